@@ -1,0 +1,33 @@
+"""GTSAM factors for target-less LiDAR-camera calibration in space and time.
+
+The package needs gtsam and NumPy only. Every convention of the project is stated here, once.
+
+Frames
+    ``w`` world, ``b`` body, ``l`` LiDAR, ``c`` camera (optical: x right, y down, z forward).
+Transforms
+    ``cTl`` maps LiDAR coordinates into the camera: ``cP = cTl.transformFrom(lP)``. In files and
+    prose it is ``T_camera_lidar``, always "p_camera = T_camera_lidar . p_lidar". Inner letters
+    meet: ``wTc * cTl``.
+Time offset
+    ``t_lidar = t_camera_stamp + time_offset_s``: an image stamped ``t`` shows the world at
+    LiDAR-clock time ``t + offset`` (the sign of Kalibr's ``timeshift``, of OpenVINS and of VINS ``td``).
+Interval of a pair
+    ``tau = (t_image_stamp + offset) - t_point`` [s]; ``t_point`` is the scan's stamp or, where the
+    data has it, the point's own time.
+Twist
+    ``c_twist = [omega, v]`` of the camera in its own frame, gtsam order, rad/s and m/s. A static
+    world point moves as ``cP(tau) = Exp(-c_twist * tau) . cP``. (The v_k of SST-Calib is the
+    *apparent* velocity of the points, -v.)
+Covariance
+    7x7 over [rotation xyz rad, translation xyz m, offset s]; right perturbation
+    ``cTl * Exp(xi)``, as gtsam has it. A sigma is never called a covariance.
+Residual
+    predicted - measured, in pixels, unwhitened; sigmas in pixels stand in the noise.
+Pixels
+    The centre of the top-left pixel is (0, 0), as in OpenCV.
+Units
+    SI inside; a suffix at boundaries (``_s _ns _px _deg``). Degrees are for people only.
+Arrays
+    A batch of points is ``(n, 3)``, of pixels ``(n, 2)``. Jacobians of a batch stay ``(n, rows, cols)``
+    or column-major ``(cols, n)`` where speed needs it; each docstring says which.
+"""

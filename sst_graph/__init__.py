@@ -1,0 +1,1 @@
+"""Target-less LiDAR-camera calibration, in space and time, as a GTSAM factor graph."""

@@ -1,0 +1,153 @@
+"""Data that flows through sst_graph: scans, images, frames, sources, motions.
+
+Conventions (frames, signs, units) are stated in :mod:`factors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+
+FloatArray = NDArray[np.float64]
+
+
+class SemanticClass(IntEnum):
+    """Canonical classes that both sensors' labels are mapped to.
+
+    ``OTHER`` is known to be none of the named classes (background); ``IGNORE`` may be anything.
+    """
+
+    OTHER = 0
+    VEHICLE = 1
+    GROUND = 2
+    BUILDING = 3
+    VEGETATION = 4
+    POLE = 5
+    PERSON = 6
+    TWO_WHEELER = 7
+    SKY = 8
+    TERRAIN = 9
+    FENCE = 10
+    SIGN = 11
+    IGNORE = 255
+
+
+@dataclass(frozen=True)
+class Scan:
+    """One LiDAR sweep.
+
+    Attributes:
+        stamp_ns: LiDAR-clock stamp [ns].
+        points: (n, 3) float32, LiDAR frame [m].
+        classes: (n,) uint8 of :class:`SemanticClass`.
+        instances: (n,) uint16 instance number within its class (0: none), or None.
+        offsets_s: (n,) float32, time of each point minus ``stamp_ns`` [s], or None where all
+            points are taken at (or compensated to) the stamp.
+        rings: (n,) uint16 laser number, or None where the data does not name it.
+    """
+
+    stamp_ns: int
+    points: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+    instances: NDArray[np.uint16] | None = None
+    offsets_s: NDArray[np.float32] | None = None
+    rings: NDArray[np.uint16] | None = None
+
+
+@dataclass(frozen=True)
+class CameraImage:
+    """One camera image with its semantic mask.
+
+    Attributes:
+        stamp_ns: camera-clock stamp [ns].
+        mask: (h, w) uint8 of :class:`SemanticClass`.
+        pixels: (h, w, 3) uint8 BGR picture.
+        instances: (h, w) uint16 instance number (0: none), or None.
+    """
+
+    stamp_ns: int
+    mask: NDArray[np.uint8]
+    pixels: NDArray[np.uint8]
+    instances: NDArray[np.uint16] | None = None
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Scan ``index`` of a drive and the image that carries the same stamp; one may be missing."""
+
+    index: int
+    scan: Scan | None
+    image: CameraImage | None
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """What is known to be true of a drive (simulated, or a published reference).
+
+    Attributes:
+        cTl: pose of the LiDAR in the camera.
+        time_offset_s: offset with the sign of :mod:`factors`, or None where it is not known.
+    """
+
+    cTl: gtsam.Pose3
+    time_offset_s: float | None
+
+
+class Source(Protocol):
+    """A drive: frames in the order of their index, read when asked for."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def camera(self) -> PinholeCamera: ...
+
+    @property
+    def nominal(self) -> gtsam.Pose3 | None:
+        """Nominal cTl that the data brings, or None."""
+        ...
+
+    @property
+    def truth(self) -> GroundTruth | None: ...
+
+    def __len__(self) -> int: ...
+
+    def __getitem__(self, position: int) -> Frame: ...
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+@dataclass(frozen=True)
+class RelativeMotion:
+    """Motion of one sensor between two of its stamps.
+
+    Attributes:
+        from_ns, to_ns: stamps in the sensor's own clock [ns].
+        aTb: pose of the sensor at ``to_ns`` in the sensor's frame at ``from_ns``.
+        covariance: (6, 6) of aTb, [rot rad, trans m], right perturbation.
+        ok: False where no motion could be estimated (aTb is then a prediction, covariance is large).
+    """
+
+    from_ns: int
+    to_ns: int
+    aTb: gtsam.Pose3
+    covariance: FloatArray
+    ok: bool = True
+
+    @property
+    def seconds(self) -> float:
+        """Length of the interval [s]."""
+        return (self.to_ns - self.from_ns) * 1e-9
+
+    @property
+    def mean_twist(self) -> FloatArray:
+        """(6,) mean twist [rad/s, m/s] over the interval, in the sensor's own frame."""
+        return np.asarray(gtsam.Pose3.Logmap(self.aTb)) / self.seconds
