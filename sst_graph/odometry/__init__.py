@@ -1,0 +1,1 @@
+"""Motion of each sensor by itself: LiDAR odometry, visual odometry, standing frames."""

@@ -1,0 +1,78 @@
+"""Scans made ready for registration: sweep compensation, static points, balanced surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+
+from sst_graph.types import Scan
+
+FloatArray = NDArray[np.float64]
+
+PARALLEL_COSINE = 0.9
+"""Normals whose angle to the main normal has a larger cosine count as the same surface direction."""
+
+
+def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArray) -> FloatArray:
+    """lP(stamp) = Exp(twist * offset) . lP(offset), to second order in the offset.
+
+    Args:
+        points: (n, 3) in the LiDAR frame at each point's own time [m].
+        offsets_s: (n,) time of each point after the stamp [s].
+        twist: (6,) [omega, v] of the LiDAR in its own frame [rad/s, m/s].
+
+    Returns:
+        (n, 3) in the LiDAR frame at the stamp [m]; at 1 rad/s and 50 ms the error of the
+        truncation is 2e-5 of the range.
+    """
+    omega, v = twist[:3], twist[3:]
+    rate = np.cross(omega, points) + v
+    t = offsets_s[:, None]
+    return np.asarray(points + t * (rate + 0.5 * t * np.cross(omega, rate)))
+
+
+def usable_points(
+    scan: Scan, near_m: float, far_m: float, most: int
+) -> tuple[FloatArray, NDArray[np.uint8], FloatArray | None]:
+    """Finite points of a scan between two ranges, thinned evenly to at most ``most``.
+
+    Returns:
+        points (n, 3) [m], classes (n,), offsets_s (n,) [s] or None.
+    """
+    square = np.einsum("ij,ij->i", scan.points, scan.points)
+    kept = np.flatnonzero((square > near_m**2) & (square < far_m**2))  # NaN and inf compare as False
+    if len(kept) > most:
+        kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
+    offsets = None if scan.offsets_s is None else scan.offsets_s[kept].astype(np.float64)
+    return scan.points[kept].astype(np.float64), scan.classes[kept], offsets
+
+
+def registration_cloud(
+    points: FloatArray, voxel_m: float, neighbours: int, plane_ratio: float
+) -> small_gicp.PointCloud:
+    """Downsampled cloud with covariances, in which no single surface direction drowns the others.
+
+    A scan is mostly ground. Its points say nothing about motion along it, yet the rings they form
+    pull the registration towards no motion. Where one normal direction dominates, its points are
+    thinned evenly to ``plane_ratio`` times the number of all the others.
+
+    Args:
+        points: (n, 3) [m].
+        voxel_m: edge of the voxels of which one mean point is kept [m].
+        neighbours: points from which a covariance is estimated.
+        plane_ratio: most points of the main direction, per point of another direction.
+    """
+    cloud, _ = small_gicp.preprocess_points(points, voxel_m, neighbours, 1)
+    normals = np.asarray(cloud.normals())[:, :3]
+    main = np.linalg.eigh(normals.T @ normals)[1][:, 2]
+    parallel = np.abs(normals @ main) > PARALLEL_COSINE
+    members = np.flatnonzero(parallel)
+    allowed = max(int(plane_ratio * (len(normals) - len(members))), 10 * neighbours)
+    if len(members) <= allowed:
+        return cloud
+    kept = ~parallel
+    kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
+    balanced = small_gicp.PointCloud(np.asarray(cloud.points())[kept])
+    small_gicp.estimate_normals_covariances(balanced, num_neighbors=neighbours, num_threads=1)
+    return balanced
