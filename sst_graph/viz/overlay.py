@@ -1,0 +1,203 @@
+"""LiDAR points and mask contours drawn over the camera image, before and after a calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.errors import DataError
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+IN_MASK: Colour = (80, 220, 60)
+OUT_OF_MASK: Colour = (60, 60, 255)
+CONTOUR: Colour = (0, 230, 255)
+CLASS_COLOURS: dict[SemanticClass, Colour] = {
+    SemanticClass.GROUND: (160, 90, 130),
+    SemanticClass.TERRAIN: (110, 150, 110),
+    SemanticClass.BUILDING: (190, 170, 110),
+    SemanticClass.FENCE: (150, 130, 170),
+    SemanticClass.VEGETATION: (70, 140, 60),
+    SemanticClass.POLE: (60, 190, 230),
+    SemanticClass.SIGN: (60, 190, 230),
+    SemanticClass.PERSON: (90, 90, 240),
+    SemanticClass.TWO_WHEELER: (180, 60, 200),
+}
+"""BGR of the points by class; a class that is not named here is grey."""
+OTHER_COLOUR: Colour = (150, 150, 150)
+
+TIME_STEP_S = 0.5e-3
+"""Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One way to place the LiDAR in the camera: the pose, the offset, and a caption.
+
+    Attributes:
+        cTl: pose of the LiDAR in the camera.
+        time_offset_s: offset with the sign of :mod:`factors` [s].
+        caption: words over the picture, such as "before".
+    """
+
+    cTl: gtsam.Pose3
+    time_offset_s: float
+    caption: str = ""
+
+
+def draw_overlay(
+    frame: Frame,
+    camera: PinholeCamera,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray | None = None,
+    caption: str = "",
+) -> Picture:
+    """The image with the scan's points and the contours of the vehicle mask -> (h + strip, w, 3) BGR.
+
+    Vehicle points are green inside the vehicle mask and red outside; the others take the colour of
+    their class. Points are moved to the image's instant by ``c_twist`` (6,) [rad/s, m/s], the camera's
+    twist in its own frame; None leaves them where they were at their own time.
+
+    Raises:
+        DataError: the frame lacks its scan or its image, or the image has another size than the camera.
+    """
+    scan, image = _both(frame, camera)
+    uvs, classes = _projected(scan, image, camera, cTl, offset_s, c_twist)
+    picture = _backdrop(image)
+    _draw_classes(picture, uvs, classes)
+    _draw_contours(picture, image.mask == SemanticClass.VEHICLE)
+    vehicles = uvs[classes == SemanticClass.VEHICLE]
+    mask_class = _at(image.mask, vehicles)
+    inside = mask_class == SemanticClass.VEHICLE
+    outside = ~inside & (mask_class != SemanticClass.IGNORE)
+    _draw_points(picture, vehicles[inside], IN_MASK, 2)
+    _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
+    return np.vstack([_strip(picture.shape[1], caption, int(inside.sum()), int(outside.sum())), picture])
+
+
+def before_after(
+    frame: Frame,
+    camera: PinholeCamera,
+    before: Placement,
+    after: Placement,
+    c_twist: FloatArray | None = None,
+) -> Picture:
+    """:func:`draw_overlay` of two placements of the same frame, one above the other.
+
+    Raises:
+        DataError: as :func:`draw_overlay`.
+    """
+    pictures = [
+        draw_overlay(frame, camera, place.cTl, place.time_offset_s, c_twist, place.caption)
+        for place in (before, after)
+    ]
+    gap = np.full((6, pictures[0].shape[1], 3), 255, np.uint8)
+    return np.vstack([pictures[0], gap, pictures[1]])
+
+
+def _both(frame: Frame, camera: PinholeCamera) -> tuple[Scan, CameraImage]:
+    if frame.scan is None or frame.image is None:
+        missing = "scan" if frame.scan is None else "image"
+        raise DataError(f"frame {frame.index}", f"no {missing}", "a scan and an image to draw")
+    height, width = frame.image.pixels.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise DataError(
+            f"frame {frame.index}", f"an image of {width}x{height}", f"{camera.width}x{camera.height}"
+        )
+    return frame.scan, frame.image
+
+
+def _projected(
+    scan: Scan,
+    image: CameraImage,
+    camera: PinholeCamera,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray | None,
+) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """Pixels (m, 2) and classes (m,) of the points that fall on the image, far ones first."""
+    cPs = cTl.transformFrom(scan.points.astype(np.float64).T).T
+    if c_twist is not None:
+        tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + offset_s
+        offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
+        cPs = _moved(cPs, tau - offsets_s, c_twist)
+    uvs = camera.project(cPs)
+    seen = np.flatnonzero(camera.in_front(cPs))
+    seen = seen[camera.in_image(uvs[seen])]
+    seen = seen[np.argsort(-cPs[seen, 2])]
+    return uvs[seen], scan.classes[seen]
+
+
+def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArray:
+    """cP(tau) = Exp(-c_twist tau) . cP for points (n, 3) [m] and intervals (n,) [s]."""
+    moved = np.empty_like(cPs)
+    steps = np.round(taus_s / TIME_STEP_S).astype(np.int64)
+    for step in np.unique(steps):
+        chosen = steps == step
+        motion = gtsam.Pose3.Expmap(-c_twist * float(taus_s[chosen].mean()))
+        moved[chosen] = motion.transformFrom(cPs[chosen].T).T
+    return moved
+
+
+def _backdrop(image: CameraImage) -> Picture:
+    """The picture at 70 % brightness and half its colour, so that the points stand out."""
+    grey = cv2.cvtColor(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
+    return np.asarray(cv2.addWeighted(image.pixels, 0.35, grey, 0.35, 0.0), dtype=np.uint8)
+
+
+def _draw_classes(picture: Picture, uvs: FloatArray, classes: NDArray[np.uint8]) -> None:
+    for label in np.unique(classes):
+        if label not in (SemanticClass.VEHICLE, SemanticClass.IGNORE):
+            colour = CLASS_COLOURS.get(SemanticClass(label), OTHER_COLOUR)
+            _draw_points(picture, uvs[classes == label], colour, 1)
+
+
+def _draw_points(picture: Picture, uvs: FloatArray, colour: Colour, size_px: int) -> None:
+    """Squares of ``size_px`` at pixels (n, 2)."""
+    height, width = picture.shape[:2]
+    columns, rows = np.floor(uvs + 0.5).astype(np.int64).T
+    for right in range(size_px):
+        for down in range(size_px):
+            picture[np.minimum(rows + down, height - 1), np.minimum(columns + right, width - 1)] = colour
+
+
+def _draw_contours(picture: Picture, mask: NDArray[np.bool_]) -> None:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(picture, contours, -1, CONTOUR, 1, cv2.LINE_8)
+
+
+def _at(mask: NDArray[np.uint8], uvs: FloatArray) -> NDArray[np.uint8]:
+    """(n,) mask values at the pixels (n, 2) that lie on the image."""
+    columns, rows = np.floor(uvs + 0.5).astype(np.int64).T
+    return np.asarray(mask[rows, columns])
+
+
+def _strip(width: int, caption: str, inside: int, outside: int) -> Picture:
+    """A strip of ``width`` pixels with the caption and the legend, in letters that fit."""
+    total = inside + outside
+    share = f"{100.0 * inside / total:.1f} % of {total}" if total else "none of them"
+    parts: list[tuple[str, Colour]] = [
+        (f"{caption}   " if caption else "", (255, 255, 255)),
+        (f"vehicle points in the mask: {share}   ", IN_MASK),
+        (f"outside: {outside}   ", OUT_OF_MASK),
+        ("mask contour", CONTOUR),
+    ]
+    text = "".join(words for words, _ in parts)
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6
+    (length, height), _ = cv2.getTextSize(text, font, scale, 1)
+    scale *= min(1.0, (width - 16) / length)
+    strip = np.full((height + 14, width, 3), 30, np.uint8)
+    left = 8
+    for words, colour in parts:
+        cv2.putText(strip, words, (left, height + 6), font, scale, colour, 1, cv2.LINE_AA)
+        left += cv2.getTextSize(words, font, scale, 1)[0][0]
+    return strip
