@@ -1,0 +1,202 @@
+"""Drives in the layout of KITTI odometry with SemanticKITTI labels and Cityscapes masks.
+
+Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``, ``velodyne``, ``labels``,
+``image_2`` and ``semantic_2``; where present also ``instance_2`` (uint16, class * 256 + instance),
+``velodyne_times`` (float32 seconds relative to the stamp, one a point) and ``groundtruth.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import overload
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
+from sst_graph.data.arrays import read_labels, read_offsets, read_points
+from sst_graph.data.calib import read_calibration
+from sst_graph.data.images import check_size, read_instances, read_mask, read_picture
+from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
+from sst_graph.data.kitti_truth import drive_truth
+from sst_graph.data.scan_order import rings_from_order, sweep_offsets_s
+from sst_graph.data.source import Loader, SourceOptions, Sweep
+from sst_graph.errors import ConfigError
+from sst_graph.timestamps import read_times
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+
+_MASKS_TO_JUDGE = 8
+"""How many masks, spread over the drive, decide on their encoding."""
+
+
+@dataclass(frozen=True, eq=False)
+class KittiSource:
+    """A KITTI drive that satisfies :class:`~sst_graph.types.Source`; a slice of it is one as well.
+
+    Attributes:
+        name: data set and sequence, "kitti/00".
+        camera: intrinsics of the chosen camera.
+        nominal: cTl of ``calib.txt``.
+        truth: from ``groundtruth.json``, or else the published calibration as a reference.
+        truth_is_reference: the truth is the published calibration: itself good to a tenth of a
+            degree or so, not known to hold.
+        files: paths of the drive.
+        stamps_ns: (n,) stamps of times.txt [ns]; scan k and image k share the stamp k.
+        indices: scan index of each frame.
+        image_shift: frame k shows image k + image_shift.
+        encoding: of the masks.
+        sweep: how per-point times are found.
+    """
+
+    name: str
+    camera: PinholeCamera
+    nominal: gtsam.Pose3
+    truth: GroundTruth
+    truth_is_reference: bool
+    files: KittiFiles
+    stamps_ns: NDArray[np.int64]
+    indices: tuple[int, ...]
+    image_shift: int
+    encoding: MaskEncoding
+    sweep: Sweep
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> KittiSource: ...
+    def __getitem__(self, position: int | slice) -> Frame | KittiSource:
+        """Frame at a position (read from disk), or the drive restricted to a slice of positions.
+
+        Raises:
+            DataError: a file of the frame is missing, truncated or holds what it must not.
+            IndexError: no frame at this position.
+        """
+        if isinstance(position, slice):
+            return replace(self, indices=self.indices[position])
+        index = self.indices[position]
+        return Frame(index, self._scan(index), self._image(index))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(len(self)))
+
+    def _scan(self, index: int) -> Scan | None:
+        path = self.files.scans.get(index)
+        if path is None:
+            return None
+        points = read_points(path)
+        labels_path = self.files.labels[index]
+        labels = read_labels(labels_path, len(points))
+        classes, instances = classes_of_points(labels, labels_path)
+        return Scan(
+            stamp_ns=int(self.stamps_ns[index]),
+            points=points,
+            classes=classes,
+            instances=instances,
+            offsets_s=self._offsets(index, points),
+            rings=rings_from_order(points),
+        )
+
+    def _offsets(self, index: int, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        if self.sweep == "azimuth":
+            return sweep_offsets_s(points, float(np.median(np.diff(self.stamps_ns))) * 1e-9)
+        if self.sweep == "auto" and self.files.point_times is not None:
+            return read_offsets(self.files.point_times[index], len(points))
+        return None
+
+    def _image(self, index: int) -> CameraImage | None:
+        number = index + self.image_shift
+        path = self.files.images.get(number)
+        if path is None:
+            return None
+        size = (self.camera.height, self.camera.width)
+        pixels = read_picture(path)
+        check_size(path, pixels.shape, size)
+        mask_path = self.files.masks[number]
+        mask = read_mask(mask_path)
+        check_size(mask_path, mask.shape, size)
+        instances = None
+        if self.files.instances is not None:
+            instances = read_instances(self.files.instances[number])
+            check_size(self.files.instances[number], instances.shape, size)
+        stamp_ns = int(self.stamps_ns[index])
+        return CameraImage(stamp_ns, classes_of_mask(mask, self.encoding, mask_path), pixels, instances)
+
+
+def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
+    """Open a drive in KITTI's layout.
+
+    Raises:
+        DataError: a file or line is missing, counts disagree, stamps do not rise.
+        ConfigError: no such sequence, camera or range of frames.
+    """
+    folder = find_sequence(path, options.sequence)
+    calibration = read_calibration(folder / "calib.txt")
+    nominal = calibration.cTl(options.camera)
+    stamps_ns = read_times(folder / "times.txt")
+    files = find_files(folder, options.camera, options.cloud, len(stamps_ns))
+    if options.sweep == "azimuth" and len(stamps_ns) < 2:
+        raise ConfigError("sweep 'azimuth': the period of a turn needs two stamps or more")
+    indices = _select(files, options, len(stamps_ns))
+    height, width = read_picture(next(iter(files.images.values()))).shape[:2]
+    truth, is_reference = drive_truth(folder, calibration, options.camera)
+    pairs = [k for k in indices if k in files.scans and k + options.image_shift in files.images]
+    return KittiSource(
+        name=_name(folder),
+        camera=calibration.camera(options.camera, width, height),
+        nominal=nominal,
+        truth=_shifted(truth, stamps_ns, pairs, options.image_shift),
+        truth_is_reference=is_reference,
+        files=files,
+        stamps_ns=stamps_ns,
+        indices=indices,
+        image_shift=options.image_shift,
+        encoding=_encoding(files, options),
+        sweep=options.sweep,
+    )
+
+
+def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int, ...]:
+    """Scan indices of the frames asked for that have a scan or an image."""
+    chosen = options.frames or slice(None)
+    first, last = chosen.start or 0, count if chosen.stop is None else chosen.stop
+    if first >= count or last > count:
+        raise ConfigError(f"frames {first}:{last}: the drive has frames 0:{count}")
+    shift = options.image_shift
+    indices = tuple(k for k in range(first, last) if k in files.scans or k + shift in files.images)
+    if not any(k in files.scans and k + shift in files.images for k in indices):
+        raise ConfigError(f"frames {first}:{last} with image shift {shift}: no scan is left with an image")
+    return indices
+
+
+def _shifted(truth: GroundTruth, stamps_ns: NDArray[np.int64], pairs: list[int], shift: int) -> GroundTruth:
+    """Truth after images are stamped as those ``shift`` before: the mean stamp difference is added."""
+    if truth.time_offset_s is None:
+        return truth
+    ks = np.array(pairs)
+    seconds = float(np.mean(stamps_ns[ks + shift] - stamps_ns[ks])) * 1e-9
+    return replace(truth, time_offset_s=truth.time_offset_s + seconds)
+
+
+def _encoding(files: KittiFiles, options: SourceOptions) -> MaskEncoding:
+    if options.label_encoding != "auto":
+        return MaskEncoding(options.label_encoding)
+    paths = list(files.masks.values())
+    chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
+    return guess_mask_encoding(map(read_mask, [paths[k] for k in chosen]), paths[0].parent)
+
+
+def _name(folder: Path) -> str:
+    folder = folder.resolve()
+    if folder.parent.name == "sequences":
+        return f"{folder.parent.parent.name}/{folder.name}"
+    return folder.name
+
+
+KITTI_LOADER = Loader(recognizes=is_kitti, open=open_kitti, layout=LAYOUT)

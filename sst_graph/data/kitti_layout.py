@@ -1,0 +1,126 @@
+"""Where the files of a KITTI drive lie, and that they go together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sst_graph.data.arrays import numbered_files
+from sst_graph.errors import ConfigError, DataError
+
+LAYOUT = "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, labels, image_2, semantic_2"
+
+_PICTURES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class KittiFiles:
+    """Paths of a drive by frame number. Every scan has labels, every image a mask.
+
+    Attributes:
+        scans, labels: point clouds and their labels.
+        point_times: per-point times of every scan, or None.
+        images, masks: pictures and their semantic masks.
+        instances: instance masks of every image, or None.
+    """
+
+    scans: Mapping[int, Path]
+    labels: Mapping[int, Path]
+    point_times: Mapping[int, Path] | None
+    images: Mapping[int, Path]
+    masks: Mapping[int, Path]
+    instances: Mapping[int, Path] | None
+
+
+def is_kitti(path: Path) -> bool:
+    """Whether a folder is a sequence in KITTI's layout, or holds some."""
+    return (path / "sequences").is_dir() or _is_sequence(path)
+
+
+def find_sequence(path: Path, sequence: str | None) -> Path:
+    """Folder of the sequence: ``path`` itself, ``path/sequences/NN``, or the only one there is.
+
+    Raises:
+        DataError: no sequence.
+        ConfigError: several and none named, or none of this name.
+    """
+    if not (path / "sequences").is_dir():
+        if not path.is_dir():
+            raise DataError(path, "no folder", LAYOUT)
+        if not _is_sequence(path):
+            raise DataError(path, "neither a folder sequences nor calib.txt", LAYOUT)
+        if sequence not in (None, path.resolve().name):
+            raise ConfigError(f"sequence {sequence!r}: {path} is itself the folder of a sequence")
+        return path
+    names = sorted(entry.name for entry in (path / "sequences").iterdir() if entry.is_dir())
+    if not names:
+        raise DataError(path / "sequences", "an empty folder", "folders 00, 01, ...")
+    if sequence is None:
+        if len(names) > 1:
+            raise ConfigError(f"{path}: several sequences ({', '.join(names)}): name one of them")
+        return path / "sequences" / names[0]
+    matches = [name for name in names if name in (sequence, sequence.zfill(2))]
+    if not matches:
+        raise ConfigError(f"sequence {sequence!r}: {path} has {', '.join(names)}")
+    return path / "sequences" / matches[0]
+
+
+def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles:
+    """Files of a sequence, checked against each other and against the number of stamps.
+
+    A number that has neither a scan nor labels is a gap, and so is one with neither image nor mask;
+    one without the other is an error. Labels may go on after the last scan of another
+    ``cloud`` than "velodyne".
+
+    Raises:
+        DataError: an empty or missing folder, a file without its partner, more or fewer frames
+            than stamps.
+        ConfigError: the camera's name is not of the form image_N.
+    """
+    if not camera.startswith("image_"):
+        raise ConfigError(f"camera {camera!r}: expected image_N, as in image_2")
+    scans = numbered_files(folder / cloud, (".bin",))
+    labels = numbered_files(folder / "labels", (".label",))
+    images = numbered_files(folder / camera, _PICTURES)
+    masks = numbered_files(folder / camera.replace("image", "semantic"), (".png",))
+    frames = max(*scans, *images) + 1
+    if frames != stamps:
+        raise DataError(folder / "times.txt", f"{stamps} stamps", f"{frames}, as there are frames")
+    if cloud != "velodyne":
+        labels = {k: path for k, path in labels.items() if k <= max(scans)}
+    _check_partners(scans, labels, folder / "labels")
+    _check_partners(images, masks, folder / camera.replace("image", "semantic"))
+    return KittiFiles(
+        scans=scans,
+        labels=labels,
+        point_times=_optional(folder / f"{cloud}_times", (".bin",), scans),
+        images=images,
+        masks=masks,
+        instances=_optional(folder / camera.replace("image", "instance"), (".png",), images),
+    )
+
+
+def _is_sequence(path: Path) -> bool:
+    return (path / "calib.txt").is_file() or (path / "velodyne").is_dir()
+
+
+def _optional(folder: Path, suffixes: tuple[str, ...], owners: Mapping[int, Path]) -> dict[int, Path] | None:
+    """Files of a folder that need not be there, but if so then for every owner."""
+    if not folder.is_dir():
+        return None
+    files = numbered_files(folder, suffixes)
+    lonely = sorted(set(owners) - set(files))
+    if lonely:
+        raise DataError(folder, f"no file for frame {lonely[0]}", f"one for each of {len(owners)} frames")
+    return files
+
+
+def _check_partners(owners: Mapping[int, Path], partners: Mapping[int, Path], folder: Path) -> None:
+    lonely = sorted(set(owners) - set(partners))
+    if lonely:
+        raise DataError(folder, f"no file for frame {lonely[0]}", f"a partner of {owners[lonely[0]]}")
+    lonely = sorted(set(partners) - set(owners))
+    if lonely:
+        home = next(iter(owners.values())).parent
+        raise DataError(home, f"no file for frame {lonely[0]}", f"a partner of {partners[lonely[0]]}")

@@ -1,0 +1,149 @@
+"""Opening a drive: the registry of loaders and the options they share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.types import Source
+
+Sweep = Literal["auto", "instant", "azimuth"]
+LabelEncoding = Literal["auto", "ids", "trainids"]
+
+SWEEPS: tuple[Sweep, ...] = ("auto", "instant", "azimuth")
+LABEL_ENCODINGS: tuple[LabelEncoding, ...] = ("auto", "ids", "trainids")
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """How a drive is to be read.
+
+    Attributes:
+        sequence: name of the sequence within the data set, or None for the only one.
+        frames: scans to use, as a slice of their indices (step 1), or None for all.
+        image_shift: scan k is paired with image k + image_shift, stamped as if it were image k.
+        camera: name of the camera, "image_2".
+        cloud: name of the folder that holds the scans.
+        label_encoding: how mask numbers are to be read; "auto" decides over several masks.
+        sweep: "auto" uses per-point times where the data has them, "instant" ignores them,
+            "azimuth" derives them from the azimuth (uncompensated clockwise sweep, stamped when
+            the scanner faces forward).
+    """
+
+    sequence: str | None = None
+    frames: slice | None = None
+    image_shift: int = 0
+    camera: str = "image_2"
+    cloud: str = "velodyne"
+    label_encoding: LabelEncoding = "auto"
+    sweep: Sweep = "auto"
+
+    def __post_init__(self) -> None:
+        if self.label_encoding not in LABEL_ENCODINGS:
+            raise ConfigError(f"label encoding {self.label_encoding!r}: expected one of {LABEL_ENCODINGS}")
+        if self.sweep not in SWEEPS:
+            raise ConfigError(f"sweep {self.sweep!r}: expected one of {SWEEPS}")
+        if self.frames is not None:
+            _check_frames(self.frames)
+
+
+@dataclass(frozen=True)
+class Loader:
+    """One data format.
+
+    Attributes:
+        recognizes: whether a path looks like this format.
+        open: opens it.
+        layout: what the format looks like on disk, for errors.
+    """
+
+    recognizes: Callable[[Path], bool]
+    open: Callable[[Path, SourceOptions], Source]
+    layout: str
+
+
+_LOADERS: dict[str, Loader] = {}
+
+
+def register_loader(name: str, loader: Loader) -> None:
+    """Make a format known to :func:`open_source` under ``name``.
+
+    Raises:
+        ConfigError: the name is taken, or reserved.
+    """
+    if name in _LOADERS or name == "auto":
+        raise ConfigError(f"loader {name!r}: the name is taken")
+    _LOADERS[name] = loader
+
+
+def loader_names() -> tuple[str, ...]:
+    """Names of the registered formats."""
+    return tuple(_LOADERS)
+
+
+def open_source(
+    path: str | Path,
+    *,
+    loader: str = "auto",
+    sequence: str | None = None,
+    frames: str | slice | None = None,
+    image_shift: int = 0,
+    camera: str = "image_2",
+    cloud: str = "velodyne",
+    label_encoding: LabelEncoding = "auto",
+    sweep: Sweep = "auto",
+) -> Source:
+    """Open a drive; frames are read when asked for. Options as in :class:`SourceOptions`.
+
+    Args:
+        path: root of the data set, or the folder of one sequence.
+        loader: a registered format, or "auto" for the one that recognizes the path.
+        frames: "A:B" (scan indices A..B-1; either may be left out) or a slice.
+
+    Raises:
+        DataError: nothing there, or data that cannot be used.
+        ConfigError: an option that is unknown or out of range.
+    """
+    options = SourceOptions(
+        sequence=sequence,
+        frames=parse_frames(frames) if isinstance(frames, str) else frames,
+        image_shift=image_shift,
+        camera=camera,
+        cloud=cloud,
+        label_encoding=label_encoding,
+        sweep=sweep,
+    )
+    path = Path(path)
+    if loader != "auto":
+        if loader not in _LOADERS:
+            raise ConfigError(f"loader {loader!r}: expected one of auto, {', '.join(_LOADERS)}")
+        return _LOADERS[loader].open(path, options)
+    if not path.is_dir():
+        raise DataError(path, "no folder" if not path.exists() else "a file", "the folder of a drive")
+    for candidate in _LOADERS.values():
+        if candidate.recognizes(path):
+            return candidate.open(path, options)
+    raise DataError(path, "no layout that is known", "; or ".join(c.layout for c in _LOADERS.values()))
+
+
+def parse_frames(text: str) -> slice:
+    """Slice of a range "A:B", A and B counted from 0 and either left out at will.
+
+    Raises:
+        ConfigError: the text is no such range.
+    """
+    first, colon, last = text.partition(":")
+    if not colon or not all(part.strip().isdecimal() or not part.strip() for part in (first, last)):
+        raise ConfigError(f"frames {text!r}: expected A:B with numbers from 0, as in 10:50")
+    return slice(int(first) if first.strip() else None, int(last) if last.strip() else None)
+
+
+def _check_frames(frames: slice) -> None:
+    first, last = frames.start or 0, frames.stop
+    if frames.step not in (None, 1):
+        raise ConfigError(f"frames with step {frames.step}: expected consecutive ones")
+    if first < 0 or (last is not None and last <= first):
+        raise ConfigError(f"frames {first}:{last}: expected A:B with 0 <= A < B")
