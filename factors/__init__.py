@@ -31,3 +31,40 @@ Arrays
     A batch of points is ``(n, 3)``, of pixels ``(n, 2)``. Jacobians of a batch stay ``(n, rows, cols)``
     or column-major ``(cols, n)`` where speed needs it; each docstring says which.
 """
+
+from .alignment import (
+    Alignment,
+    alignment_cost,
+    frame_factor,
+    pixel_to_point_factor,
+    point_to_pixel_factor,
+    residuals,
+    weighted_residuals,
+)
+from .camera import MIN_DEPTH_M, PinholeCamera
+from .condensed import condense
+from .custom import custom_factor
+from .errors import FactorError
+from .motion import MotionModel, move_points
+from .robust import KernelKind, RobustKernel
+from .silhouette import silhouette_factor
+
+__all__ = [
+    "MIN_DEPTH_M",
+    "Alignment",
+    "FactorError",
+    "KernelKind",
+    "MotionModel",
+    "PinholeCamera",
+    "RobustKernel",
+    "alignment_cost",
+    "condense",
+    "custom_factor",
+    "frame_factor",
+    "move_points",
+    "pixel_to_point_factor",
+    "point_to_pixel_factor",
+    "residuals",
+    "silhouette_factor",
+    "weighted_residuals",
+]

@@ -1,0 +1,271 @@
+"""Alignment factors: a frame's matches as ONE vectorised factor (see :mod:`factors.reprojection`).
+
+The cost of a factor is the robust cost sum rho(|r_i| / sigma_i); its linearization carries the weights
+w_i of each match. Condensed (the default) it has cols + 2 rows however many matches there are, with the
+cost, gradient and Gauss-Newton Hessian of the stacked factor.
+
+Variables are given by their key; a constant in place of a key fixes the quantity: ``offset_s=0.1`` or
+``c_twist=np.zeros(6)``. Keys: extrinsic Pose3, offset ``Vector(1)``, twist ``Vector(6)``, bias ``Vector(1)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .condensed import condense, cost_rows, gram
+from .custom import custom_factor
+from .errors import FactorError, checked_array
+from .matches import Alignment
+from .reprojection import alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
+
+__all__ = [
+    "Alignment",
+    "alignment_cost",
+    "frame_factor",
+    "pixel_to_point_factor",
+    "point_to_pixel_factor",
+    "residuals",
+    "weighted_residuals",
+]
+
+FloatArray = NDArray[np.float64]
+_COLUMNS = {"cTl": range(0, 6), "offset_s": range(6, 7), "c_twist": range(7, 13), "bias_px": range(13, 14)}
+"""Where each quantity stands among the Jacobian's columns."""
+
+
+def point_to_pixel_factor(
+    alignment: Alignment,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float = 0.0,
+    c_twist: int | FloatArray | None = None,
+    *,
+    condensed: bool = True,
+) -> gtsam.CustomFactor:
+    """r_i = uv(cP_i) - q_i, q_i the nearest pixel of the point's class; two rows a point [px].
+
+    SST-Calib, eq. 2. See :func:`frame_factor` for the arguments.
+    """
+    _require_points(alignment)
+    return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)
+
+
+def pixel_to_point_factor(
+    alignment: Alignment,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float = 0.0,
+    c_twist: int | FloatArray | None = None,
+    *,
+    condensed: bool = True,
+) -> gtsam.CustomFactor:
+    """r_j = uv(cP_j) - q_j, P_j the point that projects nearest to the mask pixel q_j; two rows a pixel [px].
+
+    SST-Calib, eq. 3: the same residual as :func:`point_to_pixel_factor` over matches found the other
+    way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weight``.
+    """
+    _require_points(alignment)
+    return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)
+
+
+def _require_points(alignment: Alignment) -> None:
+    if alignment.normals is not None:
+        raise FactorError("alignment", "normals", "none: silhouettes have silhouette_factor")
+
+
+def frame_factor(
+    alignments: Sequence[Alignment],
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float = 0.0,
+    c_twist: int | FloatArray | None = None,
+    biases_px: Sequence[int | float | None] | int | float | None = None,
+    *,
+    condensed: bool = True,
+) -> gtsam.CustomFactor:
+    """All alignments of one image as one factor.
+
+    Args:
+        alignments: one or more, over the same image (one twist).
+        cTl: key of the extrinsic, or a fixed pose.
+        offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key).
+        c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for standing still.
+        biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
+            with one entry for each alignment (None for those that are point-to-pixel).
+        condensed: False gives two rows a match and one more; for tests and for looking at residuals.
+
+    Returns:
+        A factor with unit noise on the distinct keys, in the order of the arguments.
+
+    Raises:
+        FactorError: no alignment, no key, or a bias for an alignment without normals.
+    """
+    frame = _frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
+    rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
+
+    def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        if not jacobians and condensed:
+            return cost_rows(frame.cost(values), rows), None
+        error, J = frame.condensed(values) if condensed else frame.stacked(values)
+        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1) if jacobians else None
+
+    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Where a quantity comes from: variable number ``slot`` of the factor, or a constant."""
+
+    slot: int | None
+    constant: Any = None
+
+    def value(self, values: Sequence[Any]) -> Any:
+        return self.constant if self.slot is None else values[self.slot]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """One alignment, its bias, and how its columns stand among those of the factor.
+
+    Attributes:
+        columns: columns of the alignment's [J r] that belong to variables, the residual last.
+        targets: the same columns in the factor's [J r].
+    """
+
+    alignment: Alignment
+    bias: _Source | None
+    columns: list[int]
+    targets: list[int]
+
+    def bias_px(self, values: Sequence[Any]) -> float | None:
+        return None if self.bias is None else _scalar(self.bias.value(values))
+
+
+@dataclass(frozen=True)
+class _FrameResidual:
+    """The frozen data behind a frame's factor."""
+
+    parts: tuple[_Part, ...]
+    cTl: _Source
+    offset_s: _Source
+    c_twist: _Source
+    keys: tuple[int, ...]
+    dims: tuple[int, ...]
+
+    @property
+    def cols(self) -> int:
+        return sum(self.dims)
+
+    def _state(self, values: Sequence[Any]) -> tuple[gtsam.Pose3, float, FloatArray]:
+        return self.cTl.value(values), _scalar(self.offset_s.value(values)), self.c_twist.value(values)
+
+    def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[FloatArray, float]:
+        """Weighted [J r] of one alignment, (columns, rows), and its constant."""
+        motion = self.offset_s.slot is not None or self.c_twist.slot is not None
+        evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), True, motion)
+        constant = weigh(part.alignment, evaluated)
+        return evaluated.rows.reshape(len(evaluated.rows), -1), constant
+
+    def cost(self, values: Sequence[Any]) -> float:
+        total = 0.0
+        for part in self.parts:
+            state = self._state(values)
+            total += cost(part.alignment, evaluate(part.alignment, *state, part.bias_px(values), False))
+        return total
+
+    def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        G = np.zeros((self.cols + 1, self.cols + 1))
+        constant = 0.0
+        for part in self.parts:
+            rows, part_constant = self._weighted(part, values)
+            G[np.ix_(part.targets, part.targets)] += gram(rows)[np.ix_(part.columns, part.columns)]
+            constant += part_constant
+        return condense(G, constant)
+
+    def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        blocks, constant = [], 0.0
+        for part in self.parts:
+            rows, part_constant = self._weighted(part, values)
+            block = np.zeros((rows.shape[1], self.cols + 1))
+            block[:, part.targets] = rows[part.columns].T
+            blocks.append(block)
+            constant += part_constant
+        last = np.zeros((1, self.cols + 1))
+        last[0, -1] = np.sqrt(constant)
+        system = np.concatenate([*blocks, last])
+        return system[:, -1], system[:, :-1]
+
+
+def _frame_residual(
+    alignments: Sequence[Alignment], cTl: Any, offset_s: Any, c_twist: Any, biases_px: Any
+) -> _FrameResidual:
+    if not alignments:
+        raise FactorError("alignments of a frame", "none", "one or more")
+    variables = _Variables()
+    pose = variables.source(cTl, 6, lambda value: value)
+    offset = variables.source(offset_s, 1, _scalar)
+    twist = variables.source(
+        c_twist, 6, lambda v: checked_array("c_twist", np.zeros(6) if v is None else v, (6,))
+    )
+    biases = [
+        None if bias is None else variables.source(bias, 1, _scalar)
+        for bias in _bias_of_each(alignments, biases_px)
+    ]
+    if not variables.keys:
+        raise FactorError("keys of a frame's factor", "constants only", "the key of one variable or more")
+    cols = sum(variables.dims)
+    parts = []
+    for alignment, bias in zip(alignments, biases, strict=True):
+        columns, targets = [], []
+        named = {"cTl": pose, "offset_s": offset, "c_twist": twist, "bias_px": bias}
+        for name, source in named.items():
+            if source is not None and source.slot is not None:
+                columns += list(_COLUMNS[name])
+                start = sum(variables.dims[: source.slot])
+                targets += list(range(start, start + len(_COLUMNS[name])))
+        residual = 13 if bias is None else 14
+        parts.append(_Part(alignment, bias, [*columns, residual], [*targets, cols]))
+    return _FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
+
+
+def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | None]:
+    """The bias of each alignment; a single one belongs to the silhouettes."""
+    if isinstance(biases_px, list | tuple):
+        if len(biases_px) != len(alignments):
+            raise FactorError(
+                "biases_px", f"{len(biases_px)} entries", f"{len(alignments)}, one an alignment"
+            )
+        biases = list(biases_px)
+    else:
+        biases = [None if alignment.normals is None else biases_px for alignment in alignments]
+    for alignment, bias in zip(alignments, biases, strict=True):
+        if alignment.normals is None and bias is not None:
+            raise FactorError(
+                "biases_px", "a bias for point-to-pixel matches", "None: only silhouettes have one"
+            )
+    return biases
+
+
+class _Variables:
+    """Collects the keys of a factor and their dimensions."""
+
+    def __init__(self) -> None:
+        self.keys: list[int] = []
+        self.dims: list[int] = []
+
+    def source(self, key_or_value: Any, dim: int, constant: Any) -> _Source:
+        if not isinstance(key_or_value, int | np.integer):
+            return _Source(None, constant(key_or_value))
+        key = int(key_or_value)
+        if key not in self.keys:
+            self.keys.append(key)
+            self.dims.append(dim)
+        return _Source(self.keys.index(key))
+
+
+def _scalar(value: Any) -> float:
+    """The number in a float or a ``Vector(1)``."""
+    return float(np.asarray(value, dtype=np.float64).reshape(()) if np.ndim(value) == 0 else value[0])

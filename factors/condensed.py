@@ -1,0 +1,62 @@
+"""Condensing a tall linear system to as many rows as it has columns, without loss.
+
+A frame gives thousands of weighted rows [J r]. Cost |J d + r|^2, gradient J^T r and Gauss-Newton
+Hessian J^T J depend only on the Gram matrix G = [J r]^T [J r]; any R with R^T R = G is the same
+linear system in cols + 1 rows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def gram(rows: FloatArray) -> FloatArray:
+    """(cols, cols) Gram matrix of a system stored column by column, (cols, n)."""
+    return np.asarray(rows @ rows.T)
+
+
+def square_root(G: FloatArray) -> FloatArray:
+    """R (m, m) with R^T R = G for a positive semi-definite G, of any rank.
+
+    Cholesky after scaling to a unit diagonal; where G is singular (an unobservable variable, exact
+    data), the eigenvalues' square root, in which rounding below zero is taken as zero.
+    """
+    scale = np.sqrt(np.maximum(np.diag(G), 0.0))
+    scale[scale == 0.0] = 1.0
+    scaled = G / np.outer(scale, scale)
+    try:
+        R = np.linalg.cholesky(scaled).T
+    except np.linalg.LinAlgError:
+        eigenvalues, vectors = np.linalg.eigh(scaled)
+        R = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
+    return np.asarray(R * scale)
+
+
+def condense(G: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """Few rows with the same cost, gradient and Hessian as those behind the Gram matrix.
+
+    Args:
+        G: (cols + 1, cols + 1) Gram matrix of [J r], the residual last.
+        constant: further sum of squares (>= 0) that does not depend on the variables to first order:
+            under a robust kernel ``2 sum rho - sum w r^2``, so that the error of the factor is the
+            true robust cost while its linearization carries the weights w.
+
+    Returns:
+        r (cols + 2,) and J (cols + 2, cols) with ``|r|^2 = G[-1, -1] + constant``,
+        ``J^T r = G[:-1, -1]`` and ``J^T J = G[:-1, :-1]``; the last row has a zero Jacobian.
+    """
+    R = square_root(G)
+    m = len(G)
+    J = np.zeros((m + 1, m - 1))
+    J[:m] = R[:, :-1]
+    return np.append(R[:, -1], np.sqrt(max(constant, 0.0))), J
+
+
+def cost_rows(cost: float, rows: int) -> FloatArray:
+    """An error vector (rows,) with ``|e|^2 / 2 = cost``, for evaluations that need no Jacobian."""
+    error = np.zeros(rows)
+    error[0] = np.sqrt(2.0 * max(cost, 0.0))
+    return error

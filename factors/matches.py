@@ -1,0 +1,98 @@
+"""Frozen matches between the points of a scan and the pixels of an image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import PinholeCamera
+from .errors import FactorError, checked_array, checked_positive
+from .motion import MotionModel
+from .robust import RobustKernel
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """Matches (lP_i, q_i) of one image, frozen for an inner optimisation.
+
+    Shapes are checked and arrays copied (read-only) once, here. No match at all (n = 0) is allowed.
+
+    Attributes:
+        camera: the camera of the image.
+        lPs: (n, 3) points in the LiDAR frame [m].
+        base_taus_s: (n,) or one number: t_image_stamp - t_point [s]; tau = offset + base_tau.
+        pixels: (n, 2) matched pixels q [px].
+        sigmas_px: (n,) or one number: standard deviation of a match, by axis [px].
+        normals: (n, 2) unit normals of the contour at the pixels, towards the outside of the mask (the
+            side on which the signed distance is positive), or None for point-to-pixel matches.
+        kernel: robust kernel on each match's whitened residual (its 2-norm where it has two rows).
+        c_acceleration: (6,) twist's rate of change [rad/s^2, m/s^2].
+        motion_model: "se3" or the first-order "translation" (see :mod:`factors.motion`).
+        weight: factor on the cost of every match (after the kernel).
+    """
+
+    camera: PinholeCamera
+    lPs: FloatArray
+    base_taus_s: FloatArray
+    pixels: FloatArray
+    sigmas_px: FloatArray
+    normals: FloatArray | None = None
+    kernel: RobustKernel = field(default_factory=RobustKernel)
+    c_acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
+    motion_model: MotionModel = "se3"
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        store = object.__setattr__
+        store(self, "lPs", checked_array("lPs of an alignment", self.lPs, (None, 3)))
+        n = len(self.lPs)
+        for name in ("base_taus_s", "sigmas_px"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            value = np.full(n, value) if value.ndim == 0 else value
+            store(self, name, checked_array(f"{name} of an alignment", value, (n,)))
+        store(self, "pixels", checked_array("pixels of an alignment", self.pixels, (n, 2)))
+        if (self.sigmas_px <= 0.0).any():
+            raise FactorError("sigmas_px of an alignment", f"{self.sigmas_px.min():.3g}", "values above 0")
+        if self.normals is not None:
+            store(self, "normals", checked_array("normals of an alignment", self.normals, (n, 2)))
+            lengths = np.linalg.norm(self.normals, axis=1)
+            if n and float(np.abs(lengths - 1.0).max()) > 1e-3:
+                worst = lengths[np.abs(lengths - 1.0).argmax()]
+                raise FactorError("normals of an alignment", f"one of length {worst:.3g}", "unit vectors")
+        acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, (6,))
+        store(self, "c_acceleration", acceleration)
+        if self.motion_model not in get_args(MotionModel):
+            raise FactorError("motion model", repr(self.motion_model), " or ".join(get_args(MotionModel)))
+        checked_positive("weight of an alignment", self.weight)
+
+    def __len__(self) -> int:
+        return len(self.lPs)
+
+    @property
+    def rows_per_match(self) -> int:
+        """2 for point-to-pixel matches, 1 for silhouettes."""
+        return 2 if self.normals is None else 1
+
+    @cached_property
+    def columns(self) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """lPs (3, n), pixels (2, n) and normals (2, n), contiguous by row, for the hot path."""
+        normals = None if self.normals is None else np.ascontiguousarray(self.normals.T)
+        return np.ascontiguousarray(self.lPs.T), np.ascontiguousarray(self.pixels.T), normals
+
+    @cached_property
+    def common_tau_s(self) -> float | None:
+        """The base tau of all points where they share one [s], else None."""
+        taus = self.base_taus_s
+        return float(taus[0]) if len(taus) and bool((taus == taus[0]).all()) else None
+
+    def taus_s(self, offset_s: float) -> FloatArray | float:
+        """Intervals at a time offset: one float where all points share one, else (n,) [s]."""
+        if self.common_tau_s is not None:
+            return offset_s + self.common_tau_s
+        return np.asarray(offset_s + self.base_taus_s)

@@ -1,0 +1,213 @@
+"""Reprojection residuals of frozen matches, and their Jacobian.
+
+    r_i = uv(cP_i) - q_i                          point-to-pixel and pixel-to-point, 2 rows
+    r_i = n_i . (uv(cP_i) - q_i) - bias           silhouette, 1 row
+
+in pixels, with cP_i = Exp(-tau_i w_i) . (cTl . lP_i) (:mod:`factors.motion`) and uv the pinhole
+projection; sources: SST-Calib (Kodaira et al., ITSC 2022), eq. 2-6, for the first.
+
+Behind the camera. A point that is not :meth:`PinholeCamera.in_front` has no pixel: its rows are zero,
+residual and Jacobian, so it pulls nowhere. In the *cost* it counts as a match whose residual is the
+image's diagonal. So a step never gains by pushing matches behind the camera, and with a bounded
+kernel, whose loss is already flat there, the cost does not jump either.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, overload
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .camera import MIN_DEPTH_M, PinholeCamera
+from .errors import FactorError
+from .matches import Alignment
+from .motion import move_points
+
+FloatArray = NDArray[np.float64]
+_NO_BIAS = 13
+"""Columns [rot 0:3, trans 3:6, offset 6, twist 7:13]; a bias, where there is one, is column 13."""
+
+
+@overload
+def residuals(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None = None,
+    jacobians: Literal[True] = True,
+) -> tuple[FloatArray, FloatArray]: ...
+@overload
+def residuals(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None = None,
+    *,
+    jacobians: Literal[False],
+) -> tuple[FloatArray, None]: ...
+def residuals(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None = None,
+    jacobians: bool = True,
+) -> tuple[FloatArray, FloatArray | None]:
+    """Unwhitened residuals, predicted - measured [px], and their Jacobian.
+
+    Args:
+        alignment: n matches.
+        cTl: pose of the LiDAR in the camera.
+        offset_s: time offset [s].
+        c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
+        bias_px: silhouettes only: how far the mask's contour lies outside the true one [px]; given, it
+            is the last column of the Jacobian.
+        jacobians: False saves the work and returns None for J.
+
+    Returns:
+        r (rows,): first all u, then all v (or one row a match); J (rows, 13 [+1]) with columns [rot,
+        trans, offset, twist (6), bias] [px/rad, px/m, px/s, ...]. Rows of points behind are zero.
+    """
+    evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians)
+    r = evaluated.rows[-1].reshape(-1)
+    if not jacobians:
+        return r, None
+    cols = _NO_BIAS + (bias_px is not None)
+    return r, evaluated.rows[:cols].reshape(cols, -1).T
+
+
+def weighted_residuals(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None = None,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Whitened and robustly weighted residuals.
+
+    Returns:
+        r and J as :func:`residuals` gives them, each row multiplied by sqrt(weight w_i) / sigma_i, and
+        the constant c = 2 cost - |r|^2 >= 0 that makes ``(|r|^2 + c) / 2`` the robust cost.
+    """
+    evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=True)
+    constant = weigh(alignment, evaluated)
+    cols = _NO_BIAS + (bias_px is not None)
+    rows = evaluated.rows
+    return rows[-1].reshape(-1), rows[:cols].reshape(cols, -1).T, constant
+
+
+def alignment_cost(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None = None,
+) -> float:
+    """Robust cost: weight * sum rho(|r_i| / sigma_i), with points behind as the module says."""
+    return cost(alignment, evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=False))
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """rows: (cols + 1, k, n) Jacobian columns, then the residual; behind: (n,) or None where no point is."""
+
+    rows: FloatArray
+    behind: NDArray[np.bool_] | None
+
+
+def evaluate(
+    alignment: Alignment,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    bias_px: float | None,
+    jacobians: bool,
+    motion: bool = True,
+) -> Evaluated:
+    lPs, pixels, normals = alignment.columns
+    if bias_px is not None and normals is None:
+        raise FactorError(
+            "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
+        )
+    twist = np.asarray(c_twist, dtype=np.float64)
+    taus_s = alignment.taus_s(float(offset_s))
+    moved = move_points(cTl, lPs, taus_s, twist, alignment.c_acceleration, alignment.motion_model)
+    X, Y, Z = moved.cPs
+    behind = Z <= MIN_DEPTH_M
+    any_behind = bool(behind.any())
+    inverse_z = np.where(behind, 0.0, 1.0 / np.where(behind, 1.0, Z)) if any_behind else 1.0 / Z
+
+    n, k = len(alignment), alignment.rows_per_match
+    camera = alignment.camera
+    x, y = X * inverse_z, Y * inverse_z
+    error = np.empty((2, n))
+    error[0] = camera.fx * x + (camera.cx - pixels[0])
+    error[1] = camera.fy * y + (camera.cy - pixels[1])
+    cols = (_NO_BIAS + (bias_px is not None)) if jacobians else 0
+    rows = np.empty((cols + 1, k, n))
+    if normals is None:
+        rows[-1] = error
+    else:
+        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1] - (bias_px or 0.0)
+    if jacobians:
+        moved.pull_back(_gradients(camera, x, y, inverse_z, normals), rows[:_NO_BIAS], motion)
+        if bias_px is not None:
+            rows[_NO_BIAS] = -1.0
+    if any_behind:
+        rows[:, :, behind] = 0.0
+    return Evaluated(rows, behind if any_behind else None)
+
+
+def _gradients(
+    camera: PinholeCamera, x: FloatArray, y: FloatArray, inverse_z: FloatArray, normals: FloatArray | None
+) -> FloatArray:
+    """(3, k, n) gradients of the residuals by cP [px/m]; x, y: X/Z and Y/Z."""
+    u_scale, v_scale = camera.fx * inverse_z, camera.fy * inverse_z
+    if normals is not None:
+        u_scale, v_scale = normals[0] * u_scale, normals[1] * v_scale
+        return np.stack([u_scale, v_scale, -(u_scale * x + v_scale * y)])[:, None, :]
+    g = np.zeros((3, 2, len(x)))
+    g[0, 0], g[2, 0] = u_scale, -u_scale * x
+    g[1, 1], g[2, 1] = v_scale, -v_scale * y
+    return g
+
+
+def _sizes(alignment: Alignment, evaluated: Evaluated) -> FloatArray:
+    """(n,) size of each match's whitened residual."""
+    r = evaluated.rows[-1]
+    size = np.abs(r[0]) if len(r) == 1 else np.sqrt(r[0] * r[0] + r[1] * r[1])
+    return np.asarray(size / alignment.sigmas_px)
+
+
+def _behind_cost(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
+    """Cost of the matches behind the camera: a residual of the image's diagonal each."""
+    diagonal = float(np.hypot(alignment.camera.width, alignment.camera.height))
+    return float(alignment.kernel.loss(diagonal / alignment.sigmas_px[behind]).sum())
+
+
+def cost(alignment: Alignment, evaluated: Evaluated) -> float:
+    cost = float(alignment.kernel.loss(_sizes(alignment, evaluated)).sum())
+    if evaluated.behind is not None:
+        cost += _behind_cost(alignment, evaluated.behind)
+    return alignment.weight * cost
+
+
+def weigh(alignment: Alignment, evaluated: Evaluated) -> float:
+    """Multiply the rows by sqrt(weight w) / sigma in place; return 2 cost - |weighted r|^2."""
+    scale = np.sqrt(alignment.weight) / alignment.sigmas_px
+    if alignment.kernel.kind == "none":
+        np.multiply(evaluated.rows, scale, out=evaluated.rows)
+        constant = 0.0
+    else:
+        x = _sizes(alignment, evaluated)
+        w = alignment.kernel.weight(x)
+        np.multiply(evaluated.rows, scale * np.sqrt(w), out=evaluated.rows)
+        constant = float((2.0 * alignment.kernel.loss(x) - w * x * x).sum())
+    if evaluated.behind is not None:
+        constant += 2.0 * _behind_cost(alignment, evaluated.behind)
+    return max(alignment.weight * constant, 0.0)

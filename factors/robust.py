@@ -1,0 +1,65 @@
+"""Robust kernels on whitened residuals, vectorised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .errors import FactorError, checked_positive
+
+FloatArray = NDArray[np.float64]
+KernelKind = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]
+
+
+@dataclass(frozen=True)
+class RobustKernel:
+    """rho(x) of a whitened residual x, rho(x) ~ x^2 / 2 near zero; the same curves as gtsam's.
+
+    Attributes:
+        kind: "none" (least squares), "huber", "cauchy", "geman_mcclure" or "tukey"; the last two
+            redescend and are bounded.
+        scale: in units of sigma: where Huber turns linear, where the others' weight has fallen to
+            1/2 (Cauchy), 1/4 (Geman-McClure), 0 (Tukey).
+    """
+
+    kind: KernelKind = "none"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in get_args(KernelKind):
+            raise FactorError("robust kernel", repr(self.kind), "one of " + ", ".join(get_args(KernelKind)))
+        checked_positive("scale of the robust kernel", self.scale)
+
+    def weight(self, x: ArrayLike) -> FloatArray:
+        """w = rho'(x) / x, in [0, 1]; any shape."""
+        x = np.asarray(x, dtype=np.float64)
+        if self.kind == "none":
+            return np.ones_like(x)
+        if self.kind == "huber":
+            return np.asarray(self.scale / np.maximum(np.abs(x), self.scale))
+        z = np.square(x / self.scale)
+        if self.kind == "cauchy":
+            return np.asarray(1.0 / (1.0 + z))
+        if self.kind == "geman_mcclure":
+            return np.asarray(1.0 / np.square(1.0 + z))
+        return np.asarray(np.square(np.maximum(1.0 - z, 0.0)))
+
+    def loss(self, x: ArrayLike) -> FloatArray:
+        """rho(x), any shape."""
+        x = np.asarray(x, dtype=np.float64)
+        if self.kind == "none":
+            return 0.5 * np.square(x)
+        if self.kind == "huber":
+            size = np.abs(x)
+            inside = np.minimum(size, self.scale)
+            return np.asarray(inside * (size - 0.5 * inside))
+        z = np.square(x / self.scale)
+        half = 0.5 * self.scale**2
+        if self.kind == "cauchy":
+            return half * np.log1p(z)
+        if self.kind == "geman_mcclure":
+            return half * (z / (1.0 + z))
+        return np.asarray(half / 3.0 * (1.0 - np.maximum(1.0 - z, 0.0) ** 3))
