@@ -68,7 +68,9 @@ def check_writable_target(path: str | Path, overwrite: bool, owned_by: str | Non
 
 
 @contextmanager
-def atomic_directory(path: str | Path, overwrite: bool = False, owned_by: str | None = None) -> Iterator[Path]:
+def atomic_directory(
+    path: str | Path, overwrite: bool = False, owned_by: str | None = None
+) -> Iterator[Path]:
     """Folder that appears under ``path`` when the block ends well; yields the folder to write into.
 
     If the block raises, nothing remains and what stood at ``path`` is untouched. A folder that is

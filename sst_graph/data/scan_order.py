@@ -2,39 +2,53 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 MAX_RINGS = 256
+MIN_POINTS_PER_RING = 8
+"""Mean number of points in a ring below which no ring is believed in."""
+
 MIN_EXPLAINED = 0.9
 """Share of the variance of the elevation that rings must explain to be believed."""
 
+_TURN_RAD = 2.0 * np.pi
+_SEAMS_RAD = (0.0, np.pi, 0.5 * np.pi, -0.5 * np.pi)
 _BACK_STEP_RAD = np.deg2rad(10.0)
 """Steps back by less than this are jitter of the firing order, not a new turn."""
 
 
 def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
-    """Laser number (n,) of points (n, 3) [m] stored beam after beam, or None where they are not.
+    """Ring number (n,) of points (n, 3) [m] stored beam after beam, or None where they are not.
 
     A beam's points turn monotonically; the next beam starts where the last one did. Turning is
     summed modulo a full turn (so a gap of a cropped cloud is a step ahead, a start over likewise),
-    and a ring ends wherever the sum passes the seam. The seam lies ahead (KITTI) or behind;
-    the one whose rings explain the elevation better is taken. None where rings do not explain it: a
-    cloud in another order, or one that was shuffled or filtered too far.
+    and a ring ends wherever the sum passes the seam. The seam lies ahead (KITTI), behind or
+    abeam; the one whose rings explain the elevation best is taken. None where rings do not explain
+    it: a cloud in another order, or one that was shuffled or thinned too far.
+
+    Rings are counted from the first that has points: lasers without any return are not counted.
     """
-    if len(points) < 2:
+    if len(points) < MIN_POINTS_PER_RING:
         return None
-    x, y, z = (points[:, k].astype(np.float64) for k in range(3))
+    x, y = points[:, 0], points[:, 1]
     azimuth = np.arctan2(y, x)
-    elevation = np.arctan2(z, np.hypot(x, y))
-    if np.median(np.diff(azimuth)) < 0.0:
-        azimuth = -azimuth
-    candidates = [_rings_at_seam(azimuth, seam) for seam in (0.0, np.pi)]
-    explained = [_explained(elevation, rings) for rings in candidates]
-    best = int(explained[1] > explained[0])
-    if explained[best] < MIN_EXPLAINED:
-        return None
-    return candidates[best].astype(np.uint16)
+    elevation = np.arctan2(points[:, 2], np.hypot(x, y)).astype(np.float64)
+    steps = np.diff(azimuth)
+    if np.median(steps) < 0.0:
+        azimuth, steps = -azimuth, -steps
+    turned = np.cumsum(_modulo_turn(steps.astype(np.float64)))
+    turned = np.maximum.accumulate(np.concatenate([[0.0], turned]))
+    best, best_explained = None, MIN_EXPLAINED
+    for seam in _SEAMS_RAD:
+        start = _modulo_turn(np.float64(azimuth[0]) - seam)
+        rings = np.maximum((turned + start) // _TURN_RAD, 0.0).astype(np.int64)
+        explained = _explained(elevation, rings)
+        if explained > best_explained:
+            best, best_explained = rings, explained
+    return None if best is None else best.astype(np.uint16)
 
 
 def sweep_offsets_s(points: NDArray[np.float32], period_s: float) -> NDArray[np.float32]:
@@ -51,18 +65,15 @@ def sweep_offsets_s(points: NDArray[np.float32], period_s: float) -> NDArray[np.
     return (azimuth * (-period_s / (2.0 * np.pi))).astype(np.float32)
 
 
-def _rings_at_seam(azimuth: NDArray[np.float64], seam: float) -> NDArray[np.int64]:
-    """(n,) number of passes over the seam before each point, for rising azimuths (n,) [rad]."""
-    turn = 2.0 * np.pi
-    steps = np.mod(np.diff(azimuth) + _BACK_STEP_RAD, turn) - _BACK_STEP_RAD
-    start = np.mod(azimuth[0] - seam + _BACK_STEP_RAD, turn) - _BACK_STEP_RAD
-    phase = np.maximum.accumulate(np.concatenate([[start], start + np.cumsum(steps)]))
-    return np.maximum(np.floor(phase / turn), 0.0).astype(np.int64)
+def _modulo_turn(angle: Any) -> Any:
+    """Angles [rad] modulo a full turn, but small steps back stay negative."""
+    return np.mod(angle + _BACK_STEP_RAD, _TURN_RAD) - _BACK_STEP_RAD
 
 
 def _explained(elevation: NDArray[np.float64], rings: NDArray[np.int64]) -> float:
     """Share of the elevation's variance that lies between rings; 0 where there is no ring structure."""
-    if not 2 <= rings[-1] + 1 <= MAX_RINGS:
+    number = int(rings[-1]) + 1
+    if not 2 <= number <= min(MAX_RINGS, len(rings) // MIN_POINTS_PER_RING):
         return 0.0
     counts = np.maximum(np.bincount(rings), 1)
     means = np.bincount(rings, elevation) / counts
