@@ -26,6 +26,9 @@ from sst_graph.errors import DataError
 FloatArray = NDArray[np.float64]
 Status = Literal["ok", "unobservable", "not_converged"]
 
+UNNAMED_CAMERA = "camera"
+"""Name of a camera whose name in the data is not known."""
+
 FORMAT = "sst-graph/calibration"
 VERSION = 1
 
@@ -105,7 +108,7 @@ class CalibrationResult:
     covariance: FloatArray
     status: Status
     camera: PinholeCamera
-    camera_name: str = "camera"
+    camera_name: str = UNNAMED_CAMERA
     reasons: tuple[str, ...] = ()
     weak_directions: tuple[WeakDirection, ...] = ()
     frames_used: tuple[FrameId, ...] = ()

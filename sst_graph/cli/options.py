@@ -1,0 +1,189 @@
+"""The options of every command. Imports nothing heavy: ``--help`` answers at once."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.metadata import version
+from pathlib import Path
+from typing import NoReturn
+
+from sst_graph.errors import ConfigError
+
+SIGN = "t_lidar = t_camera_stamp + offset"
+
+
+class _Parser(argparse.ArgumentParser):
+    """An argument parser that complains through :class:`ConfigError`."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ConfigError(f"{message} (see '{self.prog} --help')")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of ``sst-graph`` with all its commands."""
+    parser = _Parser(
+        prog="sst-graph",
+        description="LiDAR-camera calibration without targets, in space and time, as a GTSAM factor graph.",
+        epilog="Exit codes: 0 done; 2 bad input or usage; 3 finished, but the result is not to be trusted "
+        "(the reason is on stderr, the files are written).",
+    )
+    parser.add_argument("--version", action="version", version=f"sst-graph {version('sst-graph')}")
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
+    )
+    for add in (_add_demo, _add_simulate, _add_calibrate, _add_evaluate, _add_overlay):
+        command = add(commands)
+        command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
+    return parser
+
+
+def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "simulate a street, calibrate it from disk, check against the truth, write report and overlays"
+    demo = commands.add_parser("demo", help=text, description=text)
+    demo.add_argument(
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        metavar="DIR",
+        help="folder to write (default %(default)s)",
+    )
+    demo.add_argument("--seed", type=int, default=1, help="seed of the street (default %(default)s)")
+    demo.add_argument("--overwrite", action="store_true", help="replace an earlier demo in that folder")
+    return demo
+
+
+def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "write a simulated drive in the KITTI odometry + SemanticKITTI layout, with its truth"
+    simulate = commands.add_parser("simulate", help=text, description=text)
+    simulate.add_argument("out", metavar="OUT", type=Path, help="folder to write")
+    simulate.add_argument("--seed", type=int, help="seed of the street and of all noise")
+    simulate.add_argument("--frames", type=int, metavar="N", help="number of frames")
+    simulate.add_argument(
+        "--delay", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
+    )
+    simulate.add_argument("--motion", metavar="NAME", help="mixed, standing, constant, stop_and_go, ...")
+    simulate.add_argument("--label-noise", type=float, metavar="LEVEL", help="0: exact, 1: usual, 2: poor")
+    simulate.add_argument(
+        "--rolling", action="store_true", default=None, help="measure each point at its own time"
+    )
+    _add_settings(simulate)
+    simulate.add_argument("--overwrite", action="store_true", help="replace an earlier drive in OUT")
+    return simulate
+
+
+def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "estimate T_camera_lidar and the time offset of one or several drives"
+    calibrate = commands.add_parser(
+        "calibrate",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}: p_camera = T_camera_lidar . p_lidar (camera: x right, "
+        f"y down, z forward), {SIGN}. Several drives share one extrinsic.",
+    )
+    calibrate.add_argument("data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder")
+    _add_source_options(calibrate)
+    calibrate.add_argument(
+        "--method",
+        choices=("joint", "paper", "static"),
+        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: extrinsic alone",
+    )
+    calibrate.add_argument(
+        "--init",
+        metavar="dataset|none|FILE",
+        default="dataset",
+        help="start: the data's nominal calibration (default), no guess at all, or a KITTI calib.txt or "
+        "a calibration.json",
+    )
+    calibrate.add_argument(
+        "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
+    )
+    calibrate.add_argument(
+        "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
+    )
+    _add_settings(calibrate)
+    calibrate.add_argument(
+        "--out",
+        type=Path,
+        default=Path("calibration"),
+        metavar="DIR",
+        help="folder to write (default %(default)s)",
+    )
+    calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
+    return calibrate
+
+
+def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "compare a result with the truth: QAD, AEAD [deg], ATD [cm], time error [ms], NEES"
+    evaluate = commands.add_parser("evaluate", help=text, description=text)
+    evaluate.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    evaluate.add_argument(
+        "--truth",
+        metavar="FILE",
+        type=Path,
+        required=True,
+        help="groundtruth.json, calibration.json, or a KITTI calib.txt (then without time offset)",
+    )
+    evaluate.add_argument("--json", action="store_true", help="print JSON (degrees, metres, seconds)")
+    return evaluate
+
+
+def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "draw the LiDAR into the camera image, before and after a calibration"
+    overlay = commands.add_parser("overlay", help=text, description=text)
+    overlay.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    overlay.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder")
+    _add_source_options(overlay)
+    overlay.add_argument(
+        "--frame", type=int, metavar="K", help="index of the frame to draw (default: the middle one)"
+    )
+    overlay.add_argument(
+        "--before",
+        metavar="initial|dataset|FILE",
+        default="initial",
+        help="what to compare with: the result's own start (default), the data's nominal, or a file",
+    )
+    overlay.add_argument(
+        "--out",
+        type=Path,
+        default=Path("overlay.png"),
+        metavar="PNG",
+        help="picture to write (default %(default)s)",
+    )
+    overlay.add_argument("--overwrite", action="store_true", help="replace the picture")
+    return overlay
+
+
+def _add_source_options(command: argparse.ArgumentParser) -> None:
+    """How a drive is read."""
+    source = command.add_argument_group("data")
+    source.add_argument("--loader", default="auto", help="format of the drives: auto (default) or kitti")
+    source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
+    source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+    source.add_argument("--camera", default="image_2", help="camera folder (default %(default)s)")
+    source.add_argument("--cloud", default="velodyne", help="folder of the scans (default %(default)s)")
+    source.add_argument(
+        "--image-shift",
+        type=int,
+        default=0,
+        metavar="N",
+        help="pair scan k with image k+N, stamped as if it were image k: an offset of N frame times",
+    )
+    source.add_argument(
+        "--sweep",
+        choices=("auto", "instant", "azimuth"),
+        default="auto",
+        help="times of the points: stored ones where there are (auto), all at the stamp, or by azimuth",
+    )
+
+
+def _add_settings(command: argparse.ArgumentParser) -> None:
+    """Settings of the stage's configuration."""
+    settings = command.add_argument_group("settings")
+    settings.add_argument("--config", type=Path, metavar="FILE", help="settings as JSON or TOML")
+    settings.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="one setting, such as a.b=0.5 (repeatable; after --config)",
+    )

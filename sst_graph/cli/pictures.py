@@ -1,0 +1,84 @@
+"""Overlays of a drive: which frames, moved by which motion, compared with what."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError
+from sst_graph.odometry.lidar import lidar_odometry
+from sst_graph.result import CalibrationResult
+from sst_graph.types import Frame, SemanticClass, Source
+from sst_graph.viz import Placement, before_after, draw_overlay
+
+FloatArray = NDArray[np.float64]
+
+
+def position_of(source: Source, index: int) -> int:
+    """Position in the drive of the frame numbered ``index``.
+
+    Raises:
+        DataError: the drive has no such frame.
+    """
+    guess = index - source[0].index
+    if 0 <= guess < len(source) and source[guess].index == index:
+        return guess
+    for position, frame in enumerate(source):
+        if frame.index == index:
+            return position
+    raise DataError(source.name, f"no frame {index}", f"one of its {len(source)} frames")
+
+
+def overlay(
+    source: Source, position: int, result: CalibrationResult, before: Placement | None
+) -> NDArray[np.uint8]:
+    """Picture of one frame with the result, below ``before`` where there is one -> (h, w, 3) BGR.
+
+    Raises:
+        DataError: the frame lacks its scan or its image.
+    """
+    frame = source[position]
+    after = Placement(result.T_camera_lidar, _offset_of(result, source), "after")
+    c_twist = camera_twist(source, position, result.T_camera_lidar)
+    if before is None:
+        return draw_overlay(frame, source.camera, after.cTl, after.time_offset_s, c_twist, after.caption)
+    return before_after(frame, source.camera, before, after, c_twist)
+
+
+def camera_twist(source: Source, position: int, cTl: gtsam.Pose3) -> FloatArray | None:
+    """(6,) twist of the camera [rad/s, m/s] at a frame, by LiDAR odometry over it and its neighbours.
+
+    None where the motion cannot be told.
+    """
+    around = (source[i] for i in range(max(0, position - 1), min(len(source), position + 2)))
+    motions = lidar_odometry(frame.scan for frame in around if frame.scan is not None)
+    l_twists = [motion.mean_twist for motion in motions if motion.ok]
+    if not l_twists:
+        return None
+    return np.asarray(cTl.AdjointMap() @ np.mean(l_twists, axis=0))
+
+
+def telling_positions(source: Source, result: CalibrationResult, count: int) -> list[int]:
+    """Up to ``count`` positions spread over the frames used, each the richest in vehicles of a few."""
+    used = sorted(frame.frame for frame in result.frames_used if frame.drive == source.name)
+    chosen = []
+    for part in np.array_split(np.array(used, dtype=np.int64), max(1, min(count, len(used)))):
+        few = np.unique(np.linspace(0, len(part) - 1, 4).round().astype(np.int64)) if len(part) else part
+        positions = [position_of(source, int(index)) for index in part[few]]
+        worth = {position: _vehicle_points(source[position]) for position in positions}
+        chosen += [position for position in positions if worth[position] == max(worth.values()) >= 0][:1]
+    return chosen
+
+
+def _vehicle_points(frame: Frame) -> int:
+    """Number of vehicle points, -1 for a frame that cannot be drawn."""
+    if frame.scan is None or frame.image is None:
+        return -1
+    return int(np.count_nonzero(frame.scan.classes == SemanticClass.VEHICLE))
+
+
+def _offset_of(result: CalibrationResult, source: Source) -> float:
+    """The drive's own offset where the result has one for each drive [s]."""
+    own = {drive.drive: drive.time_offset_s for drive in result.drive_offsets}
+    return own.get(source.name, result.time_offset_s)
