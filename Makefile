@@ -1,0 +1,45 @@
+# Every target sets up what it needs: python3 >= 3.11 with venv, git and make are enough.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+WORKERS ?= 2
+
+# Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: setup test lint demo bench lock clean
+
+setup: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "Python 3.11 or newer is needed, found %d.%d (try make PYTHON=python3.12)" % v[:2])'
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) install -c constraints.txt setuptools
+	$(PIP) install -c constraints.txt --no-build-isolation -e '.[test]'
+	@touch $@
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+test: lint
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+demo: $(INSTALLED)
+	$(BIN)/sst-graph demo --out out/demo --overwrite
+
+bench: $(INSTALLED)
+	$(BIN)/python -m pytest benchmarks --benchmark-enable -n 0
+
+# Fresh versions of everything, in a throw-away environment.
+lock:
+	rm -rf build/lock && $(PYTHON) -m venv build/lock
+	build/lock/bin/python -m pip --disable-pip-version-check -q install 'setuptools>=77' -e '.[test]'
+	(sed -n '/^#/p' constraints.txt; build/lock/bin/python -m pip freeze --all --exclude-editable | grep -v '^pip==' | sort -f) > build/constraints.txt
+	mv build/constraints.txt constraints.txt && rm -rf build/lock
+
+clean:
+	rm -rf $(VENV) out build .mypy_cache .ruff_cache .pytest_cache .benchmarks

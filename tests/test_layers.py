@@ -1,0 +1,73 @@
+"""The one-way direction of imports, as the contracts of pyproject.toml state it."""
+
+from __future__ import annotations
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+from importlinter.cli import lint_imports
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def _imported(path: Path) -> set[str]:
+    """Top-level names that a module imports, wherever in it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def test_import_contracts_hold(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.chdir(ROOT)
+    code = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
+    assert code == 0, capsys.readouterr().out
+
+
+def test_factors_need_gtsam_and_numpy_only() -> None:
+    modules = sorted((ROOT / "factors").rglob("*.py"))
+    assert modules
+    allowed = {"factors", "gtsam", "numpy"} | set(sys.stdlib_module_names)
+    strangers = {str(path.relative_to(ROOT)): _imported(path) - allowed for path in modules}
+    assert {path: names for path, names in strangers.items() if names} == {}
+
+
+def test_no_module_is_called_utils() -> None:
+    modules = [*(ROOT / "factors").rglob("*.py"), *(ROOT / "sst_graph").rglob("*.py")]
+    assert [path.name for path in modules if path.stem in ("utils", "util", "helpers", "misc")] == []
+
+
+@pytest.mark.parametrize("package", ["factors", "sst_graph"])
+def test_modules_stay_short(package: str) -> None:
+    lengths = {
+        path.relative_to(ROOT): len(path.read_text(encoding="utf-8").splitlines())
+        for path in (ROOT / package).rglob("*.py")
+    }
+    assert {path: length for path, length in lengths.items() if length > 400} == {}
+
+
+@pytest.mark.parametrize("package", ["factors", "sst_graph"])
+def test_library_neither_prints_nor_exits(package: str) -> None:
+    offenders = []
+    for path in (ROOT / package).rglob("*.py"):
+        if path.is_relative_to(ROOT / "sst_graph" / "cli"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) in ("print", "exit", "sys.exit"):
+                offenders.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert offenders == []
+
+
+def test_functions_stay_within_sixty_lines() -> None:
+    long = []
+    for package in ("factors", "sst_graph"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.FunctionDef) and (node.end_lineno or 0) - node.lineno + 1 > 60:
+                    long.append(f"{path.relative_to(ROOT)}:{node.lineno} {node.name}")
+    assert long == []
