@@ -45,7 +45,7 @@ from .camera import MIN_DEPTH_M, PinholeCamera
 from .condensed import condense
 from .custom import custom_factor
 from .errors import FactorError
-from .motion import MotionModel, move_points
+from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
 from .robust import KernelKind, RobustKernel
 from .silhouette import silhouette_factor
 
@@ -56,6 +56,8 @@ __all__ = [
     "KernelKind",
     "MotionModel",
     "PinholeCamera",
+    "PointwiseMoved",
+    "RigidlyMoved",
     "RobustKernel",
     "alignment_cost",
     "condense",

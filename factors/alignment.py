@@ -18,11 +18,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .condensed import condense, cost_rows, gram
+from .condensed import condense, cost_rows
 from .custom import custom_factor
 from .errors import FactorError, checked_array
 from .matches import Alignment
-from .reprojection import alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
+from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
 
 __all__ = [
     "Alignment",
@@ -162,12 +162,10 @@ class _FrameResidual:
     def _state(self, values: Sequence[Any]) -> tuple[gtsam.Pose3, float, FloatArray]:
         return self.cTl.value(values), _scalar(self.offset_s.value(values)), self.c_twist.value(values)
 
-    def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[FloatArray, float]:
-        """Weighted [J r] of one alignment, (columns, rows), and its constant."""
-        motion = self.offset_s.slot is not None or self.c_twist.slot is not None
-        evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), True, motion)
-        constant = weigh(part.alignment, evaluated)
-        return evaluated.rows.reshape(len(evaluated.rows), -1), constant
+    def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[Evaluated, float]:
+        """Weighted [J r] of one alignment and its constant."""
+        evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), True)
+        return evaluated, weigh(part.alignment, evaluated)
 
     def cost(self, values: Sequence[Any]) -> float:
         total = 0.0
@@ -180,15 +178,16 @@ class _FrameResidual:
         G = np.zeros((self.cols + 1, self.cols + 1))
         constant = 0.0
         for part in self.parts:
-            rows, part_constant = self._weighted(part, values)
-            G[np.ix_(part.targets, part.targets)] += gram(rows)[np.ix_(part.columns, part.columns)]
+            evaluated, part_constant = self._weighted(part, values)
+            G[np.ix_(part.targets, part.targets)] += evaluated.gram()[np.ix_(part.columns, part.columns)]
             constant += part_constant
         return condense(G, constant)
 
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         blocks, constant = [], 0.0
         for part in self.parts:
-            rows, part_constant = self._weighted(part, values)
+            evaluated, part_constant = self._weighted(part, values)
+            rows = evaluated.system()
             block = np.zeros((rows.shape[1], self.cols + 1))
             block[:, part.targets] = rows[part.columns].T
             blocks.append(block)

@@ -9,6 +9,11 @@ SST-Calib (Kodaira et al., ITSC 2022), ``model="translation"``, has
     cP_i = cTl . lP_i - tau_i v_i,   v_i the linear part of w_i (the paper's v_k is -v).
 
 Points are columns here: (3, n); a Jacobian over k residual rows of n points is (cols, k, n).
+
+Where all points share one tau, the scan moves as one rigid body, cP_i = cTl' . lP_i, and every
+derivative factors through the six numbers L_i = [cP_i x g_i; g_i] of a residual's gradient g_i by cP_i
+(a wrench): J_i = lift . L_i with one (13, 6) matrix for all points. :class:`RigidlyMoved` keeps that
+form, which halves the work; :class:`PointwiseMoved` is the general case.
 """
 
 from __future__ import annotations
@@ -29,11 +34,18 @@ _SERIES_LIMIT = 1.0
 """Below this squared angle [rad^2] the power series (exact to 1e-16) stand in for the closed forms."""
 
 
+def write_cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """a x b over the first axis into ``out``; the other axes broadcast (np.cross is several times slower)."""
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        np.multiply(a[j], b[k], out=out[i])
+        out[i] -= a[k] * b[j]
+
+
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a x b over the first axis; the other axes broadcast (np.cross is several times slower)."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]],
-    )
+    """a x b over the first axis; the other axes broadcast."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    write_cross(a, b, out)
+    return out
 
 
 def left_jacobian_coefficients(squared_angles: FloatArray) -> FloatArray:
@@ -92,64 +104,68 @@ def _skew(a: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class MovedPoints:
-    """Points at their image's instant, and what their derivatives need.
+class RigidlyMoved:
+    """Points that share one tau.
 
     Attributes:
-        lPs: (3, n) points in the LiDAR [m].
         cPs: (3, n) points in the camera at the image's instant [m].
-        taus_s: interval of each point (n,), or one float for all [s].
-        cRls: (3, 3) rotation from the LiDAR to ``cPs``, or (3, 3, n).
-        xis: (6,) or (6, n) twist of the displacement, -tau w.
-        rates: (6,) or (6, n) -d xi / d tau = c_twist - tau c_acceleration.
-        model: "se3" or "translation".
+        lift: (13, 6), from a wrench to the derivatives by cTl (right perturbation, [rot, trans]), offset
+            and c_twist.
+    """
+
+    cPs: FloatArray
+    lift: FloatArray
+
+    def write_rows(self, g: FloatArray, out: FloatArray) -> None:
+        """Wrenches [cP x g; g] into out (6, k, n), from the gradients g (3, k, n) by cP."""
+        write_cross(self.cPs[:, None, :], g, out[:3])
+        out[3:] = g
+
+
+@dataclass(frozen=True)
+class PointwiseMoved:
+    """Points with a tau each.
+
+    Attributes:
+        lPs, cPs: (3, n) points in the LiDAR, and in the camera at the image's instant [m].
+        lift: None, :meth:`write_rows` gives the derivatives themselves.
+        taus_s: (n,) interval of each point [s].
+        cRl: (3, 3) rotation of the LiDAR in the camera, before the motion.
+        xis: (6, n) twist of the displacement, -tau w.
+        rates: (6, n) -d xi / d tau = c_twist - tau c_acceleration.
+        model: see :data:`MotionModel`.
     """
 
     lPs: FloatArray
     cPs: FloatArray
-    taus_s: FloatArray | float
-    cRls: FloatArray
+    lift: None
+    taus_s: FloatArray
+    cRl: FloatArray
     xis: FloatArray
     rates: FloatArray
     model: MotionModel
 
-    def pull_back(self, g: FloatArray, out: FloatArray, motion: bool = True) -> None:
-        """Derivatives of residuals from their gradients by cP.
+    def write_rows(self, g: FloatArray, out: FloatArray) -> None:
+        """Derivatives into out (13, k, n), columns as in :class:`RigidlyMoved`, from the gradients g."""
+        rotated = g if self.model == "translation" else _rotate(-self.xis[:3], g)
+        np.matmul(self.cRl.T, rotated.reshape(3, -1), out=out[3:6].reshape(3, -1))
+        write_cross(self.lPs[:, None, :], out[3:6], out[:3])
+        wrench = self._gradient_by_xi(g)
+        np.multiply(wrench, -self.taus_s, out=out[7:13])
+        np.einsum("in,ikn->kn", -self.rates, wrench, out=out[6])
 
-        Args:
-            g: (3, k, n) gradient of k residuals of each point by its cP.
-            out: (13, k, n), written: rows 0:6 by cTl (right perturbation, [rot, trans]), 6 by the
-                offset [1/s], 7:13 by c_twist.
-            motion: False writes zeros to rows 6:13 and saves their work.
-        """
-        n = self.lPs.shape[1]
-        if self.cRls.ndim == 2:
-            np.matmul(self.cRls.T, g.reshape(3, -1), out=out[3:6].reshape(3, -1))
-        else:
-            np.einsum("ijn,ikn->jkn", self.cRls, g, out=out[3:6])
-        out[0:3] = cross(self.lPs.reshape(3, 1, n), out[3:6])
-        if not motion:
-            out[6:13] = 0.0
-        else:
-            wrench = self._pull_to_twist(g)
-            np.multiply(wrench, -np.asarray(self.taus_s), out=out[7:13])
-            rates = self.rates.reshape(6, 1, -1)
-            out[6] = -(rates * wrench).sum(axis=0)
-
-    def _pull_to_twist(self, g: FloatArray) -> FloatArray:
-        """J_l(xi)^T [cP x g; g], (6, k, n): the gradient by xi."""
-        L = np.empty((6, *g.shape[1:]))
+    def _gradient_by_xi(self, g: FloatArray) -> FloatArray:
+        """J_l(xi)^T [cP x g; g], (6, k, n)."""
+        L = np.zeros((6, *g.shape[1:]))
+        L[3:] = g
         if self.model == "translation":
-            L[:3], L[3:] = 0.0, g
             return L
-        L[:3], L[3:] = cross(self.cPs.reshape(3, 1, -1), g), g
-        if self.xis.ndim == 1:
-            return np.asarray((se3_left_jacobian(self.xis).T @ L.reshape(6, -1)).reshape(L.shape))
+        write_cross(self.cPs[:, None, :], g, L[:3])
         omega, v = self.xis[:3, None, :], self.xis[3:, None, :]
-        coefficients = left_jacobian_coefficients((self.xis[:3] ** 2).sum(axis=0))
         result = L.copy()
-        for coefficient in coefficients:  # L <- ad(xi)^T L
-            L = np.concatenate([-cross(omega, L[:3]) - cross(v, L[3:]), -cross(omega, L[3:])])
+        for coefficient in left_jacobian_coefficients((self.xis[:3] ** 2).sum(axis=0)):
+            # L <- ad(xi)^T L = [L_omega x omega + L_v x v; L_v x omega]
+            L = np.concatenate([cross(L[:3], omega) + cross(L[3:], v), cross(L[3:], omega)])
             result += coefficient * L
         return result
 
@@ -161,46 +177,71 @@ def move_points(
     c_twist: FloatArray,
     c_acceleration: FloatArray,
     model: MotionModel = "se3",
-) -> MovedPoints:
-    """cP = Exp(-tau w) . (cTl . lP) for points lPs (3, n) [m]; taus_s (n,), or one float for all."""
-    R = np.asarray(cTl.rotation().matrix())
-    t = np.asarray(cTl.translation()).reshape(3, 1)
+) -> RigidlyMoved | PointwiseMoved:
+    """cP = Exp(-tau w) . (cTl . lP).
+
+    Args:
+        cTl: pose of the LiDAR in the camera.
+        lPs: (3, n) points in the LiDAR [m].
+        taus_s: (n,) interval of each point, or one float for all [s].
+        c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
+        c_acceleration: (6,) its rate of change [rad/s^2, m/s^2].
+        model: see :data:`MotionModel`.
+    """
     if isinstance(taus_s, float):
-        xis = -taus_s * (c_twist - 0.5 * taus_s * c_acceleration)
-        rates = c_twist - taus_s * c_acceleration
-    else:
-        xis = -taus_s * (c_twist[:, None] - 0.5 * taus_s * c_acceleration[:, None])
-        rates = c_twist[:, None] - taus_s * c_acceleration[:, None]
+        return _move_rigidly(cTl, lPs, taus_s, c_twist, c_acceleration, model)
+    R = np.asarray(cTl.rotation().matrix())
+    cPs = R @ lPs + np.asarray(cTl.translation()).reshape(3, 1)
+    xis = np.outer(c_twist, -taus_s) + np.outer(0.5 * c_acceleration, taus_s**2)
+    rates = c_twist[:, None] - np.outer(c_acceleration, taus_s)
+    cPs = cPs + xis[3:] if model == "translation" else _move(xis, cPs)
+    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, model)
+
+
+def _move_rigidly(
+    cTl: gtsam.Pose3,
+    lPs: FloatArray,
+    tau_s: float,
+    c_twist: FloatArray,
+    c_acceleration: FloatArray,
+    model: MotionModel,
+) -> RigidlyMoved:
+    xi = -tau_s * (c_twist - 0.5 * tau_s * c_acceleration)
+    rate = c_twist - tau_s * c_acceleration
     if model == "translation":
-        cPs = R @ lPs + t + xis[3:].reshape(3, -1)
-        return MovedPoints(lPs, cPs, taus_s, R, xis, rates, model)
-    if xis.ndim == 1:
-        cTl_moved = gtsam.Pose3.Expmap(xis) * cTl
-        R = np.asarray(cTl_moved.rotation().matrix())
-        cPs = R @ lPs + np.asarray(cTl_moved.translation()).reshape(3, 1)
-        return MovedPoints(lPs, cPs, taus_s, R, xis, rates, model)
-    Rs, ts = _exponentials(xis)
-    cRls = np.einsum("ijn,jk->ikn", Rs, R)
-    cPs = np.einsum("ijn,jn->in", Rs, R @ lPs + t) + ts
-    return MovedPoints(lPs, cPs, taus_s, cRls, xis, rates, model)
+        moved = gtsam.Pose3(cTl.rotation(), cTl.translation() + xi[3:])
+        left = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    else:
+        moved = gtsam.Pose3.Expmap(xi) * cTl
+        left = se3_left_jacobian(xi)
+    lift = np.empty((13, 6))
+    lift[0:6] = moved.AdjointMap().T
+    lift[6] = -left @ rate
+    lift[7:13] = -tau_s * left.T
+    R, t = np.asarray(moved.rotation().matrix()), np.asarray(moved.translation())
+    return RigidlyMoved(R @ lPs + t.reshape(3, 1), lift)
 
 
-def _exponentials(xis: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotations (3, 3, n) and translations (3, n) of Exp(xi) for xis (6, n)."""
+def _rotate(omegas: FloatArray, a: FloatArray) -> FloatArray:
+    """Exp(omega) a for omegas (3, n) and a (3, n) or (3, k, n), by Rodrigues' formula."""
+    theta = np.sqrt((omegas**2).sum(axis=0))
+    axis = omegas[:, None, :] if a.ndim == 3 else omegas
+    wa = cross(axis, a)
+    wwa = cross(axis, wa)
+    wa *= np.sinc(theta / np.pi)
+    wwa *= 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
+    wa += wwa
+    wa += a
+    return wa
+
+
+def _move(xis: FloatArray, points: FloatArray) -> FloatArray:
+    """Exp(xi) . p for xis (6, n) and points (3, n)."""
     omegas, vs = xis[:3], xis[3:]
     x = (omegas**2).sum(axis=0)
-    theta = np.sqrt(x)
-    a = np.sinc(theta / np.pi)
-    b = 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
-    c = _sine_remainder(x)
-    K = np.zeros((3, 3, xis.shape[1]))
-    K[2, 1], K[0, 2], K[1, 0] = omegas
-    K[1, 2], K[2, 0], K[0, 1] = -omegas
-    outer = omegas[:, None, :] * omegas[None, :, :]
-    Rs = a * K + b * outer
-    Rs[[0, 1, 2], [0, 1, 2]] += np.cos(theta)
     wv = cross(omegas, vs)
-    return Rs, vs + b * wv + c * cross(omegas, wv)
+    t = vs + 0.5 * np.sinc(np.sqrt(x) / (2.0 * np.pi)) ** 2 * wv + _sine_remainder(x) * cross(omegas, wv)
+    return np.asarray(_rotate(omegas, points) + t)
 
 
 def _sine_remainder(x: FloatArray) -> FloatArray:

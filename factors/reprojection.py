@@ -22,13 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import MIN_DEPTH_M, PinholeCamera
+from .condensed import gram
 from .errors import FactorError
 from .matches import Alignment
 from .motion import move_points
 
 FloatArray = NDArray[np.float64]
-_NO_BIAS = 13
-"""Columns [rot 0:3, trans 3:6, offset 6, twist 7:13]; a bias, where there is one, is column 13."""
 
 
 @overload
@@ -74,11 +73,10 @@ def residuals(
         trans, offset, twist (6), bias] [px/rad, px/m, px/s, ...]. Rows of points behind are zero.
     """
     evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians)
-    r = evaluated.rows[-1].reshape(-1)
     if not jacobians:
-        return r, None
-    cols = _NO_BIAS + (bias_px is not None)
-    return r, evaluated.rows[:cols].reshape(cols, -1).T
+        return evaluated.rows[-1].reshape(-1), None
+    system = evaluated.system()
+    return system[-1], system[:-1].T
 
 
 def weighted_residuals(
@@ -96,9 +94,8 @@ def weighted_residuals(
     """
     evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=True)
     constant = weigh(alignment, evaluated)
-    cols = _NO_BIAS + (bias_px is not None)
-    rows = evaluated.rows
-    return rows[-1].reshape(-1), rows[:cols].reshape(cols, -1).T, constant
+    system = evaluated.system()
+    return system[-1], system[:-1].T, constant
 
 
 def alignment_cost(
@@ -114,10 +111,34 @@ def alignment_cost(
 
 @dataclass(frozen=True)
 class Evaluated:
-    """rows: (cols + 1, k, n) Jacobian columns, then the residual; behind: (n,) or None where no point is."""
+    """Residuals of an alignment, and their derivatives in a short form.
+
+    Attributes:
+        rows: (m, k, n): rows that ``lift`` turns into the Jacobian's first 13 columns, the bias's column
+            where there is one, and the residual last.
+        lift: (13, 6), or None where the first 13 rows are the columns themselves.
+        behind: (n,) points behind the camera, or None where there is none.
+    """
 
     rows: FloatArray
+    lift: FloatArray | None
     behind: NDArray[np.bool_] | None
+
+    def system(self) -> FloatArray:
+        """[J r], column by column: (cols + 1, k n)."""
+        rows = self.rows.reshape(len(self.rows), -1)
+        return rows if self.lift is None else np.concatenate([self.lift @ rows[:6], rows[6:]])
+
+    def gram(self) -> FloatArray:
+        """(cols + 1, cols + 1) Gram matrix of [J r]."""
+        rows = self.rows.reshape(len(self.rows), -1)
+        short = gram(rows)
+        if self.lift is None:
+            return short
+        lift = np.zeros((len(rows) + 7, len(rows)))
+        lift[:13, :6] = self.lift
+        lift[13:, 6:] = np.eye(len(rows) - 6)
+        return np.asarray(lift @ short @ lift.T)
 
 
 def evaluate(
@@ -127,8 +148,8 @@ def evaluate(
     c_twist: FloatArray,
     bias_px: float | None,
     jacobians: bool,
-    motion: bool = True,
 ) -> Evaluated:
+    """Residuals and, where ``jacobians`` is true, their derivatives; arguments as in :func:`residuals`."""
     lPs, pixels, normals = alignment.columns
     if bias_px is not None and normals is None:
         raise FactorError(
@@ -148,19 +169,18 @@ def evaluate(
     error = np.empty((2, n))
     error[0] = camera.fx * x + (camera.cx - pixels[0])
     error[1] = camera.fy * y + (camera.cy - pixels[1])
-    cols = (_NO_BIAS + (bias_px is not None)) if jacobians else 0
-    rows = np.empty((cols + 1, k, n))
+    motion_rows = (13 if moved.lift is None else 6) if jacobians else 0
+    rows = np.empty((motion_rows + (jacobians and bias_px is not None) + 1, k, n))
     if normals is None:
         rows[-1] = error
     else:
         rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1] - (bias_px or 0.0)
     if jacobians:
-        moved.pull_back(_gradients(camera, x, y, inverse_z, normals), rows[:_NO_BIAS], motion)
-        if bias_px is not None:
-            rows[_NO_BIAS] = -1.0
+        moved.write_rows(_gradients(camera, x, y, inverse_z, normals), rows[:motion_rows])
+        rows[motion_rows:-1] = -1.0  # by the bias
     if any_behind:
         rows[:, :, behind] = 0.0
-    return Evaluated(rows, behind if any_behind else None)
+    return Evaluated(rows, moved.lift, behind if any_behind else None)
 
 
 def _gradients(

@@ -51,7 +51,7 @@ class RobustKernel:
         """rho(x), any shape."""
         x = np.asarray(x, dtype=np.float64)
         if self.kind == "none":
-            return 0.5 * np.square(x)
+            return np.asarray(0.5 * np.square(x))
         if self.kind == "huber":
             size = np.abs(x)
             inside = np.minimum(size, self.scale)
@@ -59,7 +59,7 @@ class RobustKernel:
         z = np.square(x / self.scale)
         half = 0.5 * self.scale**2
         if self.kind == "cauchy":
-            return half * np.log1p(z)
+            return np.asarray(half * np.log1p(z))
         if self.kind == "geman_mcclure":
-            return half * (z / (1.0 + z))
+            return np.asarray(half * (z / (1.0 + z)))
         return np.asarray(half / 3.0 * (1.0 - np.maximum(1.0 - z, 0.0) ** 3))
