@@ -42,17 +42,30 @@ from .alignment import (
     weighted_residuals,
 )
 from .camera import MIN_DEPTH_M, PinholeCamera
+from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
 from .condensed import condense
 from .custom import custom_factor
+from .delay import delay_drift, delay_prior, extrinsic_drift
 from .errors import FactorError
+from .hand_eye import hand_eye_factor, rotation_hand_eye
 from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
+from .regularizer import beta_regularizer
 from .robust import KernelKind, RobustKernel
 from .silhouette import silhouette_factor
+from .velocity import (
+    mean_velocity_factor,
+    twist_jerk_factor,
+    twist_smoothness_factor,
+    velocity_direction_factor,
+    velocity_factor,
+)
 
 __all__ = [
     "MIN_DEPTH_M",
     "Alignment",
     "FactorError",
+    "JacobianBlock",
+    "JacobianReport",
     "KernelKind",
     "MotionModel",
     "PinholeCamera",
@@ -60,13 +73,26 @@ __all__ = [
     "RigidlyMoved",
     "RobustKernel",
     "alignment_cost",
+    "beta_regularizer",
+    "check_gradient",
+    "check_jacobians",
     "condense",
     "custom_factor",
+    "delay_drift",
+    "delay_prior",
+    "extrinsic_drift",
     "frame_factor",
+    "hand_eye_factor",
+    "mean_velocity_factor",
     "move_points",
     "pixel_to_point_factor",
     "point_to_pixel_factor",
     "residuals",
+    "rotation_hand_eye",
     "silhouette_factor",
+    "twist_jerk_factor",
+    "twist_smoothness_factor",
+    "velocity_direction_factor",
+    "velocity_factor",
     "weighted_residuals",
 ]

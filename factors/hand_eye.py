@@ -1,0 +1,175 @@
+"""Motion-based factors: the LiDAR's own motion against the camera's, no common sight needed.
+
+    c1Tc2 = cTl . l1Tl2(d) . cTl^-1,    l1Tl2(d) = Exp(-l_twist_1 d) . l1Tl2 . Exp(l_twist_2 d)
+
+The camera moves from its stamp t1 to t2, on the LiDAR's clock from t1 + D to t2 + D. The LiDAR's motion
+l1Tl2 was measured over [t1 + offset_0, t2 + offset_0] and is carried by d = D - offset_0 at both ends
+with the LiDAR's twist there. Turns tie the rotation, and turns that begin or end tie the delay;
+translation along the axis of a plane motion stays free. Sources: Taylor & Nieto, Motion-based calibration
+of multimodal sensor extrinsics and timing offset estimation, T-RO 2016; Park et al., Spatiotemporal
+camera-LiDAR calibration, 2020.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .custom import ResidualFunction, custom_factor
+from .errors import FactorError, checked_array, checked_covariance
+
+FloatArray = NDArray[np.float64]
+
+LOW_TRANSLATION_M = 0.02
+"""Below this length [m] of the predicted translation its direction says less and less."""
+
+
+def hand_eye_factor(
+    E: int,
+    D: int | None,
+    c1Tc2: gtsam.Pose3,
+    l1Tl2: gtsam.Pose3,
+    l_twist_1: ArrayLike,
+    l_twist_2: ArrayLike,
+    offset_0: float,
+    covariance: ArrayLike,
+    scale_known: bool = True,
+) -> gtsam.CustomFactor:
+    """Log(c1Tc2^-1 . cTl . l1Tl2(d) . cTl^-1), predicted - measured [rad, m].
+
+    With ``scale_known=False`` the translation enters by its direction only: [Log of the rotation (rad);
+    t / sqrt(|t|^2 + s^2) - t_m / |t_m|], s = :data:`LOW_TRANSLATION_M`, t predicted, t_m measured.
+
+    Args:
+        E: extrinsic.
+        D: time offset, or None where the motions are known to be synchronous (d = 0).
+        c1Tc2: measured pose of the camera at 2 in the camera at 1; any length where the scale is unknown.
+        l1Tl2: measured pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``offset_0``.
+        l_twist_1, l_twist_2: (6,) twist of the LiDAR in its own frame at both ends [rad/s, m/s].
+        offset_0: the time offset at which l1Tl2 was measured [s].
+        covariance: (6, 6) of the error [rot, trans], right perturbation of c1Tc2: both motions' together,
+            that of the LiDAR carried to the camera. With an unknown scale its part across the translation,
+            divided by the length that c1Tc2 has, is the direction's [rad^2]; that along it is not used.
+        scale_known: see above.
+    """
+    motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, offset_0)
+    measured_covariance = checked_covariance("covariance of the hand-eye error", covariance, 6)
+    if not scale_known:
+        t = np.asarray(c1Tc2.translation())
+        length = float(np.linalg.norm(t))
+        if length == 0.0:
+            raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
+        noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, measured_covariance))
+        return _factor(
+            E, D, _direction_function(motion, c1Tc2.rotation(), t / length, D is not None), noise, 6
+        )
+
+    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
+        predicted, P_H = motion.in_camera(cTl, offset)
+        difference = c1Tc2.between(predicted)
+        error = gtsam.Pose3.Logmap(difference)
+        if not jacobians:
+            return error, None
+        Log_H = gtsam.Pose3.LogmapDerivative(error)
+        return error, [Log_H @ H for H in P_H]
+
+    return _factor(E, D, function, gtsam.noiseModel.Gaussian.Covariance(measured_covariance), 6)
+
+
+def rotation_hand_eye(
+    E: int,
+    D: int | None,
+    c1Rc2: gtsam.Rot3,
+    l1Rl2: gtsam.Rot3,
+    l_omega_1: ArrayLike,
+    l_omega_2: ArrayLike,
+    offset_0: float,
+    covariance: ArrayLike,
+) -> gtsam.CustomFactor:
+    """Log(c1Rc2^-1 . cRl . l1Rl2(d) . cRl^-1) [rad]; arguments as in :func:`hand_eye_factor`, rotation only.
+
+    The Jacobian by the extrinsic's translation is zero: something else must hold it.
+    """
+    twists = [
+        np.concatenate([checked_array("l_omega", w, (3,)), np.zeros(3)]) for w in (l_omega_1, l_omega_2)
+    ]
+    motion = _LidarMotion(gtsam.Pose3(l1Rl2, np.zeros(3)), twists[0], twists[1], offset_0)
+    noise = gtsam.noiseModel.Gaussian.Covariance(
+        checked_covariance("covariance of the rotation", covariance, 3)
+    )
+
+    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
+        predicted, P_H = motion.in_camera(cTl, offset)
+        error = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
+        if not jacobians:
+            return error, None
+        Log_H = gtsam.Rot3.LogmapDerivative(error)
+        return error, [Log_H @ H[:3] for H in P_H]
+
+    return _factor(E, D, function, noise, 3)
+
+
+def _factor(E: int, D: int | None, function: ResidualFunction, noise: Any, rows: int) -> gtsam.CustomFactor:
+    keys, dims = ([E], [6]) if D is None else ([E, D], [6, 1])
+    return custom_factor(noise, keys, function, dims, rows)
+
+
+class _LidarMotion:
+    """l1Tl2(d), and the camera's motion that it predicts."""
+
+    def __init__(self, l1Tl2: gtsam.Pose3, twist_1: ArrayLike, twist_2: ArrayLike, offset_0: float) -> None:
+        self.l1Tl2 = l1Tl2
+        self.twist_1 = checked_array("l_twist_1", twist_1, (6,))
+        self.twist_2 = checked_array("l_twist_2", twist_2, (6,))
+        self.offset_0 = float(checked_array("offset_0", [offset_0], (1,))[0])
+
+    def in_camera(
+        self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...]
+    ) -> tuple[gtsam.Pose3, list[FloatArray]]:
+        """cTl . l1Tl2(d) . cTl^-1 and its Jacobians (6, dim) by cTl [and the offset], right perturbations."""
+        d = float(offset[0][0]) - self.offset_0 if offset else 0.0
+        moved = gtsam.Pose3.Expmap(-d * self.twist_1) * self.l1Tl2 * gtsam.Pose3.Expmap(d * self.twist_2)
+        back, cAd = moved.inverse().AdjointMap(), cTl.AdjointMap()
+        H = [cAd @ (back - np.eye(6))]
+        if offset:
+            H.append((cAd @ (self.twist_2 - back @ self.twist_1)).reshape(6, 1))
+        return cTl * moved * cTl.inverse(), H
+
+
+def _direction_function(
+    motion: _LidarMotion, c1Rc2: gtsam.Rot3, direction: FloatArray, with_offset: bool
+) -> ResidualFunction:
+    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
+        predicted, P_H = motion.in_camera(cTl, offset)
+        log = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
+        t = np.asarray(predicted.translation())
+        length = np.sqrt(t @ t + LOW_TRANSLATION_M**2)
+        error = np.concatenate([log, t / length - direction])
+        if not jacobians:
+            return error, None
+        P = np.zeros((6, 6))
+        P[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
+        # t of P Exp([w, v]) is t + R v
+        P[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
+        return error, [P @ H for H in P_H]
+
+    return function
+
+
+def _direction_covariance(c1Tc2: gtsam.Pose3, covariance: FloatArray) -> FloatArray:
+    """(6, 6) of [rotation, unit direction] from that of the pose.
+
+    Across the direction it is the pose's, by length; along it, where the difference of two unit vectors
+    is of second order, the mean of the two across keeps it regular.
+    """
+    t = np.asarray(c1Tc2.translation())
+    length = np.linalg.norm(t)
+    d = t / length
+    transfer = np.eye(6)
+    transfer[3:, 3:] = (np.eye(3) - np.outer(d, d)) / length @ c1Tc2.rotation().matrix()
+    result = transfer @ covariance @ transfer.T
+    result[3:, 3:] += 0.5 * np.trace(result[3:, 3:]) * np.outer(d, d)
+    return np.asarray(0.5 * (result + result.T))

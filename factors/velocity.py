@@ -1,0 +1,159 @@
+"""Factors on the camera's twist at each image: measured velocity, mean motion, smoothness.
+
+Twists are ``Vector(6)`` = [omega, v] of the camera in its own frame [rad/s, m/s].
+"""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .custom import custom_factor
+from .errors import FactorError, checked_array, checked_covariance, checked_positive
+
+FloatArray = NDArray[np.float64]
+
+LOW_SPEED_MPS = 0.5
+"""Below this speed [m/s] a direction of motion says less and less; see velocity_direction_factor."""
+
+
+def velocity_factor(V_key: int, c_twist: ArrayLike, covariance: ArrayLike) -> gtsam.PriorFactorVector:
+    """V - c_twist, with the (6, 6) covariance of the measured twist (visual odometry, one frame)."""
+    measured = checked_array("c_twist", c_twist, (6,))
+    noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
+    return gtsam.PriorFactorVector(V_key, measured, noise)
+
+
+def velocity_direction_factor(
+    V_key: int,
+    omega: ArrayLike,
+    direction: ArrayLike,
+    speed_mps: float,
+    sigma_omega: float,
+    sigma_direction_rad: float,
+    sigma_speed_mps: float,
+    low_speed_mps: float = LOW_SPEED_MPS,
+) -> gtsam.CustomFactor:
+    """[omega_V - omega; B^T v / sqrt(|v|^2 + s^2); d . v - speed], for odometry whose scale is apart.
+
+    The five-point method gives a rotation and a direction d; the metric speed comes from elsewhere with
+    another sigma. B (3, 2) spans the plane normal to d, so that at speed rows 3 and 4 are the angle from
+    d to v [rad]; at a speed below s they turn into B^T v / s, which bounds what a direction may claim:
+    a sigma of sigma_direction_rad * max(|v|, s) [m/s] across d, without a singularity at rest. The sign
+    of d is decided by the last row.
+
+    Args:
+        V_key: twist.
+        omega: (3,) rotation rate in the camera frame [rad/s].
+        direction: (3,) direction of the camera's motion in its own frame, any length but zero.
+        speed_mps: metric speed along the direction [m/s].
+        sigma_omega: rad/s, each axis.
+        sigma_direction_rad: rad, each of the two axes.
+        sigma_speed_mps: m/s.
+        low_speed_mps: s [m/s].
+    """
+    measured_omega = checked_array("omega", omega, (3,))
+    d = checked_array("direction", direction, (3,))
+    length = float(np.linalg.norm(d))
+    if length == 0.0:
+        raise FactorError("direction", "the zero vector", "a direction")
+    d = d / length
+    speed = float(checked_array("speed_mps", [speed_mps], (1,))[0])
+    s = checked_positive("low_speed_mps", low_speed_mps)
+    across = np.asarray(gtsam.Unit3(d).basis()).T  # (2, 3)
+    sigmas = [checked_positive("sigma_omega", sigma_omega)] * 3
+    sigmas += [checked_positive("sigma_direction_rad", sigma_direction_rad)] * 2
+    sigmas += [checked_positive("sigma_speed_mps", sigma_speed_mps)]
+
+    def function(twist: FloatArray, *, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        v = twist[3:]
+        smooth_speed = np.sqrt(v @ v + s * s)
+        sideways = across @ v / smooth_speed
+        error = np.concatenate([twist[:3] - measured_omega, sideways, [d @ v - speed]])
+        if not jacobians:
+            return error, None
+        H = np.zeros((6, 6))
+        H[:3, :3] = np.eye(3)
+        H[3:5, 3:] = across / smooth_speed - np.outer(sideways, v) / smooth_speed**2
+        H[5, 3:] = d
+        return error, [H]
+
+    return custom_factor(gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas)), [V_key], function, [6], 6)
+
+
+def mean_velocity_factor(
+    V_a: int, V_b: int, mean_twist: ArrayLike, covariance: ArrayLike
+) -> gtsam.CustomFactor:
+    """(V_a + V_b) / 2 - mean_twist: odometry from image a to b measures the mean twist between them.
+
+    Args:
+        V_a, V_b: twists at the two images.
+        mean_twist: (6,) Log(aTb) / interval [rad/s, m/s].
+        covariance: (6, 6) of the mean twist.
+    """
+    measured = checked_array("mean_twist", mean_twist, (6,))
+    noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
+    half = 0.5 * np.eye(6)
+
+    def function(
+        a: FloatArray, b: FloatArray, *, jacobians: bool
+    ) -> tuple[FloatArray, list[FloatArray] | None]:
+        return 0.5 * (a + b) - measured, [half, half] if jacobians else None
+
+    return custom_factor(noise, [V_a, V_b], function, [6, 6], 6)
+
+
+def twist_smoothness_factor(
+    V_a: int, V_b: int, seconds: float, sigma_rot_acc: float, sigma_lin_acc: float
+) -> gtsam.BetweenFactorVector:
+    """V_b - V_a with sigma = seconds * [sigma_rot_acc, sigma_lin_acc]: a limit on the mean acceleration.
+
+    Args:
+        V_a, V_b: twists, b after a.
+        seconds: from a to b [s].
+        sigma_rot_acc: rad/s^2, each axis.
+        sigma_lin_acc: m/s^2, each axis.
+    """
+    sigmas = _sigmas_by_kind("acc", sigma_rot_acc, sigma_lin_acc) * checked_positive("seconds", seconds)
+    return gtsam.BetweenFactorVector(V_a, V_b, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+
+
+def twist_jerk_factor(
+    V_a: int,
+    V_b: int,
+    V_c: int,
+    seconds_ab: float,
+    seconds_bc: float,
+    sigma_rot_jerk: float,
+    sigma_lin_jerk: float,
+) -> gtsam.CustomFactor:
+    """((V_c - V_b) / s_bc - (V_b - V_a) / s_ab) / ((s_ab + s_bc) / 2): a limit on the jerk.
+
+    Zero under any constant acceleration, also with unequal intervals.
+
+    Args:
+        V_a, V_b, V_c: twists in the order of time.
+        seconds_ab, seconds_bc: intervals [s].
+        sigma_rot_jerk: rad/s^3, each axis.
+        sigma_lin_jerk: m/s^3, each axis.
+    """
+    ab, bc = checked_positive("seconds_ab", seconds_ab), checked_positive("seconds_bc", seconds_bc)
+    middle = 0.5 * (ab + bc)
+    scales = np.array([1.0 / ab, -1.0 / ab - 1.0 / bc, 1.0 / bc]) / middle
+    H = [scale * np.eye(6) for scale in scales]
+    noise = gtsam.noiseModel.Diagonal.Sigmas(_sigmas_by_kind("jerk", sigma_rot_jerk, sigma_lin_jerk))
+
+    def function(
+        a: FloatArray, b: FloatArray, c: FloatArray, *, jacobians: bool
+    ) -> tuple[FloatArray, list[FloatArray] | None]:
+        return scales[0] * a + scales[1] * b + scales[2] * c, list(H) if jacobians else None
+
+    return custom_factor(noise, [V_a, V_b, V_c], function, [6, 6, 6], 6)
+
+
+def _sigmas_by_kind(name: str, rotation: float, translation: float) -> FloatArray:
+    return np.repeat(
+        [checked_positive(f"sigma_rot_{name}", rotation), checked_positive(f"sigma_lin_{name}", translation)],
+        3,
+    )
