@@ -1,0 +1,290 @@
+"""Metric camera motion between two images: tracks, some of which have LiDAR depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.odometry.depth import DepthConfig, InverseDepths, inverse_depths
+from sst_graph.odometry.features import Tracks
+from sst_graph.odometry.relative import DirectionMotion, huber_weights, rays, skew
+from sst_graph.types import RelativeMotion
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MIN_SCALED_DEPTH = 1e-2
+"""Points are kept at least this part of their depth in front of camera b."""
+PAIR_KNEE, PAIR_GATE = 2.0, 4.5
+"""Whitened size of a residual pair from which it is down-weighted, and from which it is left out."""
+
+
+@dataclass(frozen=True)
+class MetricConfig:
+    """How metric motion is estimated from tracks and depth.
+
+    Attributes:
+        depth: how depth is interpolated at features.
+        min_depths: fewest features with depth from which a metric motion is estimated.
+        min_noise_px: track noise is never taken smaller than this [px].
+        nearest_m: no feature lies nearer than this [m].
+        prior_inverse_m, prior_sigma_inverse_m: inverse depth expected where none is measured, and its
+            sigma [1/m]; so wide that it tells nothing of the length, yet at standstill it makes
+            such a track a full constraint on the rotation.
+        iterations: Gauss-Newton steps.
+        scale_sigma: relative sigma of the length that all depths share (calibration, interpolation).
+        floor_rad, floor_m: sigmas added to every motion for what tracks share [rad, m].
+        failed_rad, failed_m: sigmas of a motion that could not be estimated [rad, m].
+    """
+
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    min_depths: int = 10
+    min_noise_px: float = 0.05
+    nearest_m: float = 1.0
+    prior_inverse_m: float = 0.05
+    prior_sigma_inverse_m: float = 0.1
+    iterations: int = 15
+    scale_sigma: float = 0.006
+    floor_rad: float = 1e-4
+    floor_m: float = 2e-3
+    failed_rad: float = 0.1
+    failed_m: float = 3.0
+
+
+def metric_motion(
+    tracks: Tracks,
+    direction_motion: DirectionMotion,
+    depth_points_c: FloatArray,
+    camera: PinholeCamera,
+    config: MetricConfig | None = None,
+) -> RelativeMotion:
+    """Pose of camera b in camera a with covariance, from reprojection of every track.
+
+    uv_b = project(aRb^T (f_a - rho t)), rho the inverse depth of the feature: measured where LiDAR
+    points surround it, else free (then only the distance from the epipolar line counts).
+
+    Args:
+        tracks: from image a to image b.
+        direction_motion: start of the estimation, see :func:`relative_pose`.
+        depth_points_c: (m, 3) LiDAR points in camera a at the instant of image a [m].
+        camera: intrinsics of both images.
+        config: thresholds.
+    """
+    config = config or MetricConfig()
+    depths = inverse_depths(tracks.uv_a, depth_points_c, camera, config.depth)
+    return motion_from_depths(tracks, direction_motion, depths, camera, config)
+
+
+def motion_from_depths(
+    tracks: Tracks,
+    direction_motion: DirectionMotion,
+    depths: InverseDepths,
+    camera: PinholeCamera,
+    config: MetricConfig,
+) -> RelativeMotion:
+    """:func:`metric_motion` with the inverse depth of each track already known."""
+    if np.count_nonzero(depths.known) < config.min_depths:
+        return _failed(tracks, direction_motion, config)
+    known = depths.known
+    rho = np.where(known, depths.value, config.prior_inverse_m)
+    sigma = np.where(known, depths.sigma, config.prior_sigma_inverse_m)
+    problem = _Problem(rays(tracks.uv_a, camera), tracks.uv_b, rho, sigma, known, camera, config)
+    # 1. The best of a few starts.
+    pose = min(_starts(problem, direction_motion), key=problem.cost)
+    # 2. Robust Gauss-Newton, the noise measured along the way.
+    noise = direction_motion.noise_px
+    for _ in range(config.iterations):
+        terms, noise = problem.linearize(pose, noise)
+        step = np.linalg.solve(terms.information + 1e-9 * np.eye(6), -terms.gradient)
+        pose = pose.retract(step)
+        if np.abs(step).max() < 1e-7:
+            break
+    terms, _ = problem.linearize(pose, noise)
+    if terms.depth_inliers < config.min_depths:
+        return _failed(tracks, direction_motion, config)
+    # 3. Covariance, with what all tracks share.
+    covariance = terms.covariance()
+    t = pose.rotation().matrix().T @ pose.translation()
+    covariance[3:, 3:] += config.scale_sigma**2 * np.outer(t, t)
+    covariance += np.diag(np.repeat([config.floor_rad, config.floor_m], 3) ** 2)
+    return RelativeMotion(tracks.from_ns, tracks.to_ns, pose, covariance)
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """A linearized problem in whitened units.
+
+    Attributes:
+        information, gradient: (6, 6), (6,) with robust weights.
+        plain: (6, 6) information of the inliers without weights.
+        efficiency: variance that the weights cost (Huber 1981, eq. 7.6.7).
+        depth_inliers: number of tracks with depth that agree.
+    """
+
+    information: FloatArray
+    gradient: FloatArray
+    plain: FloatArray
+    efficiency: float
+    depth_inliers: int
+
+    def covariance(self) -> FloatArray:
+        """(6, 6) of the pose, right perturbation."""
+        return np.asarray(self.efficiency * np.linalg.inv(self.plain + 1e-9 * np.eye(6)))
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Pixels, predicted minus measured, turned along and across the epipolar lines.
+
+    Attributes:
+        value: (n, 2) [along, across], the depth at its measured or expected value [px].
+        J: (n, 2, 6) derivative by the pose [px/rad, px/m].
+        slope: (n,) pixels along the line per inverse depth [px m].
+    """
+
+    value: FloatArray
+    J: FloatArray
+    slope: FloatArray
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Tracks as constraints on aTb.
+
+    Attributes:
+        fa: (n, 3) rays in camera a.
+        uv_b: (n, 2) [px].
+        rho, sigma: (n,) inverse depth and its sigma, the prior's where it is not measured [1/m].
+        measured: (n,) whether it is.
+        camera: intrinsics.
+        config: thresholds.
+    """
+
+    fa: FloatArray
+    uv_b: FloatArray
+    rho: FloatArray
+    sigma: FloatArray
+    measured: BoolArray
+    camera: PinholeCamera
+    config: MetricConfig
+
+    def cost(self, pose: gtsam.Pose3) -> float:
+        """Mean truncated residual [px], by which starts are compared."""
+        value = self._residuals(pose, 1.0).value
+        sizes = np.abs(np.concatenate([value[:, 1], value[self.measured, 0]]))
+        return float(np.mean(np.minimum(sizes, 5.0)))
+
+    def linearize(self, pose: gtsam.Pose3, noise_px: float) -> tuple[_Terms, float]:
+        """Normal equations at a pose, and the noise of the tracks found there [px]."""
+        residuals = self._residuals(pose, noise_px)
+        noise = max(self.config.min_noise_px, robust_sigma(residuals.value[:, 1]))
+        along_sigma = np.hypot(noise, residuals.slope * self.sigma)
+        if self.measured.any():
+            # Depths that fit worse than they claim count for less.
+            misfit = robust_sigma((residuals.value[:, 0] / along_sigma)[self.measured])
+            along_sigma = np.where(self.measured, along_sigma * max(1.0, misfit), along_sigma)
+        whitener = np.stack([1.0 / along_sigma, np.full(len(self.fa), 1.0 / noise)], axis=1)
+        r = residuals.value * whitener
+        J = residuals.J * whitener[:, :, None]
+        # A track is good or bad as a whole: one weight for both of its rows.
+        size = np.linalg.norm(r, axis=1)
+        weight = huber_weights(size, PAIR_KNEE, PAIR_GATE)
+        kept = weight > 0.0
+        weighted = (weight[:, None, None] * J).reshape(-1, 6)
+        flat = J[kept].reshape(-1, 6)
+        # The row along the line of a free depth counts by what is known of it.
+        share = np.stack([np.where(self.measured, 1.0, (noise / along_sigma) ** 2), np.ones(len(r))], axis=1)
+        score = float(np.sum(share * (weight[:, None] * r) ** 2) / max(np.sum(share[kept]), 1e-9))
+        slope = np.where(size < PAIR_KNEE, 1.0, 0.5 * weight)[kept]
+        terms = _Terms(
+            weighted.T @ J.reshape(-1, 6),
+            weighted.T @ r.reshape(-1),
+            flat.T @ flat,
+            score / max(float(np.mean(slope)) if kept.any() else 1.0, 0.1) ** 2,
+            int(np.count_nonzero(kept & self.measured)),
+        )
+        return terms, noise
+
+    def _residuals(self, pose: gtsam.Pose3, noise_px: float) -> _Residuals:
+        """Residuals at a pose; free depths are set to fit the track and their prior."""
+        focal = np.array([self.camera.fx, self.camera.fy])
+        bRa = pose.rotation().matrix().T
+        far, shift = self.fa @ bRa.T, bRa @ pose.translation()
+        q = far - self.rho[:, None] * shift
+        along = self._slopes(q, shift)
+        slope = np.linalg.norm(along, axis=1)
+        line = np.where(slope[:, None] > 1e-9, along / np.maximum(slope, 1e-9)[:, None], [1.0, 0.0])
+        # 1. Depth of the free tracks: where the line passes the measured pixel, and the prior.
+        centred = self.uv_b - [self.camera.cx, self.camera.cy]
+        row = np.column_stack([line * focal, -np.einsum("ij,ij->i", line, centred)])
+        top, bottom = np.einsum("ij,ij->i", row, far), row @ shift
+        fit = np.clip(top / np.where(np.abs(bottom) > 1e-9, bottom, np.inf), 0.0, 1.0 / self.config.nearest_m)
+        gain = slope**2 / noise_px**2
+        blend = (gain * fit + self.rho / self.sigma**2) / (gain + 1.0 / self.sigma**2)
+        rho = np.where(self.measured, self.rho, blend)
+        # 2. Residual and slope there, the depth moved back to what is known of it.
+        q = far - rho[:, None] * shift
+        q[:, 2] = np.maximum(q[:, 2], MIN_SCALED_DEPTH)
+        slope = np.einsum("ij,ij->i", self._slopes(q, shift), line)
+        error = q[:, :2] / q[:, 2:] * focal - centred
+        turn = np.stack([line, np.column_stack([-line[:, 1], line[:, 0]])], axis=1)
+        value = np.einsum("nij,nj->ni", turn, error)
+        value[:, 0] += slope * (self.rho - rho)
+        # 3. The fitted depth leans on the noise along the line: it may turn only the row across.
+        q_H_pose = np.concatenate([skew(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)
+        J = turn @ self.camera.uv_H_cP(q) @ q_H_pose
+        J[:, 0, 3:] *= self.rho[:, None]
+        J[:, 1, 3:] *= rho[:, None]
+        return _Residuals(value, J, slope)
+
+    def _slopes(self, q: FloatArray, shift: FloatArray) -> FloatArray:
+        """(n, 2) derivative of the pixel by the inverse depth [px m]."""
+        z = np.maximum(q[:, 2], MIN_SCALED_DEPTH)
+        x, y = q[:, 0] / z, q[:, 1] / z
+        return np.column_stack(
+            [
+                self.camera.fx * (x * shift[2] - shift[0]) / z,
+                self.camera.fy * (y * shift[2] - shift[1]) / z,
+            ]
+        )
+
+
+def _starts(problem: _Problem, motion: DirectionMotion) -> list[gtsam.Pose3]:
+    """Poses from which to begin: rotation alone, and the direction with its length and sign from depth."""
+    starts = [gtsam.Pose3(motion.rotation, np.zeros(3))]
+    if motion.ok:
+        bRa = motion.rotation.matrix().T
+        fa, rho = problem.fa[problem.measured], problem.rho[problem.measured]
+        far, shift = fa @ bRa.T, bRa @ motion.direction
+        uv = problem.uv_b[problem.measured]
+        x = (uv[:, 0] - problem.camera.cx) / problem.camera.fx
+        y = (uv[:, 1] - problem.camera.cy) / problem.camera.fy
+        # (far - s rho shift) is parallel to [x, y, 1]: two equations in the length s, weighted by their size.
+        top = np.concatenate([far[:, 0] - x * far[:, 2], far[:, 1] - y * far[:, 2]])
+        bottom = np.concatenate([rho * (shift[0] - x * shift[2]), rho * (shift[1] - y * shift[2])])
+        length = weighted_median(top / np.where(bottom == 0.0, np.inf, bottom), np.abs(bottom))
+        starts.append(gtsam.Pose3(motion.rotation, length * motion.direction))
+    return starts
+
+
+def weighted_median(values: FloatArray, weights: FloatArray) -> float:
+    """Value at which half of the weight is reached."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][min(int(np.searchsorted(total, 0.5 * total[-1])), len(values) - 1)])
+
+
+def robust_sigma(values: FloatArray) -> float:
+    """Sigma of values about zero by their median size."""
+    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+
+
+def _failed(tracks: Tracks, motion: DirectionMotion, config: MetricConfig) -> RelativeMotion:
+    """The rotation, if it is known, and no idea of the translation."""
+    sigmas = np.repeat([config.failed_rad, config.failed_m], 3)
+    pose = gtsam.Pose3(motion.rotation, np.zeros(3))
+    return RelativeMotion(tracks.from_ns, tracks.to_ns, pose, np.diag(sigmas**2), ok=False)

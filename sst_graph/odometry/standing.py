@@ -1,0 +1,68 @@
+"""Frames at which the vehicle stands, found from its motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.types import RelativeMotion
+
+
+@dataclass(frozen=True)
+class StandingConfig:
+    """What counts as standing.
+
+    Attributes:
+        max_speed_mps: fastest that a standing sensor may seem to move [m/s].
+        max_turn_radps: fastest that it may seem to turn [rad/s].
+        certainty: the speed plus this many of its sigmas must stay below twice ``max_speed_mps``.
+        min_motions: fewest consecutive motions at rest that make a stop.
+    """
+
+    max_speed_mps: float = 0.07
+    max_turn_radps: float = 0.03
+    certainty: float = 2.0
+    min_motions: int = 2
+
+
+def standing_frames(
+    motions: Sequence[RelativeMotion], config: StandingConfig | None = None
+) -> NDArray[np.bool_]:
+    """(n + 1,) whether each frame of n consecutive motions stands still.
+
+    A frame stands when the motion before it and the motion after it are both at rest (at either end
+    of the drive: the one there is), as part of a stop of at least ``min_motions``. A motion that
+    failed, or is known too poorly to tell rest from rolling, is never at rest.
+    """
+    config = config or StandingConfig()
+    at_rest = np.array([_at_rest(motion, config) for motion in motions], np.bool_)
+    at_rest &= _run_lengths(at_rest) >= config.min_motions
+    before = np.concatenate([at_rest[:1], at_rest])
+    after = np.concatenate([at_rest, at_rest[-1:]])
+    return before & after if len(motions) else np.zeros(1, np.bool_)
+
+
+def _at_rest(motion: RelativeMotion, config: StandingConfig) -> bool:
+    """Whether a motion is surely below the speeds of the configuration."""
+    if not motion.ok:
+        return False
+    twist = motion.mean_twist
+    turn, speed = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / motion.seconds
+    return (
+        speed < config.max_speed_mps
+        and turn < config.max_turn_radps
+        and speed + config.certainty * sigma < 2.0 * config.max_speed_mps
+    )
+
+
+def _run_lengths(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(n,) length of the run of equal flags that each belongs to, 0 where the flag is False."""
+    if len(flags) == 0:
+        return np.zeros(0, np.int64)
+    starts = np.flatnonzero(np.concatenate([[True], flags[1:] != flags[:-1]]))
+    lengths = np.diff(np.concatenate([starts, [len(flags)]]))
+    return np.asarray(np.repeat(lengths, lengths) * flags, np.int64)
