@@ -18,13 +18,18 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     """Files of a folder by the number that their name is ("000012.bin" -> 12), sorted.
 
     Raises:
-        DataError: no such folder, no such file in it, or two files with one number.
+        DataError: no such folder or one that cannot be listed, no such file in it, or two files
+            with one number.
     """
     expected = f"files 000000{suffixes[0]}, 000001{suffixes[0]}, ..."
     if not folder.is_dir():
         raise DataError(folder, "no folder", expected)
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise DataError(folder, f"an unreadable folder ({error.strerror})", expected) from None
     files: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
+    for path in entries:
         if path.suffix.lower() not in suffixes or not path.stem.isdecimal():
             continue
         if int(path.stem) in files:

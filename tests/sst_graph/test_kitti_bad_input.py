@@ -40,7 +40,11 @@ def remove(name: str) -> Damage:
 
 
 def emptied(name: str) -> Damage:
-    return lambda drive: [path.unlink() for path in (drive / name).iterdir()]
+    def damage(drive: Path) -> None:
+        for path in (drive / name).iterdir():
+            path.unlink()
+
+    return damage
 
 
 def text(name: str, content: str) -> Damage:
