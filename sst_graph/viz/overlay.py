@@ -34,6 +34,9 @@ CLASS_COLOURS: dict[SemanticClass, Colour] = {
 """BGR of the points by class; a class that is not named here is grey."""
 OTHER_COLOUR: Colour = (150, 150, 150)
 
+MIN_WIDTH_PX = 720
+"""Smaller pictures are enlarged by a whole factor to at least this width."""
+
 TIME_STEP_S = 0.5e-3
 """Points of a rolling sweep are moved in steps of this [s]; at 15 m/s the rest is 4 mm."""
 
@@ -81,6 +84,7 @@ def draw_overlay(
     outside = ~inside & (mask_class != SemanticClass.IGNORE)
     _draw_points(picture, vehicles[inside], IN_MASK, 2)
     _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
+    picture = _enlarged(picture)
     return np.vstack([_strip(picture.shape[1], caption, int(inside.sum()), int(outside.sum())), picture])
 
 
@@ -125,7 +129,7 @@ def _projected(
     c_twist: FloatArray | None,
 ) -> tuple[FloatArray, NDArray[np.uint8]]:
     """Pixels (m, 2) and classes (m,) of the points that fall on the image, far ones first."""
-    cPs = cTl.transformFrom(scan.points.astype(np.float64).T).T
+    cPs = _transformed(cTl, scan.points.astype(np.float64))
     if c_twist is not None:
         tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + offset_s
         offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
@@ -144,14 +148,25 @@ def _moved(cPs: FloatArray, taus_s: FloatArray, c_twist: FloatArray) -> FloatArr
     for step in np.unique(steps):
         chosen = steps == step
         motion = gtsam.Pose3.Expmap(-c_twist * float(taus_s[chosen].mean()))
-        moved[chosen] = motion.transformFrom(cPs[chosen].T).T
+        moved[chosen] = _transformed(motion, cPs[chosen])
     return moved
+
+
+def _transformed(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
+    """(n, 3) points in frame a; ``transformFrom`` itself flattens a batch of one."""
+    return bPs @ aTb.rotation().matrix().T + aTb.translation()
 
 
 def _backdrop(image: CameraImage) -> Picture:
     """The picture at 70 % brightness and half its colour, so that the points stand out."""
     grey = cv2.cvtColor(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     return np.asarray(cv2.addWeighted(image.pixels, 0.35, grey, 0.35, 0.0), dtype=np.uint8)
+
+
+def _enlarged(picture: Picture) -> Picture:
+    """The picture with each pixel repeated until the legend fits over it."""
+    times = -(-MIN_WIDTH_PX // picture.shape[1])
+    return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
 def _draw_classes(picture: Picture, uvs: FloatArray, classes: NDArray[np.uint8]) -> None:
