@@ -1,0 +1,9 @@
+"""A street simulator with exact truth: images, masks and LiDAR scans of one and the same geometry."""
+
+from __future__ import annotations
+
+from sst_graph.data.simulator.config import Motion, SimulationConfig
+from sst_graph.data.simulator.drive import SimulatedDrive, simulate
+from sst_graph.data.simulator.write import write_drive
+
+__all__ = ["Motion", "SimulatedDrive", "SimulationConfig", "simulate", "write_drive"]
