@@ -1,0 +1,98 @@
+"""Motion over the interval: signs by hand, gtsam as the oracle, derivatives."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import move_points
+from factors.motion import left_jacobian_coefficients, se3_left_jacobian
+
+STILL = np.zeros(6)
+
+
+def moved(cTl, lPs, taus, twist, acceleration=STILL, model="se3"):
+    return move_points(cTl, np.asarray(lPs, dtype=float).T, taus, np.asarray(twist), acceleration, model).cPs.T
+
+
+@pytest.mark.parametrize("model", ["se3", "translation"])
+@pytest.mark.parametrize("taus", [0.1, np.array([0.1])])
+def test_driving_forward_brings_points_nearer(model, taus):
+    cPs = moved(gtsam.Pose3(), [[1.0, 0.0, 20.0]], taus, [0, 0, 0, 0, 0, 10.0], model=model)
+    np.testing.assert_allclose(cPs, [[1.0, 0.0, 19.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("taus", [0.1, np.array([0.1])])
+def test_turning_right_moves_points_to_the_left(taus):
+    # y points down, so a turn to the right is a positive rotation about y
+    cPs = moved(gtsam.Pose3(), [[0.0, 0.0, 10.0]], taus, [0, np.pi, 0, 0, 0, 0])
+    np.testing.assert_allclose(cPs, [[-10.0 * np.sin(0.1 * np.pi), 0.0, 10.0 * np.cos(0.1 * np.pi)]], atol=1e-12)
+
+
+def test_acceleration_by_hand():
+    # 10 m/s at the image, braking at 4 m/s^2: in the 0.5 s before, 10 * 0.5 + 4 / 2 * 0.25 = 5.5 m
+    braking = np.array([0, 0, 0, 0, 0, -4.0])
+    for taus in (0.5, np.array([0.5])):
+        cPs = moved(gtsam.Pose3(), [[0.0, 0.0, 20.0]], taus, [0, 0, 0, 0, 0, 10.0], braking)
+        np.testing.assert_allclose(cPs, [[0.0, 0.0, 14.5]], atol=1e-12)
+
+
+@pytest.mark.parametrize("speed", [1e-7, 1.0, 12.0])
+def test_points_move_as_gtsam_moves_them(speed):
+    rng = np.random.default_rng(3)
+    cTl = gtsam.Pose3.Expmap(rng.normal(size=6))
+    lPs, taus = rng.normal(0.0, 10.0, (100, 3)), rng.uniform(-0.5, 0.5, 100)
+    twist, acceleration = speed * rng.normal(size=6), speed * rng.normal(size=6)
+    expected = [
+        (gtsam.Pose3.Expmap(-tau * (twist - 0.5 * tau * acceleration)) * cTl).transformFrom(lP)
+        for tau, lP in zip(taus, lPs, strict=True)
+    ]
+    np.testing.assert_allclose(moved(cTl, lPs, taus, twist, acceleration), expected, rtol=1e-9, atol=1e-9)
+    same = [moved(cTl, lP[None], float(tau), twist, acceleration)[0] for tau, lP in zip(taus, lPs, strict=True)]
+    np.testing.assert_allclose(same, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.1, 0.999999, 1.000001, 2.0, 3.1, 9.0])
+def test_left_jacobian_is_the_power_series(angle):
+    rng = np.random.default_rng(7)
+    xi = rng.normal(size=6)
+    xi[:3] *= angle / np.linalg.norm(xi[:3])
+    ad = gtsam.Pose3.adjointMap(xi)
+    expected, term = np.eye(6), np.eye(6)
+    for k in range(1, 80):
+        term = term @ ad / (k + 1)
+        expected = expected + term
+    np.testing.assert_allclose(se3_left_jacobian(xi), expected, rtol=1e-10, atol=1e-10)
+
+
+def test_coefficients_of_many_angles_are_those_of_each():
+    x = np.array([0.0, 1e-6, 0.5, 0.99, 1.01, 4.0, 9.0])
+    each = [left_jacobian_coefficients(np.array([value]))[:, 0] for value in x]
+    np.testing.assert_allclose(left_jacobian_coefficients(x), np.transpose(each), rtol=1e-12)
+
+
+@pytest.mark.parametrize("model", ["se3", "translation"])
+@pytest.mark.parametrize("rigid", [True, False])
+@pytest.mark.parametrize("speed", [0.01, 1.0, 10.0])
+def test_derivatives_at_100_points(model, rigid, speed):
+    rng = np.random.default_rng(11)
+    cTl, twist = gtsam.Pose3.Expmap(rng.normal(size=6)), speed * rng.normal(size=6)
+    acceleration, offset_s = speed * rng.normal(size=6), 0.13
+    lPs = rng.normal(0.0, 10.0, (3, 100))
+    base = -0.04 if rigid else rng.uniform(-0.2, 0.2, 100)
+
+    def cPs(x):
+        return move_points(cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model).cPs
+
+    point = move_points(cTl, lPs, offset_s + base, twist, acceleration, model)
+    g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()
+    rows = np.empty((6 if rigid else 13, 3, 100))
+    point.write_rows(g, rows)
+    J = np.tensordot(point.lift, rows, axes=1) if rigid else rows
+    for column in range(13):
+        step = 1e-4 * np.eye(13)[column]
+        coarse, fine = (cPs(step) - cPs(-step)) / 2e-4, (cPs(step / 2) - cPs(-step / 2)) / 1e-4
+        numerical = (4.0 * fine - coarse) / 3.0
+        scale = max(np.abs(numerical).max(), 1e-3)
+        np.testing.assert_allclose(J[column] / scale, numerical / scale, atol=1e-6)
