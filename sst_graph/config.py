@@ -119,7 +119,8 @@ def _join(where: str, key: str) -> str:
 
 
 def _unknown(place: str, key: str, names: Sequence[str]) -> str:
-    near = difflib.get_close_matches(key, names, n=1, cutoff=0.4)
+    starts = sorted((name for name in names if name.startswith(key)), key=len)
+    near = starts or difflib.get_close_matches(key, names, n=1, cutoff=0.4)
     hint = f"did you mean '{near[0]}'?" if near else f"known: {', '.join(sorted(names))}"
     return f"unknown setting '{place}'; {hint}"
 
