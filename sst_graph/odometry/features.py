@@ -18,8 +18,9 @@ UNTRACKED_CLASSES = (
     SemanticClass.PERSON,
     SemanticClass.TWO_WHEELER,
     SemanticClass.SKY,
+    SemanticClass.IGNORE,
 )
-"""Classes on which no corner is taken: what may move by itself, and clouds."""
+"""Classes on which no corner is taken: what may move by itself, clouds, and what may be anything."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from factors.camera import PinholeCamera
 from sst_graph.odometry.depth import DepthConfig, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import DirectionMotion, huber_weights, rays, skew
+from sst_graph.odometry.starts import consensus_translation
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
@@ -94,9 +95,9 @@ def motion_from_depths(
     sigma = np.where(known, depths.sigma, config.prior_sigma_inverse_m)
     problem = _Problem(rays(tracks.uv_a, camera), tracks.uv_b, rho, sigma, known, camera, config)
     # 1. The best of a few starts.
-    pose = min(_starts(problem, direction_motion), key=problem.cost)
+    noise = max(config.min_noise_px, direction_motion.noise_px)
+    pose = min(_starts(problem, direction_motion, config), key=lambda start: problem.cost(start, noise))
     # 2. Robust Gauss-Newton, the noise measured along the way.
-    noise = direction_motion.noise_px
     for _ in range(config.iterations):
         terms, noise = problem.linearize(pose, noise)
         step = np.linalg.solve(terms.information + 1e-9 * np.eye(6), -terms.gradient)
@@ -172,11 +173,12 @@ class _Problem:
     camera: PinholeCamera
     config: MetricConfig
 
-    def cost(self, pose: gtsam.Pose3) -> float:
-        """Mean truncated residual [px], by which starts are compared."""
-        value = self._residuals(pose, 1.0).value
-        sizes = np.abs(np.concatenate([value[:, 1], value[self.measured, 0]]))
-        return float(np.mean(np.minimum(sizes, 5.0)))
+    def cost(self, pose: gtsam.Pose3, noise_px: float) -> float:
+        """Truncated whitened squares of the tracks with depth, by which starts are compared."""
+        residuals = self._residuals(pose, noise_px)
+        along_sigma = np.hypot(noise_px, residuals.slope * self.sigma)
+        whitened = residuals.value / np.column_stack([along_sigma, np.full(len(self.fa), noise_px)])
+        return float(np.sum(np.minimum(np.sum(whitened[self.measured] ** 2, axis=1), PAIR_GATE**2)))
 
     def linearize(self, pose: gtsam.Pose3, noise_px: float) -> tuple[_Terms, float]:
         """Normal equations at a pose, and the noise of the tracks found there [px]."""
@@ -253,29 +255,16 @@ class _Problem:
         )
 
 
-def _starts(problem: _Problem, motion: DirectionMotion) -> list[gtsam.Pose3]:
-    """Poses from which to begin: rotation alone, and the direction with its length and sign from depth."""
-    starts = [gtsam.Pose3(motion.rotation, np.zeros(3))]
-    if motion.ok:
-        bRa = motion.rotation.matrix().T
-        fa, rho = problem.fa[problem.measured], problem.rho[problem.measured]
-        far, shift = fa @ bRa.T, bRa @ motion.direction
-        uv = problem.uv_b[problem.measured]
-        x = (uv[:, 0] - problem.camera.cx) / problem.camera.fx
-        y = (uv[:, 1] - problem.camera.cy) / problem.camera.fy
-        # (far - s rho shift) is parallel to [x, y, 1]: two equations in the length s, weighted by their size.
-        top = np.concatenate([far[:, 0] - x * far[:, 2], far[:, 1] - y * far[:, 2]])
-        bottom = np.concatenate([rho * (shift[0] - x * shift[2]), rho * (shift[1] - y * shift[2])])
-        length = weighted_median(top / np.where(bottom == 0.0, np.inf, bottom), np.abs(bottom))
-        starts.append(gtsam.Pose3(motion.rotation, length * motion.direction))
-    return starts
-
-
-def weighted_median(values: FloatArray, weights: FloatArray) -> float:
-    """Value at which half of the weight is reached."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][min(int(np.searchsorted(total, 0.5 * total[-1])), len(values) - 1)])
+def _starts(problem: _Problem, motion: DirectionMotion, config: MetricConfig) -> list[gtsam.Pose3]:
+    """Poses from which to begin: each rotation with the translation that most depths agree on."""
+    camera, known = problem.camera, problem.measured
+    fa, fb, rho = problem.fa[known], rays(problem.uv_b[known], camera), problem.rho[known]
+    noise = max(config.min_noise_px, motion.noise_px) / min(camera.fx, camera.fy)
+    rotations = (motion.rotation, motion.turn) if motion.ok else (motion.turn,)
+    return [
+        gtsam.Pose3(aRb, consensus_translation(aRb, fa, fb, rho, noise, config.depth.range_sigma))
+        for aRb in rotations
+    ]
 
 
 def robust_sigma(values: FloatArray) -> float:
