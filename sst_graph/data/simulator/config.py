@@ -8,7 +8,7 @@ from typing import Literal, get_args
 from sst_graph.errors import ConfigError
 
 Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning"]
-"""Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` drives straight on at one speed."""
+"""Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed."""
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ NOMINAL_CTL = gtsam.Pose3(
     ),
     np.array([0.05737, -0.07536, -0.26939]),
 )
-"""Published pose of KITTI's LiDAR (2011_09_26) in its left colour camera: the simulator's nominal extrinsic."""
+"""Pose of KITTI's LiDAR (2011_09_26) in its left colour camera as published: the nominal extrinsic."""
 
 
 @dataclass(frozen=True)

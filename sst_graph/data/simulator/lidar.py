@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.simulator.casting import Columns, IndexArray, SweepMotion, cast_lidar
+from sst_graph.data.simulator.casting import IndexArray, compact
 from sst_graph.data.simulator.config import SimulationConfig
 from sst_graph.data.simulator.motion import EgoMotion
 from sst_graph.data.simulator.street import Snapshot
 from sst_graph.data.simulator.surfaces import EXTRA_LOSS, Kind, Material
+from sst_graph.data.simulator.sweep import Columns, SweepMotion, cast_lidar
 from sst_graph.types import FloatArray
 
 RINGS = 64
 TOP_DEG, MIDDLE_DEG, BOTTOM_DEG = 2.0, -8.53, -24.8
-"""The upper half of the lasers fans over TOP..MIDDLE, the lower half over MIDDLE..BOTTOM, as in the HDL-64E."""
+"""The upper half of the lasers fans over TOP..MIDDLE, the lower over MIDDLE..BOTTOM, as in the HDL-64E."""
 MIN_RANGE_M = 2.0
 
 
@@ -60,13 +61,10 @@ class Lidar:
         step, start = 2 * np.pi / count, rng.uniform(-0.5, 0.5) * 2 * np.pi / count
         nominal = Columns(start, step, count, self.slopes)
         seconds = -nominal.azimuths / (2 * np.pi) * config.period_s if config.rolling else np.zeros(count)
-        motion = sweep_motion(ego, stamp_s, seconds, velocities) if config.rolling else None
+        motion = _sweep_motion(ego, stamp_s, seconds, velocities) if config.rolling else None
         # Half a radius is the standard deviation of a uniform disc along one axis.
         half = config.beam_divergence_mrad * 1e-3 / 4.0
-        beams = [
-            cast_lidar(triangles, Columns(start + shift, step, count, self.slopes), velocities, motion)
-            for shift in ((-half, half) if half > 0.0 else (0.0,))
-        ]
+        beams = cast_lidar(triangles, nominal, (-half, half) if half > 0.0 else (0.0,), motion)
         faces, reach = _mixed(beams, rng)
         return self._returns(snapshot, triangles, faces, reach, nominal, seconds, rng)
 
@@ -116,16 +114,11 @@ def make_lidar(config: SimulationConfig) -> Lidar:
     return Lidar(config, np.tan(np.deg2rad(np.sort(elevation))))
 
 
-def sweep_motion(ego: EgoMotion, stamp_s: float, seconds: FloatArray, velocities: FloatArray) -> SweepMotion:
+def _sweep_motion(ego: EgoMotion, stamp_s: float, seconds: FloatArray, velocities: FloatArray) -> SweepMotion:
     """The sensor's motion relative to its pose at the stamp, for columns at ``seconds`` (n,) after it."""
     rotation, position = (a[0] for a in ego.pose(np.array([stamp_s])))
     rotations, positions = ego.pose(stamp_s + seconds)
-    relative = rotation.T @ rotations
-    shift = (positions - position) @ rotation
-    fastest = float(np.abs(velocities).max(initial=0.0)) * np.sqrt(3.0) * float(np.abs(seconds).max())
-    angle = np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)).max()
-    reach = float(np.linalg.norm(shift, axis=1).max()) + fastest + 0.05
-    return SweepMotion(relative, shift, seconds, reach, float(angle) + 0.002)
+    return SweepMotion(rotation.T @ rotations, (positions - position) @ rotation, seconds, velocities)
 
 
 def _mixed(
@@ -159,7 +152,7 @@ def _loss(
 ) -> FloatArray:
     """(n,) probability that a return is lost: material, dark and slanted paint, range."""
     mesh = snapshot.mesh
-    used, index = np.unique(face, return_inverse=True)
+    used, index = compact(face)
     corner = triangles[used]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)

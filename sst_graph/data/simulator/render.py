@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from sst_graph.data.simulator.casting import IndexArray, plane_of
+from sst_graph.data.simulator.casting import IndexArray, compact, plane_of
 from sst_graph.data.simulator.mesh import Mesh
 from sst_graph.data.simulator.surfaces import DETAIL, TILE_M, Material
 from sst_graph.data.simulator.textures import LEVELS, TILE, Atlas
@@ -61,8 +61,7 @@ def shade(
     view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
     """(h, w, 3) uint8 BGR picture of the faces (h, w) of ``mesh`` at depth z (h, w) [m]."""
-    seen, index = np.unique(faces, return_inverse=True)
-    index = index.reshape(faces.shape)
+    seen, index = compact(faces)
     if seen[0] < 0:
         # The sky borrows any face; it is painted over below.
         seen = np.concatenate([[0], seen[1:]])

@@ -196,7 +196,7 @@ def _lettered(rng: np.random.Generator) -> Image:
 
 
 def sky_panorama(rng: np.random.Generator) -> Image:
-    """(256, 1024, 3) uint8 sky: azimuth across (periodic), from 60 deg above the horizon (top) to 10 below."""
+    """(256, 1024, 3) uint8 sky: azimuth across (periodic), 60 deg above the horizon (top) to 10 below."""
     up = np.linspace(60.0, -10.0, 256)[:, None]
     fade = np.clip(up / 45.0, 0.0, 1.0)[:, :, None]
     blue = (1 - fade) * np.array([235.0, 225.0, 215.0]) + fade * np.array([225.0, 160.0, 105.0])
