@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ from sst_graph.errors import DataError
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame, SemanticClass, Source
-from sst_graph.viz import Placement, before_after, draw_overlay
+from sst_graph.viz import Placement, draw_overlay, stacked
 
 FloatArray = NDArray[np.float64]
 
@@ -38,12 +40,30 @@ def overlay(
     Raises:
         DataError: the frame lacks its scan or its image.
     """
-    frame = source[position]
-    after = Placement(result.T_camera_lidar, _offset_of(result, source), "after")
+    offset_s = _offset_of(result, source)
     c_twist = camera_twist(source, position, result.T_camera_lidar)
+    frame, other_image = _at_true_time(source, position, offset_s)
+    caption = "after (image closest in time)" if other_image else "after"
+    after = draw_overlay(frame, source.camera, result.T_camera_lidar, offset_s, c_twist, caption)
     if before is None:
-        return draw_overlay(frame, source.camera, after.cTl, after.time_offset_s, c_twist, after.caption)
-    return before_after(frame, source.camera, before, after, c_twist)
+        return after
+    start = source[position], source.camera, before.cTl, before.time_offset_s, c_twist, before.caption
+    return stacked(draw_overlay(*start), after)
+
+
+def _at_true_time(source: Source, position: int, offset_s: float) -> tuple[Frame, bool]:
+    """The frame, with the image that shows the instant of its scan best, and whether that is another one."""
+    frame = source[position]
+    neighbour = source[position - 1 if position else min(1, len(source) - 1)]
+    scan, image = frame.scan, frame.image
+    if scan is None or image is None or neighbour.scan is None or neighbour.scan.stamp_ns == scan.stamp_ns:
+        return frame, False
+    period_s = abs(scan.stamp_ns - neighbour.scan.stamp_ns) * 1e-9
+    guess = position - round(offset_s / period_s)
+    nearby = range(max(0, guess - 1), min(len(source), guess + 2))
+    images = [image, *(other for other in (source[i].image for i in nearby) if other is not None)]
+    best = min(images, key=lambda other: abs(other.stamp_ns * 1e-9 + offset_s - scan.stamp_ns * 1e-9))
+    return replace(frame, image=best), best.stamp_ns != image.stamp_ns
 
 
 def camera_twist(source: Source, position: int, cTl: gtsam.Pose3) -> FloatArray | None:

@@ -1,5 +1,5 @@
 """Pictures for people: the LiDAR drawn into the camera image."""
 
-from sst_graph.viz.overlay import Placement, before_after, draw_overlay
+from sst_graph.viz.overlay import Placement, before_after, draw_overlay, stacked
 
-__all__ = ["Placement", "before_after", "draw_overlay"]
+__all__ = ["Placement", "before_after", "draw_overlay", "stacked"]

@@ -100,12 +100,16 @@ def before_after(
     Raises:
         DataError: as :func:`draw_overlay`.
     """
-    pictures = [
+    above, below = (
         draw_overlay(frame, camera, place.cTl, place.time_offset_s, c_twist, place.caption)
         for place in (before, after)
-    ]
-    gap = np.full((6, pictures[0].shape[1], 3), 255, np.uint8)
-    return np.vstack([pictures[0], gap, pictures[1]])
+    )
+    return stacked(above, below)
+
+
+def stacked(above: Picture, below: Picture) -> Picture:
+    """Two pictures of the same width, one above the other."""
+    return np.vstack([above, np.full((6, above.shape[1], 3), 255, np.uint8), below])
 
 
 def _both(frame: Frame, camera: PinholeCamera) -> tuple[Scan, CameraImage]:
