@@ -52,6 +52,7 @@ from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
 from .regularizer import beta_regularizer
 from .robust import KernelKind, RobustKernel
 from .silhouette import silhouette_factor
+from .twist_transfer import twist_transfer_factor
 from .velocity import (
     mean_velocity_factor,
     twist_jerk_factor,
@@ -92,6 +93,7 @@ __all__ = [
     "silhouette_factor",
     "twist_jerk_factor",
     "twist_smoothness_factor",
+    "twist_transfer_factor",
     "velocity_direction_factor",
     "velocity_factor",
     "weighted_residuals",

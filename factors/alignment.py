@@ -92,7 +92,7 @@ def frame_factor(
         alignments: one or more, over the same image (one twist).
         cTl: key of the extrinsic, or a fixed pose.
         offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key).
-        c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for standing still.
+        c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for zero.
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel).
         condensed: False gives two rows a match and one more; for tests and for looking at residuals.
@@ -107,10 +107,10 @@ def frame_factor(
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
     def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        if not jacobians and condensed:
-            return cost_rows(frame.cost(values), rows), None
+        if not jacobians:
+            return cost_rows(frame.cost(values), rows) if condensed else frame.stacked_error(values), None
         error, J = frame.condensed(values) if condensed else frame.stacked(values)
-        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1) if jacobians else None
+        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
 
     return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
 
@@ -196,6 +196,15 @@ class _FrameResidual:
         last[0, -1] = np.sqrt(constant)
         system = np.concatenate([*blocks, last])
         return system[:, -1], system[:, :-1]
+
+    def stacked_error(self, values: Sequence[Any]) -> FloatArray:
+        """The error of :meth:`stacked`, without the work for its Jacobian."""
+        blocks, constant = [], 0.0
+        for part in self.parts:
+            evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), False)
+            constant += weigh(part.alignment, evaluated)
+            blocks.append(evaluated.rows[-1].reshape(-1))
+        return np.concatenate([*blocks, [np.sqrt(constant)]])
 
 
 def _frame_residual(

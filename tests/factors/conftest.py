@@ -17,7 +17,13 @@ FORWARD = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.
 
 
 def scene(
-    seed: int, n: int = 30, *, per_point: bool = False, normals: bool = False, noise_px: float = 3.0, **options: Any
+    seed: int,
+    n: int = 30,
+    *,
+    per_point: bool = False,
+    normals: bool = False,
+    noise_px: float = 3.0,
+    **options: Any,
 ) -> tuple[Alignment, gtsam.Pose3, float, np.ndarray]:
     """Matches that fit a random extrinsic, non-zero delay and twist up to ``noise_px``."""
     rng = np.random.default_rng(seed)

@@ -13,7 +13,9 @@ STILL = np.zeros(6)
 
 
 def moved(cTl, lPs, taus, twist, acceleration=STILL, model="se3"):
-    return move_points(cTl, np.asarray(lPs, dtype=float).T, taus, np.asarray(twist), acceleration, model).cPs.T
+    return move_points(
+        cTl, np.asarray(lPs, dtype=float).T, taus, np.asarray(twist), acceleration, model
+    ).cPs.T
 
 
 @pytest.mark.parametrize("model", ["se3", "translation"])
@@ -27,7 +29,9 @@ def test_driving_forward_brings_points_nearer(model, taus):
 def test_turning_right_moves_points_to_the_left(taus):
     # y points down, so a turn to the right is a positive rotation about y
     cPs = moved(gtsam.Pose3(), [[0.0, 0.0, 10.0]], taus, [0, np.pi, 0, 0, 0, 0])
-    np.testing.assert_allclose(cPs, [[-10.0 * np.sin(0.1 * np.pi), 0.0, 10.0 * np.cos(0.1 * np.pi)]], atol=1e-12)
+    np.testing.assert_allclose(
+        cPs, [[-10.0 * np.sin(0.1 * np.pi), 0.0, 10.0 * np.cos(0.1 * np.pi)]], atol=1e-12
+    )
 
 
 def test_acceleration_by_hand():
@@ -49,7 +53,9 @@ def test_points_move_as_gtsam_moves_them(speed):
         for tau, lP in zip(taus, lPs, strict=True)
     ]
     np.testing.assert_allclose(moved(cTl, lPs, taus, twist, acceleration), expected, rtol=1e-9, atol=1e-9)
-    same = [moved(cTl, lP[None], float(tau), twist, acceleration)[0] for tau, lP in zip(taus, lPs, strict=True)]
+    same = [
+        moved(cTl, lP[None], float(tau), twist, acceleration)[0] for tau, lP in zip(taus, lPs, strict=True)
+    ]
     np.testing.assert_allclose(same, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -83,7 +89,9 @@ def test_derivatives_at_100_points(model, rigid, speed):
     base = -0.04 if rigid else rng.uniform(-0.2, 0.2, 100)
 
     def cPs(x):
-        return move_points(cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model).cPs
+        return move_points(
+            cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model
+        ).cPs
 
     point = move_points(cTl, lPs, offset_s + base, twist, acceleration, model)
     g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()

@@ -40,7 +40,9 @@ def test_signed_distance_less_bias():
 
 def test_a_later_image_sees_a_point_further_out():
     # 10 m/s forward and 0.1 s: Z from 10 m to 9 m
-    r, J = residuals(match([1.0, 0.0, 10.0], [50.0, 40.0]), gtsam.Pose3(), 0.1, np.array([0, 0, 0, 0, 0, 10.0]))
+    r, J = residuals(
+        match([1.0, 0.0, 10.0], [50.0, 40.0]), gtsam.Pose3(), 0.1, np.array([0, 0, 0, 0, 0, 10.0])
+    )
     np.testing.assert_allclose(r, [100.0 / 9.0, 0.0], atol=1e-12)
     assert J[0, 6] == pytest.approx(10.0 * 100.0 / 81.0)  # px/s: v fx X / Z^2
 

@@ -1,0 +1,78 @@
+"""Priors and random walks of offset and extrinsic."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import FactorError, check_jacobians, delay_drift, delay_prior, extrinsic_drift
+
+D = [gtsam.symbol("d", k) for k in range(11)]
+E = [gtsam.symbol("e", k) for k in range(2)]
+
+
+def test_prior_by_hand():
+    values = gtsam.Values()
+    values.insert(D[0], np.array([0.13]))
+    factor = delay_prior(D[0], 0.10, 0.01)
+    np.testing.assert_allclose(factor.unwhitenedError(values), [0.03], atol=1e-15)
+    assert factor.error(values) == pytest.approx(0.5 * 3.0**2)
+
+
+def test_later_less_earlier():
+    values = gtsam.Values()
+    values.insert(D[0], np.array([0.10]))
+    values.insert(D[1], np.array([0.13]))
+    # 4 s of 0.005 s / sqrt(s): sigma 0.01 s
+    np.testing.assert_allclose(delay_drift(D[0], D[1], 4.0, 0.005).whitenedError(values), [3.0])
+
+
+def test_a_walk_of_many_steps_is_a_walk_of_one():
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(delay_prior(D[0], 0.1, 0.02))
+    for k, key in enumerate(D):
+        values.insert(key, np.array([0.1]))
+        if k:
+            graph.add(delay_drift(D[k - 1], key, 0.3, 0.005))
+    variance = gtsam.Marginals(graph, values).marginalCovariance(D[-1])[0, 0]
+    assert variance == pytest.approx(0.02**2 + 10 * 0.3 * 0.005**2, rel=1e-9)
+
+
+def test_extrinsic_drift_by_hand():
+    values, start = gtsam.Values(), gtsam.Pose3(gtsam.Rot3.Ry(0.4), np.array([1.0, 2.0, 3.0]))
+    step = np.array([0.01, 0.0, 0.0, 0.0, 0.02, 0.0])
+    values.insert(E[0], start)
+    values.insert(E[1], start * gtsam.Pose3.Expmap(step))
+    factor = extrinsic_drift(E[0], E[1], 4.0, 0.005, 0.01)
+    np.testing.assert_allclose(factor.whitenedError(values), [1.0, 0, 0, 0, 1.0, 0], atol=1e-9)
+
+
+def test_jacobians_at_100_states():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        values = gtsam.Values()
+        for k in range(2):
+            values.insert(D[k], rng.normal(0.0, 0.2, 1))
+            values.insert(E[k], gtsam.Pose3.Expmap(rng.normal(0.0, 0.7, 6)))
+        check_jacobians(delay_prior(D[0], 0.1, 0.01), values, 1e-6)
+        check_jacobians(delay_drift(D[0], D[1], 0.1, 0.01), values, 1e-6)
+        check_jacobians(extrinsic_drift(E[0], E[1], 0.1, 0.01, 0.02), values, 1e-6)
+
+
+def test_they_serialize():
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(delay_prior(D[0], 0.1, 0.01))
+    graph.add(delay_drift(D[0], D[1], 0.1, 0.01))
+    graph.add(extrinsic_drift(E[0], E[1], 0.1, 0.01, 0.02))
+    copy = gtsam.NonlinearFactorGraph()
+    copy.deserialize(graph.serialize())
+    assert copy.equals(graph, 1e-12)
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, np.inf])
+def test_time_must_pass(seconds):
+    with pytest.raises(FactorError, match="seconds"):
+        delay_drift(D[0], D[1], seconds, 0.01)
+    with pytest.raises(FactorError, match="seconds"):
+        extrinsic_drift(E[0], E[1], seconds, 0.01, 0.01)
