@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import gtsam
@@ -75,16 +76,17 @@ def draw_overlay(
     """
     scan, image = _both(frame, camera)
     uvs, classes = _projected(scan, image, camera, cTl, offset_s, c_twist)
-    picture = _backdrop(image)
+    zoom = -(-MIN_WIDTH_PX // camera.width)
+    picture = _enlarged(_backdrop(image), zoom)
+    _draw_contours(picture, _enlarged(image.mask == SemanticClass.VEHICLE, zoom))
+    mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
+    uvs = (uvs + 0.5) * zoom - 0.5
     _draw_classes(picture, uvs, classes)
-    _draw_contours(picture, image.mask == SemanticClass.VEHICLE)
     vehicles = uvs[classes == SemanticClass.VEHICLE]
-    mask_class = _at(image.mask, vehicles)
     inside = mask_class == SemanticClass.VEHICLE
     outside = ~inside & (mask_class != SemanticClass.IGNORE)
     _draw_points(picture, vehicles[inside], IN_MASK, 2)
     _draw_points(picture, vehicles[outside], OUT_OF_MASK, 2)
-    picture = _enlarged(picture)
     return np.vstack([_strip(picture.shape[1], caption, int(inside.sum()), int(outside.sum())), picture])
 
 
@@ -167,9 +169,8 @@ def _backdrop(image: CameraImage) -> Picture:
     return np.asarray(cv2.addWeighted(image.pixels, 0.35, grey, 0.35, 0.0), dtype=np.uint8)
 
 
-def _enlarged(picture: Picture) -> Picture:
-    """The picture with each pixel repeated until the legend fits over it."""
-    times = -(-MIN_WIDTH_PX // picture.shape[1])
+def _enlarged(picture: NDArray[Any], times: int) -> NDArray[Any]:
+    """The picture or mask with each pixel repeated, so that points keep apart and the legend fits."""
     return picture.repeat(times, axis=0).repeat(times, axis=1)
 
 
