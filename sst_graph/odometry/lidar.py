@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, usable_points
+from sst_graph.odometry.movers import MoverConfig, StandingObjects
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""
+SETTLED_M = 2e-3
+"""Sweep compensation has settled where another pass would move no point farther than this [m]."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,9 @@ class LidarOdometryConfig:
     """How scans are thinned, registered and trusted.
 
     Attributes:
-        voxel_m: edge of the voxels of which one point is registered [m].
+        voxel_m: edge of the voxels of which one point is registered, for the first scan [m].
+        min_voxel_m, max_voxel_m: limits between which the edge is adapted from scan to scan [m].
+        target_points: number of voxels that the adaptation aims at.
         map_voxel_m: edge of the Gaussian voxels of the local map [m].
         map_age: scans after which a voxel that was not seen again is forgotten.
         near_m, far_m: ranges between which points are used [m].
@@ -37,12 +42,16 @@ class LidarOdometryConfig:
         max_iterations: Gauss-Newton steps of one registration.
         min_inlier_ratio: a registration with fewer points paired than this fraction has failed.
         compensations: most registrations of one scan while its sweep compensation settles.
+        movers: how standing objects are told from moving ones.
         inflation: factor on the sigmas of the registration's own covariance, for pairs are correlated.
         floor_rad, floor_m: sigmas added to every motion for what the registration cannot know [rad, m].
         failed_rad, failed_m: sigmas of a motion that was only predicted [rad, m].
     """
 
     voxel_m: float = 0.2
+    min_voxel_m: float = 0.1
+    max_voxel_m: float = 1.0
+    target_points: int = 3000
     map_voxel_m: float = 0.4
     map_age: int = 20
     near_m: float = 1.0
@@ -50,11 +59,12 @@ class LidarOdometryConfig:
     max_points: int = 60_000
     min_points: int = 200
     neighbours: int = 10
-    plane_ratio: float = 1.0
+    plane_ratio: float = 0.5
     max_distance_m: float = 1.0
     max_iterations: int = 30
     min_inlier_ratio: float = 0.3
     compensations: int = 3
+    movers: MoverConfig = field(default_factory=MoverConfig)
     inflation: float = 2.0
     floor_rad: float = 1e-4
     floor_m: float = 2e-3
@@ -68,10 +78,12 @@ class LidarOdometry:
     def __init__(self, config: LidarOdometryConfig | None = None) -> None:
         self.config = config or LidarOdometryConfig()
         self._map: small_gicp.GaussianVoxelMap | None = None
+        self._objects = StandingObjects(self.config.movers)
         self._last: Scan | None = None
         self._wTl = np.eye(4)
         self._twist: FloatArray | None = None
         self._covariance = np.zeros((6, 6))
+        self._voxel_m = self.config.voxel_m
 
     @property
     def pose(self) -> gtsam.Pose3:
@@ -84,57 +96,64 @@ class LidarOdometry:
         Raises:
             DataError: the scan is not later than the one before.
         """
-        if self._last is None:
-            self._last = scan
+        last, self._last = self._last, scan
+        if last is None:
             self._restart_map(scan)
             return None
-        seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
+        seconds = (scan.stamp_ns - last.stamp_ns) * 1e-9
         if seconds <= 0.0:
+            self._last = last
             raise DataError("LiDAR odometry", f"a scan {seconds:.6f} s after the one before", "rising stamps")
         # 1. Constant velocity predicts; registration to the map corrects.
         registration = self._register(scan, seconds)
-        if registration is not None and self._twist is None and self._last.offsets_s is not None:
+        if registration is not None and self._twist is None and last.offsets_s is not None:
             # 2. Only now is the first scan's own sweep known: build the map anew and register again.
             self._twist = registration.twist
-            self._restart_map(self._last)
+            self._restart_map(last)
             registration = self._register(scan, seconds) or registration
         # 3. The map grows, or starts again where the registration failed.
-        motion = self._advance(self._last, scan, registration)
-        self._last = scan
-        return motion
+        return self._advance(last, scan, registration)
 
     def _register(self, scan: Scan, seconds: float) -> _Registration | None:
         """Pose of the scan in the map, its sweep compensated by its own motion; None where it fails."""
         config = self.config
-        start = self._wTl @ _exp(self._twist, seconds)
+        wTl = self._wTl @ _exp(self._twist, seconds)
         twist: FloatArray | None = self._twist
         for _ in range(config.compensations):
-            cloud = self._cloud(scan, twist)
-            if cloud is None or self._map is None:
-                return None
-            result = small_gicp.align(
-                self._map,
-                cloud,
-                start,
-                max_correspondence_distance=config.max_distance_m,
-                num_threads=1,
-                max_iterations=config.max_iterations,
-                rotation_epsilon=1e-4,
-                translation_epsilon=5e-4,
-            )
-            if not np.isfinite(result.T_target_source).all() or (
-                result.num_inliers < config.min_inlier_ratio * cloud.size()
-            ):
-                return None
-            start = _orthonormal(np.asarray(result.T_target_source))
-            step = np.linalg.inv(self._wTl) @ start
-            assumed, twist = twist, _log(step) / seconds
-            if scan.offsets_s is None or (
-                assumed is not None
-                and np.abs(twist - assumed)[3:].max() * np.abs(scan.offsets_s).max(initial=0.0) < 2e-3
-            ):
-                break
-        return _Registration(start, cloud, _log(step) / seconds, _registration_covariance(result, config))
+            points = self._points(scan, twist)
+            # What stands still among the movable objects helps where the rest says little.
+            standing = self._objects.still(_transformed(wTl, points.movable), scan.stamp_ns)
+            found = self._align(np.concatenate([points.still, points.movable[standing]]), wTl, seconds)
+            if found is None or scan.offsets_s is None:
+                return found
+            change = np.inf if twist is None else np.abs(found.twist - twist)[3:].max()
+            if change * np.abs(scan.offsets_s).max(initial=0.0) < SETTLED_M:
+                return found
+            wTl, twist = found.wTl, found.twist
+        return found
+
+    def _align(self, points: FloatArray, wTl: FloatArray, seconds: float) -> _Registration | None:
+        """Points (n, 3) registered to the map from a start; None where that fails."""
+        config = self.config
+        if self._map is None or len(points) < config.min_points:
+            return None
+        cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
+        result = small_gicp.align(
+            self._map,
+            cloud,
+            wTl,
+            max_correspondence_distance=config.max_distance_m,
+            num_threads=1,
+            max_iterations=config.max_iterations,
+            rotation_epsilon=1e-4,
+            translation_epsilon=5e-4,
+        )
+        found = np.asarray(result.T_target_source)
+        if not np.isfinite(found).all() or result.num_inliers < config.min_inlier_ratio * cloud.size():
+            return None
+        found = _orthonormal(found)
+        twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
+        return _Registration(found, cloud, twist, _registration_covariance(result, config))
 
     def _advance(self, last: Scan, scan: Scan, registration: _Registration | None) -> RelativeMotion:
         """Take the registered pose, or the predicted one, and answer the motion since the last scan."""
@@ -142,14 +161,14 @@ class LidarOdometry:
         if registration is None or self._map is None:
             step = _exp(self._twist, (scan.stamp_ns - last.stamp_ns) * 1e-9)
             self._wTl = self._wTl @ step
-            sigmas = np.repeat([config.failed_rad, config.failed_m], 3)
             self._covariance = np.zeros((6, 6))
             self._restart_map(scan)
-            covariance = np.diag(sigmas**2)
+            covariance = np.diag(np.repeat([config.failed_rad, config.failed_m], 3) ** 2)
         else:
             step = np.linalg.inv(self._wTl) @ registration.wTl
             self._wTl, self._twist = registration.wTl, registration.twist
             self._map.insert(registration.cloud, self._wTl)
+            self._remember(scan, registration.cloud.size())
             bHa = gtsam.Pose3(step).inverse().AdjointMap()
             floor = np.repeat([config.floor_rad, config.floor_m], 3) ** 2
             covariance = registration.covariance + bHa @ self._covariance @ bHa.T + np.diag(floor)
@@ -157,28 +176,35 @@ class LidarOdometry:
         ok = registration is not None
         return RelativeMotion(last.stamp_ns, scan.stamp_ns, gtsam.Pose3(step), covariance, ok)
 
+    def _remember(self, scan: Scan, registered: int) -> None:
+        """Keep the movable objects for later comparison, and adapt the voxels to the number registered."""
+        config = self.config
+        movable = self._points(scan, self._twist).movable
+        self._objects.remember(_transformed(self._wTl, movable), scan.stamp_ns)
+        edge = self._voxel_m * np.sqrt(registered / config.target_points)
+        self._voxel_m = float(np.clip(edge, config.min_voxel_m, config.max_voxel_m))
+
     def _restart_map(self, scan: Scan) -> None:
         """Forget the map and begin it anew with a scan at the current pose."""
         config = self.config
-        cloud = self._cloud(scan, self._twist)
+        points = self._points(scan, self._twist).still
         self._map = None
-        if cloud is not None:
+        if len(points) >= config.min_points:
             self._map = small_gicp.GaussianVoxelMap(config.map_voxel_m)
             self._map.set_lru(config.map_age, max(1, config.map_age // 2))
+            cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
             self._map.insert(cloud, self._wTl)
 
-    def _cloud(self, scan: Scan, twist: FloatArray | None) -> small_gicp.PointCloud | None:
-        """The scan's static points at its stamp, ready for registration; None where too few are left."""
+    def _points(self, scan: Scan, twist: FloatArray | None) -> _Points:
+        """The scan's points at its stamp; what may move counts as still where too little else is left."""
         config = self.config
         points, classes, offsets = usable_points(scan, config.near_m, config.far_m, config.max_points)
         if offsets is not None and twist is not None:
             points = compensate_sweep(points, offsets, twist)
-        still = ~np.isin(classes, MOVABLE_CLASSES)
-        if np.count_nonzero(still) >= config.min_points:
-            points = points[still]
-        if len(points) < config.min_points:
-            return None
-        return registration_cloud(points, config.voxel_m, config.neighbours, config.plane_ratio)
+        movable = np.isin(classes, MOVABLE_CLASSES)
+        if np.count_nonzero(~movable) < config.min_points:
+            movable[:] = False
+        return _Points(points[~movable], points[movable])
 
 
 def lidar_odometry(scans: Iterable[Scan], config: LidarOdometryConfig | None = None) -> list[RelativeMotion]:
@@ -189,6 +215,14 @@ def lidar_odometry(scans: Iterable[Scan], config: LidarOdometryConfig | None = N
     """
     odometry = LidarOdometry(config)
     return [motion for scan in scans if (motion := odometry.add(scan)) is not None]
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Points of a scan in the LiDAR frame [m]: still (n, 3), and of classes that may move (m, 3)."""
+
+    still: FloatArray
+    movable: FloatArray
 
 
 @dataclass(frozen=True)
@@ -225,6 +259,11 @@ def _exp(twist: FloatArray | None, seconds: float) -> FloatArray:
 def _log(matrix: FloatArray) -> FloatArray:
     """(6,) logarithm [rot, trans] of a (4, 4) motion."""
     return np.asarray(gtsam.Pose3.Logmap(gtsam.Pose3(matrix)))
+
+
+def _transformed(wTl: FloatArray, lPs: FloatArray) -> FloatArray:
+    """(n, 3) points lPs (n, 3) in the frame to which the (4, 4) pose leads."""
+    return np.asarray(lPs @ wTl[:3, :3].T + wTl[:3, 3])
 
 
 def _orthonormal(matrix: FloatArray) -> FloatArray:

@@ -15,6 +15,9 @@ from sst_graph.odometry.features import Tracks
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+EPIPOLE_PX = 40.0
+"""Tracks nearer to the epipole than this lose their weight [px]."""
+
 
 @dataclass(frozen=True)
 class RelativeConfig:
@@ -33,7 +36,7 @@ class RelativeConfig:
     confidence: float = 0.999
     min_tracks: int = 20
     min_noise_px: float = 0.05
-    min_parallax_ratio: float = 2.0
+    min_parallax_ratio: float = 4.0
     iterations: int = 8
 
 
@@ -241,8 +244,7 @@ def _line_distance(
     line_a = fa @ skew(-direction[None])[0].T
     line_b = line_a @ aRb
     error = np.einsum("ij,ij->i", line_a, gb)
-    length = np.hypot(line_b[:, 0] / camera.fx, line_b[:, 1] / camera.fy)
-    length = np.maximum(length, 1e-12)
+    length = _softened(np.hypot(line_b[:, 0] / camera.fx, line_b[:, 1] / camera.fy), camera)
     J = np.empty((len(fa), 5))
     J[:, :3] = _cross(fb, line_b)
     J[:, 3:] = _cross(gb, fa) @ basis
@@ -251,6 +253,11 @@ def _line_distance(
     normal = np.column_stack([line_b[:, 0] / camera.fx**2, line_b[:, 1] / camera.fy**2])
     J -= (error / length**2)[:, None] * np.einsum("ni,nij->nj", normal, line_H_motion[:, :2])
     return error / length, J / length[:, None]
+
+
+def _softened(length: FloatArray, camera: PinholeCamera) -> FloatArray:
+    """Length of line normals, never near zero: about the epipole a line may turn anywhere."""
+    return np.asarray(np.hypot(length, EPIPOLE_PX / (camera.fx * camera.fy)))
 
 
 def _spurious_information(
@@ -262,7 +269,7 @@ def _spurious_information(
     """
     line_b = _cross(fa, np.broadcast_to(direction, fa.shape)) @ aRb
     normal = np.column_stack([line_b[:, 0] / camera.fx, line_b[:, 1] / camera.fy])
-    length = np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    length = _softened(np.linalg.norm(normal, axis=1), camera)
     along = np.column_stack([-normal[:, 1] / camera.fx, normal[:, 0] / camera.fy, np.zeros(len(fa))])
     J = _cross((along / length[:, None]) @ aRb.T, fa) @ np.asarray(gtsam.Unit3(direction).basis())
     J /= length[:, None]

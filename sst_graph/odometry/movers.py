@@ -1,0 +1,82 @@
+"""Which objects of movable classes stand still: those that are where they were a while ago."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MoverConfig:
+    """When an object of a movable class counts as standing.
+
+    Attributes:
+        memory_s: age of the scan with which an object is compared [s].
+        cell_m: objects are apart where this much of the ground between them is empty [m].
+        voxel_m: edge of the voxels of which one point is compared [m].
+        slack_m: farthest that points of a standing object lie from those of the older scan [m].
+        share: part of an object's points that must lie within it.
+    """
+
+    memory_s: float = 0.6
+    cell_m: float = 0.4
+    voxel_m: float = 0.15
+    slack_m: float = 0.15
+    share: float = 0.75
+
+
+class StandingObjects:
+    """Memory of the movable points of past scans, in the world."""
+
+    def __init__(self, config: MoverConfig | None = None) -> None:
+        self.config = config or MoverConfig()
+        self._past: deque[tuple[int, FloatArray]] = deque()
+
+    def still(self, wPs: FloatArray, stamp_ns: int) -> BoolArray:
+        """(n,) whether points wPs (n, 3) of movable classes, in the world [m], belong to a standing object.
+
+        Nothing counts as standing before the memory reaches back far enough.
+        """
+        config = self.config
+        before = [points for past_ns, points in self._past if stamp_ns - past_ns >= 0.95e9 * config.memory_s]
+        if not before or len(before[-1]) == 0 or len(wPs) == 0:
+            return np.zeros(len(wPs), np.bool_)
+        keys = _voxel_representatives(wPs, config.voxel_m)
+        labels = _objects(wPs, config.cell_m)
+        distance, _ = cKDTree(before[-1]).query(wPs[keys], distance_upper_bound=config.slack_m)
+        near = np.isfinite(distance).astype(np.float64)
+        total = np.bincount(labels[keys], minlength=labels.max() + 1)
+        share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
+        return np.asarray((share >= config.share)[labels])
+
+    def remember(self, wPs: FloatArray, stamp_ns: int) -> None:
+        """Keep the movable points wPs (n, 3) of a scan, and forget what is too old to be asked for."""
+        self._past.append((stamp_ns, wPs[_voxel_representatives(wPs, self.config.voxel_m)]))
+        while len(self._past) > 2 and stamp_ns - self._past[1][0] >= 1e9 * self.config.memory_s:
+            self._past.popleft()
+
+
+def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.intp]:
+    """Index of one point of each occupied voxel."""
+    if len(points) == 0:
+        return np.zeros(0, np.intp)
+    cell = np.floor((points - points.min(axis=0)) / voxel_m).astype(np.int64)
+    size = cell.max(axis=0) + 1
+    return np.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_index=True)[1]
+
+
+def _objects(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
+    """(n,) number of the connected patch of ground plan that each point stands on."""
+    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / cell_m).astype(np.intp)
+    plan = np.zeros(cell.max(axis=0) + 1, np.bool_)
+    plan[cell[:, 0], cell[:, 1]] = True
+    numbers, _ = ndimage.label(plan, structure=np.ones((3, 3)))
+    return np.asarray(numbers[cell[:, 0], cell[:, 1]], np.intp)
