@@ -25,6 +25,10 @@ Residual
     predicted - measured, in pixels, unwhitened; sigmas in pixels stand in the noise.
 Pixels
     The centre of the top-left pixel is (0, 0), as in OpenCV.
+Variables
+    extrinsic E ``Pose3``, offset D ``Vector(1)``, twist V ``Vector(6)``, mask bias B ``Vector(1)``
+    (a ``double`` in gtsam's Values cannot be serialized). A factor takes their keys, which are ints; a
+    float or an array in place of a key fixes the quantity.
 Units
     SI inside; a suffix at boundaries (``_s _ns _px _deg``). Degrees are for people only.
 Arrays

@@ -48,39 +48,45 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-def left_jacobian_coefficients(squared_angles: FloatArray) -> FloatArray:
-    """c_1 .. c_4 with J_l(xi) = I + sum_k c_k ad(xi)^k, from x = theta^2 (n,) -> (4, n).
+def _series_table() -> FloatArray:
+    """(terms, 4): coefficients of x^m in b, c, db/dx, dc/dx of :func:`exponential_coefficients`."""
+    table = np.zeros((_TERMS, 4))
+    for m in range(_TERMS):
+        sign = (-1.0) ** m
+        for column in range(2):
+            table[m, column] = sign / math.factorial(2 * m + 2 + column)
+            table[m, 2 + column] = -sign * (m + 1) / math.factorial(2 * m + 4 + column)
+    return table
 
-    The closed forms (Barfoot, State Estimation for Robotics, 7.95) cancel badly at small angles, so
-    there the series sum ad^k / (k+1)! is used, its powers above 4 reduced by ad^5 = -2 x ad^3 - x^2 ad.
+
+_SERIES = _series_table()
+
+
+def exponential_coefficients(x: FloatArray) -> FloatArray:
+    """b, c, db/dx, dc/dx of x = theta^2 (...) -> (4, ...).
+
+    b = (1 - cos theta) / theta^2 and c = (theta - sin theta) / theta^3. With W = [omega]_x they give the
+    exponential, R = I + (1 - c x) W + b W^2 and V = I + b W + c W^2, and its derivatives. The closed forms
+    cancel badly at small angles, where the power series are used.
     """
-    x = np.asarray(squared_angles, dtype=np.float64)
+    powers = np.minimum(x, _SERIES_LIMIT)[None]
+    rows = _SERIES.reshape(_TERMS, 4, *[1] * x.ndim)
+    series: FloatArray = np.zeros((4, *x.shape)) + rows[-1]
+    for row in rows[-2::-1]:  # Horner
+        series *= powers
+        series += row
     if x.size == 0 or float(x.max()) < _SERIES_LIMIT:
-        return _series_coefficients(x)
+        return series
     large = np.maximum(x, _SERIES_LIMIT)
     t = np.sqrt(large)
-    sin, cos = np.sin(t), np.cos(t)
-    closed = np.stack(
-        [
-            (4.0 - t * sin - 4.0 * cos) / (2.0 * t**2),
-            (4.0 * t - 5.0 * sin + t * cos) / (2.0 * t**3),
-            (2.0 - t * sin - 2.0 * cos) / (2.0 * t**4),
-            (2.0 * t - 3.0 * sin + t * cos) / (2.0 * t**5),
-        ]
-    )
-    return np.where(x < _SERIES_LIMIT, _series_coefficients(np.minimum(x, _SERIES_LIMIT)), closed)
-
-
-def _series_coefficients(x: FloatArray) -> FloatArray:
-    """ad^(2m+1) = a_m x^(m-1) ad^3 + b_m x^m ad, with a_m = (-1)^(m+1) m and b_m = (-1)^m (1-m)."""
-    result = np.zeros((4, *x.shape))
-    for m in reversed(range(_TERMS)):  # Horner
-        sign = (-1.0) ** m
-        result[0] = result[0] * x + sign * (1 - m) / math.factorial(2 * m + 2)
-        result[1] = result[1] * x + sign * (1 - m) / math.factorial(2 * m + 3)
-        result[2] = result[2] * x + sign * (m + 1) / math.factorial(2 * m + 4)
-        result[3] = result[3] * x + sign * (m + 1) / math.factorial(2 * m + 5)
-    return result
+    sin, rest = np.sin(t), 1.0 - np.cos(t)
+    closed = [
+        rest / large,
+        (t - sin) / t**3,
+        (t * sin - 2.0 * rest) / (2.0 * large**2),
+        (t * rest - 3.0 * (t - sin)) / (2.0 * t**5),
+    ]
+    return np.where(x < _SERIES_LIMIT, series, np.stack(closed))
 
 
 def twist_ad(xi: FloatArray) -> FloatArray:
@@ -92,11 +98,16 @@ def twist_ad(xi: FloatArray) -> FloatArray:
 
 
 def se3_left_jacobian(xi: FloatArray) -> FloatArray:
-    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order."""
-    c = left_jacobian_coefficients(np.array([xi[:3] @ xi[:3]]))[:, 0]
+    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order.
+
+    J_l = sum ad^k / (k+1)! = I + (b - x b') ad + (c - x c') ad^2 - b' ad^3 - c' ad^4, the powers above 4
+    reduced by ad^5 = -2 x ad^3 - x^2 ad (Barfoot, State Estimation for Robotics, 7.95).
+    """
+    x = xi[:3] @ xi[:3]
+    b, c, b_x, c_x = exponential_coefficients(np.asarray(x))
     ad = twist_ad(xi)
     ad2 = ad @ ad
-    return np.asarray(np.eye(6) + c[0] * ad + c[1] * ad2 + c[2] * ad2 @ ad + c[3] * ad2 @ ad2)
+    return np.asarray(np.eye(6) + (b - x * b_x) * ad + (c - x * c_x) * ad2 - (b_x * ad + c_x * ad2) @ ad2)
 
 
 def _skew(a: FloatArray) -> FloatArray:
@@ -147,27 +158,38 @@ class PointwiseMoved:
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
         """Derivatives into out (13, k, n), columns as in :class:`RigidlyMoved`, from the gradients g."""
-        rotated = g if self.model == "translation" else _rotate(-self.xis[:3], g)
-        np.matmul(self.cRl.T, rotated.reshape(3, -1), out=out[3:6].reshape(3, -1))
+        by_xi, pulled = self._by_motion(g)
+        np.matmul(self.cRl.T, pulled.reshape(3, -1), out=out[3:6].reshape(3, -1))
         write_cross(self.lPs[:, None, :], out[3:6], out[:3])
-        wrench = self._gradient_by_xi(g)
-        np.multiply(wrench, -self.taus_s, out=out[7:13])
-        np.einsum("in,ikn->kn", -self.rates, wrench, out=out[6])
+        np.multiply(by_xi, -self.taus_s, out=out[7:13])
+        by_xi *= self.rates[:, None, :]
+        np.negative(by_xi.sum(axis=0), out=out[6])
 
-    def _gradient_by_xi(self, g: FloatArray) -> FloatArray:
-        """J_l(xi)^T [cP x g; g], (6, k, n)."""
-        L = np.zeros((6, *g.shape[1:]))
-        L[3:] = g
+    def _by_motion(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gradients by xi (6, k, n), and by the point before the motion, (3, k, n)."""
+        by_xi = np.zeros((6, *g.shape[1:]))
         if self.model == "translation":
-            return L
-        write_cross(self.cPs[:, None, :], g, L[:3])
-        omega, v = self.xis[:3, None, :], self.xis[3:, None, :]
-        result = L.copy()
-        for coefficient in left_jacobian_coefficients((self.xis[:3] ** 2).sum(axis=0)):
-            # L <- ad(xi)^T L = [L_omega x omega + L_v x v; L_v x omega]
-            L = np.concatenate([cross(L[:3], omega) + cross(L[3:], v), cross(L[3:], omega)])
-            result += coefficient * L
-        return result
+            by_xi[3:] = g
+            return by_xi, g
+        omega, v = self.xis[:3], self.xis[3:]
+        x = (omega**2).sum(axis=0)
+        b, c, b_x, c_x = exponential_coefficients(x)
+        wv = cross(omega, v)
+        wwv = cross(omega, wv)
+        arms = self.cPs - (v + b * wv + c * wwv)  # R (cTl . lP)
+        w = omega[:, None, :]
+        wg = cross(w, g)
+        wwg = cross(w, wg)
+        pulled = g - (1.0 - c * x) * wg + b * wwg  # R^T g
+        by_xi[3:] = g - b * wg + c * wwg  # V^T g
+        pg = cross(arms[:, None, :], g)
+        wpg = cross(w, pg)
+        # V^T (arm x g) + (d(V v) / d omega)^T g
+        by_xi[:3] = pg - b * wpg + c * cross(w, wpg)
+        by_xi[:3] += cross((b * v + c * wv)[:, None, :], g)
+        by_xi[:3] -= c * cross(v[:, None, :], wg)
+        by_xi[:3] += w * np.einsum("in,ikn->kn", 2.0 * (b_x * wv + c_x * wwv), g)
+        return by_xi, pulled
 
 
 def move_points(
@@ -222,33 +244,11 @@ def _move_rigidly(
     return RigidlyMoved(R @ lPs + t.reshape(3, 1), lift)
 
 
-def _rotate(omegas: FloatArray, a: FloatArray) -> FloatArray:
-    """Exp(omega) a for omegas (3, n) and a (3, n) or (3, k, n), by Rodrigues' formula."""
-    theta = np.sqrt((omegas**2).sum(axis=0))
-    axis = omegas[:, None, :] if a.ndim == 3 else omegas
-    wa = cross(axis, a)
-    wwa = cross(axis, wa)
-    wa *= np.sinc(theta / np.pi)
-    wwa *= 0.5 * np.sinc(theta / (2.0 * np.pi)) ** 2
-    wa += wwa
-    wa += a
-    return wa
-
-
 def _move(xis: FloatArray, points: FloatArray) -> FloatArray:
     """Exp(xi) . p for xis (6, n) and points (3, n)."""
-    omegas, vs = xis[:3], xis[3:]
-    x = (omegas**2).sum(axis=0)
-    wv = cross(omegas, vs)
-    t = vs + 0.5 * np.sinc(np.sqrt(x) / (2.0 * np.pi)) ** 2 * wv + _sine_remainder(x) * cross(omegas, wv)
-    return np.asarray(_rotate(omegas, points) + t)
-
-
-def _sine_remainder(x: FloatArray) -> FloatArray:
-    """(theta - sin theta) / theta^3 from x = theta^2, without cancellation."""
-    series = np.zeros_like(x)
-    small = np.minimum(x, _SERIES_LIMIT)
-    for m in reversed(range(_TERMS)):
-        series = series * small + (-1.0) ** m / math.factorial(2 * m + 3)
-    large = np.sqrt(np.maximum(x, _SERIES_LIMIT))
-    return np.where(x < _SERIES_LIMIT, series, (large - np.sin(large)) / large**3)
+    omega, v = xis[:3], xis[3:]
+    x = (omega**2).sum(axis=0)
+    b, c, _, _ = exponential_coefficients(x)
+    wp, wv = cross(omega, points), cross(omega, v)
+    rotated = points + (1.0 - c * x) * wp + b * cross(omega, wp)
+    return np.asarray(rotated + v + b * wv + c * cross(omega, wv))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from factors import move_points
-from factors.motion import left_jacobian_coefficients, se3_left_jacobian
+from factors.motion import exponential_coefficients, se3_left_jacobian
 
 STILL = np.zeros(6)
 
@@ -74,8 +74,21 @@ def test_left_jacobian_is_the_power_series(angle):
 
 def test_coefficients_of_many_angles_are_those_of_each():
     x = np.array([0.0, 1e-6, 0.5, 0.99, 1.01, 4.0, 9.0])
-    each = [left_jacobian_coefficients(np.array([value]))[:, 0] for value in x]
-    np.testing.assert_allclose(left_jacobian_coefficients(x), np.transpose(each), rtol=1e-12)
+    each = [exponential_coefficients(np.array(value)) for value in x]
+    np.testing.assert_allclose(exponential_coefficients(x), np.transpose(each), rtol=1e-12)
+
+
+def test_coefficients_by_hand_and_their_derivatives():
+    theta = np.pi / 2.0
+    b, c, *_ = exponential_coefficients(np.array(theta**2))
+    assert b == pytest.approx(1.0 / theta**2)
+    assert c == pytest.approx((theta - 1.0) / theta**3)
+    for x in (1e-8, 0.3, 0.9, 1.1, 5.0):
+        h = 1e-4 * max(x, 1.0) if x > 1e-3 else 1e-9
+        up, down = exponential_coefficients(np.array([[x + h], [x - h]]))[:2].transpose(1, 0, 2)
+        numerical = (up - down)[:, 0] / (2.0 * h)
+        tolerance = 1e-6 if x > 1e-3 else 1e-5  # differences of 1e-9
+        np.testing.assert_allclose(exponential_coefficients(np.array(x))[2:], numerical, rtol=tolerance)
 
 
 @pytest.mark.parametrize("model", ["se3", "translation"])
