@@ -154,8 +154,9 @@ def _track(
     """Corners that LK finds in b, inside the image, and that return to where they started."""
     if len(corners) == 0:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    there, found = _flow(gray_a, gray_b, corners, config)
-    back, found_back = _flow(gray_b, gray_a, there, config)
+    there, found = _flow(gray_a, gray_b, corners, None, config)
+    # Back from where it went: the pyramid has done its work, two levels check it.
+    back, found_back = _flow(gray_b, gray_a, there, corners, config)
     height, width = gray_a.shape[:2]
     good = (
         found
@@ -167,16 +168,21 @@ def _track(
 
 
 def _flow(
-    gray_a: NDArray[np.uint8], gray_b: NDArray[np.uint8], uv_a: NDArray[np.float32], config: FeatureConfig
+    gray_a: NDArray[np.uint8],
+    gray_b: NDArray[np.uint8],
+    uv_a: NDArray[np.float32],
+    guess: NDArray[np.float32] | None,
+    config: FeatureConfig,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(n, 2) pixels of b where Lucas-Kanade finds the windows about uv_a, and (n,) whether it does."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         gray_a,
         gray_b,
         uv_a,
-        np.empty_like(uv_a),
+        np.empty_like(uv_a) if guess is None else guess.copy(),
         winSize=(config.window_px, config.window_px),
-        maxLevel=config.levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.01),
+        maxLevel=config.levels if guess is None else 1,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
+        flags=0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     return np.asarray(there, np.float32).reshape(-1, 2), np.asarray(found).reshape(-1) == 1

@@ -223,7 +223,7 @@ def _refine(
         step = -np.linalg.solve(normal + 1e-9 * np.eye(5) * np.trace(normal), weighted.T @ residual)
         aRb = aRb @ np.asarray(gtsam.Rot3.Expmap(step[:3]).matrix())
         direction = np.asarray(gtsam.Unit3(direction).retract(step[3:]).point3())
-        if np.abs(step).max() < 1e-6:
+        if np.abs(step).max() < 1e-5:
             break
     residual, J = _line_distance(aRb, direction, fa, fb, camera)
     noise = max(config.min_noise_px, 1.4826 * float(np.median(np.abs(residual))))
