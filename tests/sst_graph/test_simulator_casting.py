@@ -16,7 +16,7 @@ COLUMNS = Columns(0.003, 2 * np.pi / 360, 360, SLOPES)
 
 
 def brute_force(triangles: FloatArray, rays: FloatArray) -> tuple[np.ndarray, FloatArray]:
-    """Nearest front face (-1: none) of each ray (m, 3) from the origin and the factor of the ray (Moeller-Trumbore)."""
+    """Nearest front face (-1: none) of each ray (m, 3) and the factor of the ray (Moeller-Trumbore)."""
     a, e1, e2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = np.cross(rays[:, None], e2[None])
     det = np.einsum("nk,mnk->mn", e1, p)

@@ -51,7 +51,7 @@ class SimulationConfig:
     time_offset_s: float = 0.05
     rotation_error_deg: float = 1.5
     translation_error_m: float = 0.05
-    vehicle_density: float = 0.2
+    vehicle_density: float = 0.13
     moving_fraction: float = 0.2
     truck_fraction: float = 0.08
     label_noise: float = 1.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -82,13 +83,19 @@ class SimulatedDrive:
     truth: GroundTruth
     street: Street
     stamps_ns: NDArray[np.int64]
-    look: Look
     lidar: Lidar
 
     @property
     def name(self) -> str:
         """Name of the drive: motion and seed."""
         return f"simulated-{self.config.motion}-{self.config.seed}"
+
+    @cached_property
+    def look(self) -> Look:
+        """What the street is painted with; drawn when the first picture is asked for."""
+        paint = np.random.default_rng([self.config.seed, 11])
+        atlas, detail, sky = material_atlas(paint), detail_atlas(paint), sky_panorama(paint)
+        return Look(atlas, detail, sky, self.street.sun, float(paint.uniform(0.35, 0.65)))
 
     def __len__(self) -> int:
         return self.config.frames
@@ -183,12 +190,4 @@ def simulate(config: SimulationConfig) -> SimulatedDrive:
     jitter[0] = 0.0
     stamps = np.rint((np.arange(config.frames) * config.period_s + jitter) * 1e6).astype(np.int64) * 1000
     street = build_street(config)
-    paint = np.random.default_rng([config.seed, 11])
-    look = Look(
-        material_atlas(paint),
-        detail_atlas(paint),
-        sky_panorama(paint),
-        street.sun,
-        float(paint.uniform(0.35, 0.65)),
-    )
-    return SimulatedDrive(config, camera, NOMINAL_CTL, truth, street, stamps, look, make_lidar(config))
+    return SimulatedDrive(config, camera, NOMINAL_CTL, truth, street, stamps, make_lidar(config))

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.simulator.casting import IndexArray, compact
 from sst_graph.data.simulator.config import SimulationConfig
+from sst_graph.data.simulator.mesh import normals_of
 from sst_graph.data.simulator.motion import EgoMotion
 from sst_graph.data.simulator.street import Snapshot
 from sst_graph.data.simulator.surfaces import EXTRA_LOSS, Kind, Material
@@ -153,9 +154,7 @@ def _loss(
     """(n,) probability that a return is lost: material, dark and slanted paint, range."""
     mesh = snapshot.mesh
     used, index = compact(face)
-    corner = triangles[used]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = normals_of(triangles[used])
     slant = 1.0 - np.abs(np.einsum("ij,ij->i", normal[index], direction))
     bright = mesh.colours[used].mean(axis=1)[index]
     paint = (mesh.materials[used] == Material.PAINT)[index]

@@ -59,15 +59,26 @@ def yaw_rotation(yaw: float) -> FloatArray:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def normals_of(triangles: FloatArray) -> FloatArray:
+    """(n, 3) outward unit normals of triangles (n, 3, 3)."""
+    normals = _cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return np.asarray(normals / np.maximum(np.sqrt((normals**2).sum(axis=1, keepdims=True)), 1e-12))
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(n, 3) cross products of the rows of a and b (n, 3)."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
+
+
 def planar_textures(triangles: FloatArray) -> FloatArray:
     """(n, 2, 4) texture frames in each face's plane: along the horizontal and up the slope."""
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    normals = normals_of(triangles)
     along = np.stack([-normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
-    size = np.linalg.norm(along, axis=1, keepdims=True)
+    size = np.sqrt((along**2).sum(axis=1, keepdims=True))
     flat = size[:, 0] < 0.3
     along = np.where(flat[:, None], np.array([1.0, 0.0, 0.0]), along / np.maximum(size, 1e-12))
-    up = np.where(flat[:, None], np.array([0.0, 1.0, 0.0]), np.cross(normals, along))
+    up = np.where(flat[:, None], np.array([0.0, 1.0, 0.0]), _cross(normals, along))
     textures = np.zeros((len(triangles), 2, 4))
     textures[:, 0, :3], textures[:, 1, :3] = along, up
     return textures

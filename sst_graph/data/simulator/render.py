@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from sst_graph.data.simulator.casting import IndexArray, compact, plane_of
-from sst_graph.data.simulator.mesh import Mesh
+from sst_graph.data.simulator.casting import IndexArray, compact
+from sst_graph.data.simulator.mesh import Mesh, normals_of
 from sst_graph.data.simulator.surfaces import DETAIL, TILE_M, Material
 from sst_graph.data.simulator.textures import LEVELS, TILE, Atlas
 from sst_graph.types import FloatArray
@@ -81,14 +81,13 @@ def shade(
 
 def _lighting(part: Mesh, look: Look) -> FloatArray:
     """(n, 1) light on each face: sun and sky; flat paint and glass mirror some of the sky."""
-    normal, _ = plane_of(part.triangles)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    normal = normals_of(part.triangles)
     sun = np.clip(normal @ look.sun, 0.0, 1.0)
     sky = 0.62 + 0.38 * normal[:, 2]
     light = look.sunlight * sun + (1.0 - look.sunlight) * sky
     glossy = np.isin(part.materials, (Material.PAINT, Material.GLASS))
     light += np.where(glossy, 0.35 * np.clip(normal[:, 2], 0.0, 1.0) ** 2, 0.0)
-    return np.asarray(1.5 * light)[:, None]
+    return np.asarray(1.85 * light)[:, None]
 
 
 def _textured(view: View, part: Mesh, index: IndexArray, z: NDArray[np.float32], look: Look) -> NDArray[Any]:
@@ -99,8 +98,7 @@ def _textured(view: View, part: Mesh, index: IndexArray, z: NDArray[np.float32],
     origin = part.textures[:, :, :3] @ view.position + part.textures[:, :, 3]
     # Periodic in both tiles: 40 tiles of grain make 100 m; keep float32 numbers small.
     origin = np.mod(origin, np.lcm.reduce(np.round(side * 2).astype(np.int64)) * DETAIL_TILE_M)
-    normal, d = plane_of(view.to_camera(part.triangles))
-    distance = np.abs(d) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
+    distance = np.abs(((part.triangles[:, 0] - view.position) * normals_of(part.triangles)).sum(axis=1))
     table = np.column_stack(
         [axes.reshape(-1, 6), origin, side, distance, DETAIL[part.materials], part.materials]
     )
@@ -149,8 +147,7 @@ def _sky(view: View, look: Look) -> NDArray[np.float32]:
 
 def _developed(colour: NDArray[Any], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Lens blur, exposure and sensor noise, then 8 bits."""
-    blurred = cv2.GaussianBlur(colour, (0, 0), 0.55)
-    blurred *= np.float32(rng.normal(1.0, 0.01))
-    blurred += np.float32(2.0) * rng.standard_normal(blurred.shape, dtype=np.float32)
-    picture: NDArray[np.uint8] = cv2.convertScaleAbs(np.maximum(blurred, 0.0))
-    return picture
+    blurred: NDArray[Any] = cv2.GaussianBlur(colour, (0, 0), 0.55)
+    blurred *= float(rng.normal(1.0, 0.01))
+    blurred += 2.0 * rng.standard_normal(blurred.shape, dtype=np.float32)
+    return np.asarray(cv2.convertScaleAbs(np.maximum(blurred, 0.0)), np.uint8)

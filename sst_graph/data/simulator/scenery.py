@@ -177,7 +177,7 @@ def tree(rng: np.random.Generator) -> Mesh:
     for _ in range(int(rng.integers(4, 8))):
         centre = top + np.array([*rng.normal(0.0, 0.55 * spread, 2), rng.uniform(0.2, 1.6 * spread)])
         size = spread * rng.uniform(0.5, 0.9, 3)
-        blob = blob_triangles(rng, size, 0.28) + centre
+        blob = blob_triangles(rng, size, 0.2, rows=9) + centre
         parts.append(soup(blob, Kind.VEGETATION, Material.LEAVES, green))
         branch = cylinder_triangles(top - np.array([0, 0, 0.5]), centre, (0.4 * radius, 0.15 * radius), 5)
         parts.append(soup(branch, Kind.TRUNK, Material.BARK, bark))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +72,9 @@ def _grow(shift: FloatArray, mask: NDArray[np.bool_], growth: float) -> None:
     crop = mask[y0:y1, x0:x1].astype(np.uint8)
     outside = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
     distance = cv2.GaussianBlur(outside - cv2.distanceTransform(crop, cv2.DIST_L2, 5), (0, 0), 1.0)
-    gradient = np.stack([cv2.Sobel(distance, cv2.CV_32F, 1, 0), cv2.Sobel(distance, cv2.CV_32F, 0, 1)])
+    gradient: NDArray[Any] = np.stack(
+        [cv2.Sobel(distance, cv2.CV_32F, 1, 0), cv2.Sobel(distance, cv2.CV_32F, 0, 1)]
+    )
     gradient /= np.maximum(np.linalg.norm(gradient, axis=0), 1e-6)
     weight = np.clip(1.0 - (np.abs(distance) - abs(growth) - 1.0) / 2.0, 0.0, 1.0)
     shift[:, y0:y1, x0:x1] -= growth * weight * gradient

@@ -23,7 +23,7 @@ from sst_graph.data.simulator.surfaces import Kind, Material
 from sst_graph.data.simulator.vehicles import random_car, random_truck
 from sst_graph.types import FloatArray
 
-BEHIND_M, AHEAD_M = 120.0, 150.0
+BEHIND_M, AHEAD_M = 105.0, 145.0
 """The street is built this far before the drive's start and beyond its end [m]."""
 LIDAR_HEIGHT_M = 1.73
 

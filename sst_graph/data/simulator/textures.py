@@ -32,7 +32,7 @@ class Atlas:
     pixels: Image
     bands: FloatArray
 
-    def sample(self, tile: FloatArray, u: FloatArray, v: FloatArray, level: FloatArray) -> Image:
+    def sample(self, tile: Image, u: Image, v: Image, level: Image) -> Image:
         """Texture at coordinates u, v (h, w) in tiles, of tiles numbered ``tile`` at halvings ``level``."""
         size = np.float32(TILE) * np.exp2(-level).astype(np.float32)
         x = (u - np.floor(u)) * size + np.float32(0.5) + tile * (size + np.float32(2.0))
@@ -83,7 +83,7 @@ def material_atlas(rng: np.random.Generator) -> Atlas:
     plain = 0.95 + 0.03 * smooth_noise(rng, 20.0)
     tiles: dict[int, Image] = {material: _tile(plain) for material in range(MATERIALS)}
     stains = smooth_noise(rng, 25.0) + 0.7 * smooth_noise(rng, 8.0)
-    asphalt = 0.9 + 0.06 * stains + 0.05 * smooth_noise(rng, 0.7)
+    asphalt = 0.9 + 0.035 * stains + 0.05 * smooth_noise(rng, 0.7)
     asphalt[np.abs(smooth_noise(rng, 14.0)) < 0.02] *= 0.6
     tiles[Material.ASPHALT] = _tile(asphalt)
     tiles[Material.PAVING] = _tile(_slabs(rng, 8, 16) * (1.0 + 0.05 * smooth_noise(rng, 12.0)))
@@ -136,7 +136,7 @@ def _slabs(rng: np.random.Generator, columns: int, rows: int) -> FloatArray:
         joints = (np.arange(0, TILE, wide) + (row % 2) * wide // 2) % TILE
         slabs[row * high : (row + 1) * high, joints] *= 0.65
         slabs[row * high] *= 0.65
-    return slabs
+    return np.asarray(slabs, np.float64)
 
 
 def _facade(rng: np.random.Generator) -> Image:

@@ -110,6 +110,7 @@ def car_mesh(shape: CarShape, paint: Colour) -> Mesh:
     parts = [
         _body(shape, paint),
         _cabin(shape, paint),
+        *_lamps(shape),
         *_wheels(shape.axles, shape.wheel, shape.width, Kind.CAR),
     ]
     half, rear, nose = shape.width / 2, -shape.length / 2, shape.length / 2
@@ -172,18 +173,25 @@ def _body(shape: CarShape, paint: Colour) -> Mesh:
     ]
     y = [0.97 * w, w, w, 0.965 * w, 0.86 * w, 0.0 * w]
     half = np.stack([np.stack([x, yi, zi], axis=1) for yi, zi in zip(y, z, strict=True)], axis=1)
-    return _lit(soup(loft_triangles(_mirrored(half)), Kind.CAR, Material.PAINT, paint), shape)
+    return soup(loft_triangles(_mirrored(half)), Kind.CAR, Material.PAINT, paint)
 
 
-def _lit(body: Mesh, shape: CarShape) -> Mesh:
-    """The body with lamps at its corners and a dark grille and bumper."""
-    centre = body.triangles.mean(axis=1)
-    x, y, z = centre[:, 0] / (shape.length / 2), np.abs(centre[:, 1]) / (shape.width / 2), centre[:, 2]
-    lamp_band = (z > shape.hood - 0.2) & (z < shape.hood - 0.02)
-    body = body.recoloured((x > 0.93) & (y > 0.45) & lamp_band, Material.PLAIN, HEADLIGHT)
-    tail_band = (z > shape.tail - 0.32) & (z < shape.tail - 0.02)
-    body = body.recoloured((x < -0.93) & (y > 0.55) & tail_band, Material.PLAIN, TAILLIGHT)
-    return body.recoloured((x > 0.95) & (y < 0.5) & (z < shape.hood - 0.12), Material.PLAIN, BLACK)
+def _lamps(shape: CarShape) -> list[Mesh]:
+    """Head and tail lamps, and the dark grille and bumper."""
+    half, nose, parts = shape.width / 2, shape.length / 2, []
+    for x, z, colour in (
+        (nose - 0.1, shape.hood - 0.19, HEADLIGHT),
+        (-nose - 0.015, shape.tail - 0.3, TAILLIGHT),
+    ):
+        high = z + (0.12 if x > 0 else 0.2)
+        for side in (-1.0, 1.0):
+            y = sorted((side * 0.5 * half, side * (0.775 if x > 0 else 0.79) * half))
+            lamp = box_triangles((x, y[0], z), (x + 0.115, y[1], high))
+            parts.append(soup(lamp, Kind.CAR, Material.PLAIN, colour))
+    for low, high_x in ((nose - 0.05, nose + 0.012), (-nose - 0.012, -nose + 0.05)):
+        bumper = box_triangles((low, -0.6 * half, 0.33), (high_x, 0.6 * half, 0.46))
+        parts.append(soup(bumper, Kind.CAR, Material.PLAIN, BLACK))
+    return parts
 
 
 def _cabin(shape: CarShape, paint: Colour) -> Mesh:
@@ -198,7 +206,8 @@ def _cabin(shape: CarShape, paint: Colour) -> Mesh:
     rise = shape.height - shape.belt - 0.03
     roof_x = np.array([x_foot, x_head - 0.02, x_head + 0.15, middle[0], x_screen - 0.2, x_screen, x_cowl])
     roof_z = np.array([0.0, 0.9, 0.965, 1.0, 0.98, 0.93, 0.0]) * rise
-    h = np.interp(x, *(a[np.argsort(roof_x)] for a in (roof_x, roof_z)))
+    order = np.argsort(roof_x)
+    h = np.interp(x, roof_x[order], roof_z[order])
     base = 0.93 * _half_width(shape, x)
     top = base - 0.28 * h
     z0 = np.full(len(x), shape.belt - 0.06)
@@ -232,18 +241,13 @@ def _glazing(
 
 def _wheels(axles: tuple[float, ...], radius: float, width: float, kind: Kind) -> list[Mesh]:
     """Tyres with rims at both ends of each axle."""
-    parts = []
-    for axle in axles:
-        for side in (-1.0, 1.0):
-            outer = np.array([axle, side * (width / 2 - 0.02), radius])
-            inner = outer - np.array([0.0, side * 0.22, 0.0])
-            rim = outer + np.array([0.0, side * 0.006, 0.0])
-            parts.append(
-                soup(cylinder_triangles(inner, outer, (radius, radius), 14), kind, Material.RUBBER, BLACK)
-            )
-            disc = cylinder_triangles(inner, rim, (0.66 * radius, 0.62 * radius), 10)
-            parts.append(soup(disc, kind, Material.METAL, RIM))
-    return parts
+    outer, inner = np.array([0.0, width / 2 - 0.02, radius]), np.array([0.0, width / 2 - 0.24, radius])
+    rim = outer + np.array([0.0, 0.006, 0.0])
+    tyre = soup(cylinder_triangles(inner, outer, (radius, radius), 14), kind, Material.RUBBER, BLACK)
+    disc = cylinder_triangles(inner, rim, (0.66 * radius, 0.62 * radius), 10)
+    left = merged([tyre, soup(disc, kind, Material.METAL, RIM)])
+    right = left.placed(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    return [wheel.placed(np.eye(3), np.array([axle, 0.0, 0.0])) for axle in axles for wheel in (left, right)]
 
 
 def random_truck(rng: np.random.Generator) -> Mesh:
