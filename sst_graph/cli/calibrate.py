@@ -46,6 +46,6 @@ def calibrate_drives(
 ) -> tuple[CalibrationResult, Comparison | None]:
     """The calibration of ``sources``, with progress on stderr, and its errors where they can be known."""
     with ProgressBar() as progress:
-        result = calibrate(sources, initial, config, progress=progress)
+        result = calibrate(sources, initial, config, initial_offset_s=initial_offset_s, progress=progress)
     result = dataclasses.replace(result, camera_name=camera)
     return result, comparison(result, sources)
