@@ -1,7 +1,7 @@
 """Reprojection residuals of frozen matches, and their Jacobian.
 
     r_i = uv(cP_i) - q_i                          point-to-pixel and pixel-to-point, 2 rows
-    r_i = n_i . (uv(cP_i) - q_i) - bias           silhouette, 1 row
+    r_i = n_i . (uv(cP_i) - q_i) + bias           silhouette, 1 row
 
 in pixels, with cP_i = Exp(-tau_i w_i) . (cTl . lP_i) (:mod:`factors.motion`) and uv the pinhole
 projection; sources: SST-Calib (Kodaira et al., ITSC 2022), eq. 2-6, for the first.
@@ -64,8 +64,8 @@ def residuals(
         cTl: pose of the LiDAR in the camera.
         offset_s: time offset [s].
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
-        bias_px: silhouettes only: how far the mask's contour lies outside the true one [px]; given, it
-            is the last column of the Jacobian.
+        bias_px: silhouettes only: how far the mask's contour lies outside the true outline [px]
+            (dilation positive); given, it is the last column of the Jacobian.
         jacobians: False saves the work and returns None for J.
 
     Returns:
@@ -174,10 +174,10 @@ def evaluate(
     if normals is None:
         rows[-1] = error
     else:
-        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1] - (bias_px or 0.0)
+        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1] + (bias_px or 0.0)
     if jacobians:
         moved.write_rows(_gradients(camera, x, y, inverse_z, normals), rows[:motion_rows])
-        rows[motion_rows:-1] = -1.0  # by the bias
+        rows[motion_rows:-1] = 1.0  # by the bias
     if any_behind:
         rows[:, :, behind] = 0.0
     return Evaluated(rows, moved.lift, behind if any_behind else None)

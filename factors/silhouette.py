@@ -22,11 +22,12 @@ def silhouette_factor(
     *,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
-    """r_i = n_i . (uv(cP_i) - q_i) - bias: signed distance to the mask's contour less its bias [px].
+    """r_i = n_i . (uv(cP_i) - q_i) + bias: signed distance to the true outline [px].
 
     q_i is the contour's point nearest to the predicted pixel and n_i its outward unit normal; frozen,
     they are the contour's tangent line. ``bias_px`` is how far a class's masks reach outside the true
-    outline (dilation positive). See :func:`factors.frame_factor` for the arguments.
+    outline (dilation positive): the outline lies that far inside the contour. The arguments are those of
+    :func:`factors.frame_factor`.
 
     Raises:
         FactorError: the alignment has no normals.

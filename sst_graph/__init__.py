@@ -1,1 +1,31 @@
 """Target-less LiDAR-camera calibration, in space and time, as a GTSAM factor graph."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sst_graph.data import open_source
+    from sst_graph.estimators import CalibrationConfig, calibrate
+    from sst_graph.result import CalibrationResult
+
+__all__ = ["CalibrationConfig", "CalibrationResult", "calibrate", "open_source"]
+
+_HOMES = {
+    "CalibrationConfig": "sst_graph.estimators",
+    "CalibrationResult": "sst_graph.result",
+    "calibrate": "sst_graph.estimators",
+    "open_source": "sst_graph.data",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for: the command's ``--help`` must not wait for OpenCV."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

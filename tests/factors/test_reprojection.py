@@ -30,12 +30,12 @@ def test_predicted_less_measured():
     np.testing.assert_allclose(r, [3.0, -2.0], atol=1e-12)
 
 
-def test_signed_distance_less_bias():
+def test_signed_distance_to_the_contour_and_how_far_the_outline_lies_within():
     alignment = match([1.0, -0.5, 10.0], [57.0, 37.0], normals=np.array([[0.6, -0.8]]))
     r, J = residuals(alignment, gtsam.Pose3(), 0.0, STILL, bias_px=0.5)
-    np.testing.assert_allclose(r, [0.6 * 3.0 + 0.8 * 2.0 - 0.5])
+    np.testing.assert_allclose(r, [0.6 * 3.0 + 0.8 * 2.0 + 0.5])
     assert J.shape == (1, 14)
-    assert J[0, 13] == -1.0
+    assert J[0, 13] == 1.0
 
 
 def test_a_later_image_sees_a_point_further_out():

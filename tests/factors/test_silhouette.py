@@ -12,15 +12,16 @@ E, D, V, B = (gtsam.symbol(letter, 0) for letter in "edvb")
 CAMERA = PinholeCamera(100.0, 100.0, 50.0, 40.0, 101, 81)
 
 
-def test_outside_is_positive_and_a_dilated_mask_takes_it_back():
-    # predicted at u = 60, contour at u = 57 with the outside to the right, mask dilated by 2 px
+def test_outside_is_positive_and_a_dilated_mask_hides_more_of_it():
+    # predicted at u = 60, contour at u = 57 with the outside to the right, mask dilated by 2 px: the
+    # outline is at u = 55
     alignment = Alignment(CAMERA, [[1.0, 0.0, 10.0]], 0.0, [[57.0, 40.0]], 1.0, [[1.0, 0.0]])
     values = gtsam.Values()
     values.insert(E, gtsam.Pose3())
     values.insert(B, np.array([2.0]))
     factor = silhouette_factor(alignment, E, bias_px=B, condensed=False)
-    np.testing.assert_allclose(factor.unwhitenedError(values), [1.0, 0.0], atol=1e-12)
-    assert silhouette_factor(alignment, E, bias_px=2.0).error(values) == pytest.approx(0.5)
+    np.testing.assert_allclose(factor.unwhitenedError(values), [5.0, 0.0], atol=1e-12)
+    assert silhouette_factor(alignment, E, bias_px=2.0).error(values) == pytest.approx(12.5)
     assert silhouette_factor(alignment, E).error(values) == pytest.approx(4.5)
 
 

@@ -1,0 +1,128 @@
+"""Beam geometry of a spinning LiDAR, fitted from a scan.
+
+A laser of a spinning scanner does not sit in the origin of the LiDAR frame: its ring lies on the cone
+
+    z = slope * rho + height,        rho = sqrt(x^2 + y^2)
+
+with ``height`` about 0.1-0.2 m for an HDL-64E. Comparing the elevation angles of a near and a far return
+as if both left the origin is then wrong by ``height * (1/rho_near - 1/rho_far)``, up to a degree; the
+silhouette's vertical position needs the cone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_CONE_NOISE_M = 0.02
+_ROUNDS = 6
+_MIN_RING_POINTS = 30
+_MIN_RHO_RATIO = 1.5
+"""A cone's height is fitted only where the ring's far points are this much farther than its near ones."""
+
+
+@dataclass(frozen=True)
+class Beams:
+    """The points of a scan in beam order.
+
+    Attributes:
+        order: (n,) indices of the points sorted by (ring, azimuth).
+        ring: (n,) ring of each point, 0 the lowest, rising with elevation.
+        azimuth: (n,) azimuth of each point, counter-clockwise from the x axis [rad].
+        rho: (n,) distance of each point from the z axis [m].
+        height: (rings,) height of each ring's cone tip [m].
+        step: median azimuth step between neighbours of one ring [rad].
+        elevation: (rings,) median elevation angle of each ring [rad].
+    """
+
+    order: IntArray
+    ring: IntArray
+    azimuth: FloatArray
+    rho: FloatArray
+    height: FloatArray
+    step: float
+    elevation: FloatArray
+
+
+def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beams:
+    """Order points (n, 3) [m] by laser and azimuth and fit the cones.
+
+    Args:
+        rings: (n,) laser of each point, or None: then rings are recovered from the elevations.
+    """
+    rho = np.hypot(points[:, 0], points[:, 1])
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    elevation = np.arctan2(points[:, 2], np.maximum(rho, 1e-6))
+    labels = recover_rings(elevation, rho) if rings is None else rings
+    ring, median_elevation = _rank_by_elevation(labels, elevation)
+    order = np.lexsort((azimuth, ring))
+    steps = np.diff(azimuth[order])[np.diff(ring[order]) == 0]
+    step = float(np.median(steps)) if len(steps) else 0.0
+    height = _cone_heights(points[:, 2], rho, ring, len(median_elevation))
+    return Beams(order, ring, azimuth, rho, height, step, median_elevation)
+
+
+def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
+    """(n,) ring numbers from elevation angles [rad]: peaks of their histogram over far points.
+
+    Lasers off the origin smear the angle of near points, so the peaks come from points beyond 8 m
+    (from all points where too few are that far). A sensor without rings gets strips of 0.4 degrees.
+    """
+    if len(elevation) == 0:
+        return np.zeros(0, dtype=np.intp)
+    resolution = np.radians(0.04)
+    far = rho > 8.0
+    sample = elevation[far] if np.count_nonzero(far) > 1000 else elevation
+    low = float(elevation.min())
+    bins = int((float(elevation.max()) - low) / resolution) + 2
+    histogram = np.bincount(((sample - low) / resolution).astype(np.intp), minlength=bins).astype(float)
+    smooth = np.convolve(histogram, [0.25, 0.5, 0.25], mode="same")
+    inner = smooth[1:-1]
+    is_peak = (inner >= smooth[:-2]) & (inner > smooth[2:]) & (inner > 0.25 * np.median(smooth[smooth > 0]))
+    peaks = low + (np.flatnonzero(is_peak) + 1.5) * resolution
+    occupied = np.count_nonzero(histogram) / max(1, bins)
+    if len(peaks) < 8 or occupied > 0.9:
+        return np.asarray(((elevation - low) / np.radians(0.4)).astype(np.intp))
+    borders = 0.5 * (peaks[1:] + peaks[:-1])
+    return np.asarray(np.searchsorted(borders, elevation).astype(np.intp))
+
+
+def _rank_by_elevation(labels: NDArray[np.integer], elevation: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Ring numbers that rise with elevation, and each ring's median elevation."""
+    names, ring = np.unique(labels, return_inverse=True)
+    ring = ring.reshape(-1).astype(np.intp)
+    by_ring = np.lexsort((elevation, ring))
+    starts = np.searchsorted(ring[by_ring], np.arange(len(names) + 1))
+    middle = by_ring[(starts[:-1] + starts[1:]) // 2] if len(names) else by_ring
+    medians = elevation[middle]
+    rank = np.argsort(medians, kind="stable")
+    place = np.empty_like(rank)
+    place[rank] = np.arange(len(rank))
+    return place[ring], medians[rank]
+
+
+def _cone_heights(z: FloatArray, rho: FloatArray, ring: IntArray, rings: int) -> FloatArray:
+    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell."""
+    weight = 1.0 / np.maximum(rho, 1.0)
+    base = weight
+    height = np.zeros(rings)
+    for _ in range(_ROUNDS):
+        w2 = weight**2
+        s = [np.bincount(ring, w2 * a, rings) for a in (np.ones_like(rho), rho, rho**2, z, z * rho)]
+        det = s[0] * s[2] - s[1] ** 2
+        safe = np.where(det > 1e-9 * np.maximum(s[0] * s[2], 1e-12), det, np.inf)
+        slope = (s[0] * s[4] - s[1] * s[3]) / safe
+        height = (s[2] * s[3] - s[1] * s[4]) / safe
+        error = z - slope[ring] * rho - height[ring]
+        weight = base / (1.0 + np.square(error / _CONE_NOISE_M))
+    counts = np.bincount(ring, minlength=rings)
+    nearest, farthest = np.full(rings, np.inf), np.zeros(rings)
+    np.minimum.at(nearest, ring, rho)
+    np.maximum.at(farthest, ring, rho)
+    trusted = (counts >= _MIN_RING_POINTS) & (farthest > _MIN_RHO_RATIO * nearest) & (np.abs(height) < 0.6)
+    return np.where(trusted, height, 0.0)

@@ -1,0 +1,218 @@
+"""Boundary points of a scan: where a scan line leaves an object for what is behind it.
+
+The edge lies between the last return on the object and the next beam, so the mid-direction at the
+object's range is an unbiased boundary point, uniform over half a beam step to either side. Where the
+neighbour is *nearer* the edge belongs to the neighbour and is skipped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sst_graph.association.beams import Beams, arrange_beams
+from sst_graph.types import Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+class Edge(IntEnum):
+    """On which side of the object the scan leaves it."""
+
+    SIDE = 0
+    TOP = 1
+
+
+@dataclass(frozen=True)
+class BoundaryConfig:
+    """Which returns make a boundary.
+
+    Attributes:
+        behind_m: the neighbour must be farther by this much [m] ...
+        behind_ratio: ... plus this fraction of the range.
+        max_steps: largest azimuth gap between neighbours, in beam steps.
+        max_elevation_gap_deg: largest gap between neighbouring rings [deg].
+        max_range_m: farthest object [m].
+        min_points: objects with fewer points are left out.
+        cell_m: grid cell for splitting a class into objects where instances are missing [m].
+    """
+
+    behind_m: float = 0.5
+    behind_ratio: float = 0.0
+    max_steps: float = 1.6
+    max_elevation_gap_deg: float = 0.9
+    max_range_m: float = 60.0
+    min_points: int = 15
+    cell_m: float = 0.3
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """Boundary points of one class in one scan.
+
+    Attributes:
+        lPs: (m, 3) points in the LiDAR frame [m].
+        outward: (m, 3) a point farther out across the edge at the same range [m]: its direction in the
+            image tells on which side the background lies.
+        half_gaps_m: (m,) half the gap between the two beams at the object's range [m].
+        offsets_s: (m,) time of each point relative to the scan's stamp [s].
+        edges: (m,) of :class:`Edge`.
+        objects: (m,) number of the object within the scan.
+    """
+
+    lPs: FloatArray
+    outward: FloatArray
+    half_gaps_m: FloatArray
+    offsets_s: FloatArray
+    edges: NDArray[np.uint8]
+    objects: IntArray
+
+    def __len__(self) -> int:
+        return len(self.lPs)
+
+
+def find_boundaries(
+    scan: Scan, classes: Sequence[SemanticClass], config: BoundaryConfig | None = None
+) -> dict[SemanticClass, Boundaries]:
+    """Side and top boundary points of each class in a scan; a class without any has no entry."""
+    config = config or BoundaryConfig()
+    usable = np.linalg.norm(scan.points, axis=1) > 0.5
+    points = scan.points[usable].astype(np.float64)
+    labels = scan.classes[usable]
+    present = [c for c in classes if np.count_nonzero(labels == c) >= config.min_points]
+    if not present:
+        return {}
+    beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
+    offsets = np.zeros(len(points)) if scan.offsets_s is None else scan.offsets_s[usable].astype(float)
+    instances = None if scan.instances is None else scan.instances[usable]
+    found = {}
+    for c in present:
+        mask = labels == c
+        objects = split_objects(points, mask, instances, config)
+        parts = [
+            _side_edges(points, mask, beams, config, +1),
+            _side_edges(points, mask, beams, config, -1),
+            _top_edges(points, mask, beams, config),
+        ]
+        found[c] = _collect(parts, offsets, objects, config)
+    return {c: b for c, b in found.items() if len(b)}
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges of one side: index of the object's point, the boundary point, the point across it."""
+
+    index: IntArray
+    lPs: FloatArray
+    outward: FloatArray
+    edge: Edge
+
+
+def _side_edges(
+    points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config: BoundaryConfig, side: int
+) -> _Edges:
+    """Edges towards rising (side = 1) or falling azimuth, half a beam step from the last return.
+
+    The half step, not the middle of the two azimuths: a laser mounted off the axis shows a near and a
+    far return of neighbouring firings under azimuths that differ by more, or less, than the step.
+    """
+    a, b = beams.order[:-1], beams.order[1:]
+    last, following = (a, b) if side > 0 else (b, a)
+    gap = side * (beams.azimuth[following] - beams.azimuth[last])
+    parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
+    ok = (beams.ring[a] == beams.ring[b]) & (gap < config.max_steps * beams.step + parallax)
+    ok &= mask[last] & ~mask[following] & _is_behind(beams.rho, last, following, config)
+    last = last[ok]
+    half = 0.5 * side * beams.step
+    return _Edges(last, _turn(points[last], half), _turn(points[last], 3.0 * half), Edge.SIDE)
+
+
+def _turn(points: FloatArray, angle: float) -> FloatArray:
+    """Points turned about the z axis by an angle [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, points[:, 2]], axis=1)
+
+
+def _top_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config: BoundaryConfig) -> _Edges:
+    """Edges towards the ring above: half way, at the object's range, to that ring's cone."""
+    on_object = np.flatnonzero(mask & (beams.ring + 1 < len(beams.height)))
+    keys = beams.ring[beams.order] * 10.0 + beams.azimuth[beams.order]
+    above = beams.ring[on_object] + 1
+    place = np.searchsorted(keys, above * 10.0 + beams.azimuth[on_object])
+    place = np.clip(place, 1, len(keys) - 1)
+    left, right = beams.order[place - 1], beams.order[place]
+    gap = beams.azimuth[right] - beams.azimuth[left]
+    ok = (beams.ring[left] == above) & (beams.ring[right] == above) & (gap < 2.0 * beams.step + 0.01)
+    ok &= ~mask[left] & ~mask[right]
+    for neighbour in (left, right):
+        ok &= _is_behind(beams.rho, on_object, neighbour, config)
+    i, left, right, above, gap = on_object[ok], left[ok], right[ok], above[ok], gap[ok]
+    rho, tip = beams.rho[i], beams.height[above]
+    fraction = np.clip((beams.azimuth[i] - beams.azimuth[left]) / np.maximum(gap, 1e-9), 0.0, 1.0)
+    z_left = tip + (points[left, 2] - tip) * rho / beams.rho[left]
+    z_right = tip + (points[right, 2] - tip) * rho / beams.rho[right]
+    z_above = (1.0 - fraction) * z_left + fraction * z_right
+    rise = (z_above - points[i, 2]) / rho
+    ok = (rise > 0.0) & (rise < np.radians(config.max_elevation_gap_deg))
+    i, z_above = i[ok], z_above[ok]
+    lPs, outward = points[i].copy(), points[i].copy()
+    lPs[:, 2] = 0.5 * (points[i, 2] + z_above)
+    outward[:, 2] = 1.5 * z_above - 0.5 * points[i, 2]
+    return _Edges(i, lPs, outward, Edge.TOP)
+
+
+def _is_behind(
+    rho: FloatArray, last: IntArray, following: IntArray, config: BoundaryConfig
+) -> NDArray[np.bool_]:
+    return np.asarray(rho[following] > rho[last] * (1.0 + config.behind_ratio) + config.behind_m)
+
+
+def _collect(
+    parts: Sequence[_Edges], offsets: FloatArray, objects: IntArray, config: BoundaryConfig
+) -> Boundaries:
+    index = np.concatenate([part.index for part in parts])
+    lPs = np.concatenate([part.lPs for part in parts])
+    outward = np.concatenate([part.outward for part in parts])
+    edges = np.concatenate([np.full(len(part.index), part.edge, dtype=np.uint8) for part in parts])
+    keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < config.max_range_m)
+    half_gaps = 0.5 * np.linalg.norm(outward - lPs, axis=1)
+    return Boundaries(
+        lPs[keep], outward[keep], half_gaps[keep], offsets[index][keep], edges[keep], objects[index][keep]
+    )
+
+
+def split_objects(
+    points: FloatArray,
+    mask: NDArray[np.bool_],
+    instances: NDArray[np.uint16] | None,
+    config: BoundaryConfig,
+) -> IntArray:
+    """(n,) number of the object that each point of a class belongs to; -1 for none or too small a one.
+
+    The data's instances where all points carry one, else connected cells of a grid seen from above.
+    """
+    objects = np.full(len(points), -1, dtype=np.intp)
+    members = points[mask, :2]
+    if instances is not None and bool((instances[mask] > 0).all()):
+        numbers = instances[mask].astype(np.intp)
+    else:
+        cells = np.floor(members / config.cell_m).astype(np.intp)
+        cells -= cells.min(axis=0) - 1
+        size = np.minimum(cells.max(axis=0) + 2, 4000)
+        grid = np.zeros(size, dtype=np.uint8)
+        cells = np.minimum(cells, size - 1)
+        grid[cells[:, 0], cells[:, 1]] = 1
+        grown = cv2.dilate(grid, np.ones((3, 3), np.uint8))
+        regions, _ = ndimage.label(grown)
+        numbers = regions[cells[:, 0], cells[:, 1]].astype(np.intp)
+    counts = np.bincount(numbers)
+    objects[mask] = np.where(counts[numbers] >= config.min_points, numbers, -1)
+    return objects

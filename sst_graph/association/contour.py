@@ -1,0 +1,105 @@
+"""Signed distance to the contour of a class in an image mask, below a pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
+
+_REMAP_LIMIT = 30_000
+_SMOOTHING_PX = 1.0
+_MIN_GRADIENT = 0.3
+"""A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
+
+
+@dataclass(frozen=True)
+class ContourFeet:
+    """Nearest contour of each queried pixel.
+
+    Attributes:
+        distances: (n,) signed distance, negative inside the mask [px].
+        normals: (n, 2) unit normal of the contour, towards the outside.
+        feet: (n, 2) nearest point of the contour [px].
+        valid: (n,) False at ridges of the distance, beside ``IGNORE`` pixels and off the image.
+    """
+
+    distances: FloatArray
+    normals: FloatArray
+    feet: FloatArray
+    valid: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ContourMap:
+    """Signed distance field of one class in one mask.
+
+    Attributes:
+        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed [px].
+        unknown: (h, w) 1 near ``IGNORE`` pixels, where a contour is not the object's.
+    """
+
+    distance: FloatMap
+    unknown: FloatMap
+
+    @classmethod
+    def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
+        """The field of a class in a mask (h, w); None where the class is absent or fills the image."""
+        inside = (mask == semantic_class).astype(np.uint8)
+        if not inside.any() or inside.all():
+            return None
+        distance = signed_distance(inside)
+        unknown = cv2.dilate((mask == SemanticClass.IGNORE).astype(np.uint8), np.ones((5, 5), np.uint8))
+        smooth = np.asarray(cv2.GaussianBlur(distance, (0, 0), _SMOOTHING_PX), np.float32)
+        return cls(smooth, unknown.astype(np.float32))
+
+    def look_up(self, uvs: FloatArray) -> ContourFeet:
+        """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
+        height, width = self.distance.shape
+        border = 3.0
+        u, v = uvs[:, 0], uvs[:, 1]
+        with np.errstate(invalid="ignore"):
+            valid = (u > border) & (u < width - 1 - border) & (v > border) & (v < height - 1 - border)
+        safe = np.where(valid[:, None], uvs, border + 1.0)
+        distances = sample(self.distance, safe)
+        step_u, step_v = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+        gradient = 0.5 * np.stack(
+            [
+                sample(self.distance, safe + step_u) - sample(self.distance, safe - step_u),
+                sample(self.distance, safe + step_v) - sample(self.distance, safe - step_v),
+            ],
+            axis=1,
+        )
+        length = np.linalg.norm(gradient, axis=1)
+        normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
+        feet = safe - distances[:, None] * normals
+        valid &= (length > _MIN_GRADIENT) & (sample(self.unknown, feet) < 0.1)
+        return ContourFeet(distances, normals, feet, valid)
+
+
+def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
+    """(h, w) distance of pixel centres to the border of the region [px], negative inside.
+
+    The border runs half way between an inside pixel's centre and its outside neighbour's.
+    """
+    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+
+
+def sample(field: FloatMap, uvs: FloatArray) -> FloatArray:
+    """(n,) bilinear values of a field (h, w) at pixels uvs (n, 2); the border is extended."""
+    values = np.empty(len(uvs))
+    for start in range(0, len(uvs), _REMAP_LIMIT):
+        part = uvs[start : start + _REMAP_LIMIT].astype(np.float32)
+        u, v = np.ascontiguousarray(part[:, :1]), np.ascontiguousarray(part[:, 1:])
+        values[start : start + _REMAP_LIMIT] = cv2.remap(
+            field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        ).reshape(-1)
+    return values

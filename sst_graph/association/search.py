@@ -1,0 +1,244 @@
+"""Global search for the extrinsic: no local step before a start that sees the whole problem.
+
+Every labelled point votes with the log-likelihood ratio of its class at the pixel it falls on,
+
+    score(T) = sum_i w_i log( P(class_i | blurred mask at uv_i) / P(class_i) ),
+
+0 off the image. Points are spread evenly over the sphere (a scan's own angular grid), so the score is a
+cross-correlation of two labelled panoramas. A grid of rotations is scored on strongly blurred, coarse
+masks; the best are refined in pose and time offset by the cross-entropy method on ever sharper ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.association.votes import CELLS, Level, SearchFrame, States, Votes
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """How the start is searched.
+
+    Attributes:
+        frames: most frames that take part.
+        points_per_class: most points of a class in one frame.
+        grid_step_deg: spacing of the rotation grid over all of SO(3) [deg].
+        box_deg: half width of the box of rotation vectors around a guess [deg].
+        box_step_deg: spacing within the box [deg].
+        translation_m: half width of the translations around a guess [m].
+        free_translation_m: half width of the translations without a guess [m].
+        delay_s: half width of the time offsets [s].
+        blurs_px: widths of the mask's blur, coarse to fine, at an image width of 1242 [px].
+        candidates: poses refined at the first, second, ... blur.
+        free_breadth: so many times more of them where nothing is known.
+        shares: share of the points that votes at the first, second, ... blur.
+        population, rounds: samples and rounds of the cross-entropy method at each blur.
+        seed: of the sampler.
+    """
+
+    frames: int = 6
+    points_per_class: int = 250
+    grid_step_deg: float = 7.5
+    box_deg: float = 30.0
+    box_step_deg: float = 5.0
+    translation_m: float = 0.6
+    free_translation_m: float = 2.0
+    delay_s: float = 0.5
+    blurs_px: tuple[float, ...] = (60.0, 25.0, 10.0, 4.0)
+    candidates: tuple[int, ...] = (24, 10, 4, 3)
+    free_breadth: int = 4
+    shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
+    population: int = 64
+    rounds: int = 4
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A pose and time offset with its score per cell of the images (0 chance, higher better)."""
+
+    cTl: gtsam.Pose3
+    offset_s: float
+    score: float
+
+
+def search_start(
+    frames: Sequence[SearchFrame],
+    camera: PinholeCamera,
+    classes: Sequence[SemanticClass],
+    guess: gtsam.Pose3 | None,
+    offset_s: float = 0.0,
+    config: SearchConfig | None = None,
+) -> list[Candidate]:
+    """Refined candidates, best first, no two of them alike (closer than 3 deg and 30 cm).
+
+    Args:
+        guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
+
+    Raises:
+        EstimationError: no frame has a point and a pixel of one of the classes.
+    """
+    config = config or SearchConfig()
+    rng = np.random.default_rng(config.seed)
+    votes = Votes.gather(frames, camera, classes, config.points_per_class, rng)
+    levels = [votes.level(*pair) for pair in zip(config.blurs_px, config.shares, strict=True)]
+    # 1. A grid of rotations on the most blurred masks.
+    rotations, translation = _grid(guess, config)
+    states = States(rotations, np.tile(translation, (len(rotations), 1)), np.full(len(rotations), offset_s))
+    breadth = config.free_breadth if guess is None else 1
+    apart = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
+    best = _peaks(states, levels[0].score(states), breadth * config.candidates[0], 1.5 * apart)
+    # 2. Refined at every blur; fewer candidates survive each.
+    spread_t = config.free_translation_m if guess is None else config.translation_m
+    spread_r = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
+    scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s])
+    if not votes.moving:
+        scale[6] = 0.0
+    limits = _Limits(translation, spread_t, offset_s, config.delay_s)
+    for level, blur, keep in zip(levels, config.blurs_px, config.candidates, strict=True):
+        best = best.take(slice(0, breadth * keep))
+        best = _cross_entropy(level, best, scale * (blur / config.blurs_px[0]) ** 0.7, limits, config, rng)
+    scores = levels[-1].score(best)
+    return _distinct(best, scores / (len(frames) * CELLS[0] * CELLS[1]))
+
+
+def _grid(guess: gtsam.Pose3 | None, config: SearchConfig) -> tuple[FloatArray, FloatArray]:
+    """Rotations (m, 3, 3) to begin with, and the translation they share."""
+    if guess is None:
+        return _so3_grid(np.radians(config.grid_step_deg)), np.zeros(3)
+    n = round(config.box_deg / config.box_step_deg)
+    axis = np.radians(config.box_step_deg) * np.arange(-n, n + 1)
+    vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    rotations = rotation_matrices(vectors) @ np.asarray(guess.rotation().matrix())
+    return rotations, np.asarray(guess.translation(), dtype=np.float64)
+
+
+def _so3_grid(step: float) -> FloatArray:
+    """Rotations that cover SO(3) evenly at about a spacing [rad]: super-Fibonacci (Alexa, CVPR 2022)."""
+    n = int(8.0 * np.pi**2 / step**3)
+    i = np.arange(n) + 0.5
+    phi, psi = np.sqrt(2.0), 1.533751168755204288118041
+    r, big_r = np.sqrt(i / n), np.sqrt(1.0 - i / n)
+    alpha, beta = 2.0 * np.pi * i / phi, 2.0 * np.pi * i / psi
+    x, y, z, w = r * np.sin(alpha), r * np.cos(alpha), big_r * np.sin(beta), big_r * np.cos(beta)
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1),
+        ],
+        axis=1,
+    )
+
+
+def rotation_matrices(vectors: FloatArray) -> FloatArray:
+    """(m, 3, 3) rotation matrices of rotation vectors (m, 3) [rad] (Rodrigues)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    a = np.sinc(angle / np.pi)
+    b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    K = np.zeros((len(vectors), 3, 3))
+    K[:, 2, 1], K[:, 0, 2], K[:, 1, 0] = vectors.T
+    K[:, 1, 2], K[:, 2, 0], K[:, 0, 1] = -vectors.T
+    return np.asarray(np.eye(3) + a[:, None, None] * K + b[:, None, None] * (K @ K))
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Box that translations [m] and time offsets [s] stay in."""
+
+    translation: FloatArray
+    half_width_m: float
+    offset_s: float
+    half_width_s: float
+
+    def clip(self, states: States) -> States:
+        return States(
+            states.rotations,
+            self.translation
+            + np.clip(states.translations - self.translation, -self.half_width_m, self.half_width_m),
+            self.offset_s + np.clip(states.offsets - self.offset_s, -self.half_width_s, self.half_width_s),
+        )
+
+
+def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> States:
+    """The best ``count`` states no two of which are closer in rotation than ``apart_rad``."""
+    chosen: list[int] = []
+    remaining = np.argsort(-scores, kind="stable")
+    flat = states.rotations.reshape(len(scores), 9)
+    largest_trace = 1.0 + 2.0 * np.cos(apart_rad)
+    while len(remaining) and len(chosen) < count:
+        best = remaining[0]
+        chosen.append(int(best))
+        remaining = remaining[flat[remaining] @ flat[best] < largest_trace]
+    return states.take(np.array(chosen, dtype=np.intp))
+
+
+def _cross_entropy(
+    level: Level,
+    states: States,
+    scale: FloatArray,
+    limits: _Limits,
+    config: SearchConfig,
+    rng: np.random.Generator,
+) -> States:
+    """Each state moved to a better one nearby, sorted by score."""
+    elite = max(4, config.population // 8)
+    m, n = len(states), config.population
+    sigmas = np.tile(scale, (m, 1))
+    incumbent, scores = states, level.score(states)
+    for _ in range(config.rounds):
+        delta = rng.standard_normal((m, n, 7)) * sigmas[:, None, :]
+        delta[:, 0] = 0.0
+        samples = limits.clip(_perturbed(incumbent, delta))
+        values = level.score(samples).reshape(m, n)
+        order = np.argsort(-values, axis=1, kind="stable")[:, :elite]
+        chosen = np.take_along_axis(delta, order[:, :, None], axis=1)
+        mean = limits.clip(_perturbed(incumbent, chosen.mean(axis=1, keepdims=True)))
+        mean_scores = level.score(mean)
+        top = samples.take(np.arange(m) * n + order[:, 0])
+        top_scores = np.take_along_axis(values, order[:, :1], axis=1)[:, 0]
+        use_mean = mean_scores >= top_scores
+        incumbent = States(
+            np.where(use_mean[:, None, None], mean.rotations, top.rotations),
+            np.where(use_mean[:, None], mean.translations, top.translations),
+            np.where(use_mean, mean.offsets, top.offsets),
+        )
+        scores = np.where(use_mean, mean_scores, top_scores)
+        sigmas = np.maximum(chosen.std(axis=1), 0.25 * sigmas)
+    return incumbent.take(np.argsort(-scores, kind="stable"))
+
+
+def _perturbed(states: States, delta: FloatArray) -> States:
+    """(m * n) states: camera-side rotation vector, translation and offset steps delta (m, n, 7)."""
+    m, n, _ = delta.shape
+    turn = rotation_matrices(delta[..., :3].reshape(-1, 3)).reshape(m, n, 3, 3)
+    rotations = turn @ states.rotations[:, None]
+    translations = states.translations[:, None] + delta[..., 3:6]
+    offsets = states.offsets[:, None] + delta[..., 6]
+    return States(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3), offsets.reshape(-1))
+
+
+def _distinct(states: States, scores: FloatArray) -> list[Candidate]:
+    found: list[Candidate] = []
+    for i in np.argsort(-scores, kind="stable"):
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(states.rotations[i]), states.translations[i])
+        difference = [other.cTl.between(pose) for other in found]
+        near = [
+            np.linalg.norm(gtsam.Rot3.Logmap(d.rotation())) < np.radians(3.0)
+            and np.linalg.norm(d.translation()) < 0.3
+            for d in difference
+        ]
+        if not any(near):
+            found.append(Candidate(pose, float(states.offsets[i]), float(scores[i])))
+    return found

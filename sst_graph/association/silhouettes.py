@@ -1,0 +1,126 @@
+"""Matches between a scan's boundary points and an image's mask contours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.alignment import Alignment
+from factors.camera import PinholeCamera
+from factors.motion import move_points
+from factors.robust import RobustKernel
+from sst_graph.association.boundary import Boundaries, Edge
+from sst_graph.association.contour import ContourMap
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """How boundary points are matched to contours.
+
+    Attributes:
+        mask_sigma_px: deviation of a mask's contour from the object's [px].
+        gate: farthest match, in units of the kernel's scale.
+        min_cosine: least agreement between the contour's normal and the way out of the object.
+        top_edges: use boundaries towards the ring above.
+    """
+
+    mask_sigma_px: float = 1.0
+    gate: float = 3.0
+    min_cosine: float = 0.5
+    top_edges: bool = True
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Camera motion around one image: twist at its instant and the twist's rate of change, (6,) each."""
+
+    c_twist: FloatArray
+    c_acceleration: FloatArray
+
+
+@dataclass(frozen=True)
+class SilhouetteMatches:
+    """Matches of one class in one pair.
+
+    Attributes:
+        alignment: the frozen matches.
+        objects: (n,) object of each match, within its scan.
+        sides: (n,) 0 left, 1 right, 2 top: which side of the object the match lies on.
+        index: (n,) which boundary point each match is.
+    """
+
+    alignment: Alignment
+    objects: NDArray[np.intp]
+    sides: NDArray[np.intp]
+    index: NDArray[np.intp]
+
+    def __len__(self) -> int:
+        return len(self.alignment)
+
+
+def match_silhouettes(
+    boundaries: Mapping[SemanticClass, Boundaries],
+    contours: Mapping[SemanticClass, ContourMap],
+    camera: PinholeCamera,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    base_tau_s: float,
+    motion: Motion,
+    biases_px: Mapping[SemanticClass, float],
+    kernel: RobustKernel,
+    config: MatchConfig,
+) -> dict[SemanticClass, SilhouetteMatches]:
+    """Each boundary point's nearest contour at the current estimate, where the two face the same way.
+
+    The kernel's scale is in pixels here; matches farther than ``gate`` times it are left out.
+    """
+    found = {}
+    for c, points in boundaries.items():
+        if c not in contours:
+            continue
+        base_taus = base_tau_s - points.offsets_s
+        uvs = _project(points.lPs, camera, cTl, offset_s + base_taus, motion)
+        outs = _project(points.outward, camera, cTl, offset_s + base_taus, motion)
+        feet = contours[c].look_up(uvs)
+        way = outs - uvs
+        length = np.linalg.norm(way, axis=1)
+        way = way / np.maximum(length, 1e-9)[:, None]
+        cosine = (way * feet.normals).sum(axis=1)
+        residuals = feet.distances + biases_px.get(c, 0.0)
+        ok = feet.valid & (cosine > config.min_cosine) & (np.abs(residuals) < config.gate * kernel.scale)
+        if not config.top_edges:
+            ok &= points.edges != Edge.TOP
+        index = np.flatnonzero(ok)
+        if len(index) == 0:
+            continue
+        beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
+        alignment = Alignment(
+            camera=camera,
+            lPs=points.lPs[index],
+            base_taus_s=base_taus[index],
+            pixels=feet.feet[index],
+            sigmas_px=np.hypot(config.mask_sigma_px, beam_sigma),
+            normals=feet.normals[index],
+            kernel=kernel,
+            c_acceleration=motion.c_acceleration,
+        )
+        sides = np.where(points.edges[index] == Edge.TOP, 2, (way[index, 0] > 0).astype(np.intp))
+        found[c] = SilhouetteMatches(alignment, points.objects[index], sides, index)
+    return found
+
+
+def _project(
+    lPs: FloatArray, camera: PinholeCamera, cTl: gtsam.Pose3, taus_s: FloatArray, motion: Motion
+) -> FloatArray:
+    """(n, 2) pixels of points moved to their image's instant; NaN behind the camera."""
+    common = bool((taus_s == taus_s[0]).all()) if len(taus_s) else True
+    taus = float(taus_s[0]) if common and len(taus_s) else taus_s
+    moved = move_points(cTl, np.ascontiguousarray(lPs.T), taus, motion.c_twist, motion.c_acceleration)
+    return camera.project(moved.cPs.T)

@@ -1,0 +1,37 @@
+"""Settings of a calibration, stage by stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sst_graph.estimators.joint import JointConfig
+from sst_graph.estimators.start import StartConfig
+from sst_graph.problem.drive import PrepareConfig
+from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.observability import ObservabilityConfig
+
+Method = Literal["joint", "paper", "static"]
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """What to do and how; one part a stage, written beside every result.
+
+    Attributes:
+        method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage).
+        classes: semantic classes to align.
+        delay_per_drive: each drive has a time offset of its own, instead of one for all.
+        prepare: what is taken from every frame.
+        start: the search for a start.
+        joint: the outer and inner loop.
+        observability: when a direction counts as unobservable.
+    """
+
+    method: Method = "joint"
+    classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
+    delay_per_drive: bool = False
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    start: StartConfig = field(default_factory=StartConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

@@ -1,0 +1,29 @@
+"""What a caller may hand to ``calibrate``: a source, several, or a slice of one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sst_graph.errors import DataError
+from sst_graph.types import Source
+
+
+def as_sources(frames: Source | Sequence[Source]) -> list[Source]:
+    """Sources in a list.
+
+    Raises:
+        DataError: neither a source nor a sequence of sources with at least one frame each.
+    """
+    sources: list[Any] = [frames] if _is_source(frames) else list(frames)
+    if not sources or not all(_is_source(source) for source in sources):
+        found = type(frames).__name__ if not sources else f"a sequence of {type(sources[0]).__name__}"
+        raise DataError("frames to calibrate", found, "a source (open_source), a slice of one, or several")
+    for source in sources:
+        if len(source) == 0:
+            raise DataError(source.name, "no frame", "one or more")
+    return sources
+
+
+def _is_source(value: Any) -> bool:
+    return all(hasattr(value, name) for name in ("camera", "nominal", "name", "__len__", "__getitem__"))

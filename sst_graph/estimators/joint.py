@@ -1,0 +1,134 @@
+"""The default method: a global start, then silhouettes over the whole drive in one factor graph."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from factors.robust import RobustKernel
+from sst_graph.errors import EstimationError
+from sst_graph.problem.drive import Drive, Progress
+from sst_graph.problem.graph import (
+    GraphConfig,
+    PairMatches,
+    Tracks,
+    associate,
+    joint_graph,
+    state_from,
+)
+from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.uncertainty.covariance import Unknowns, marginal_covariance
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class JointConfig:
+    """Outer and inner loop of the joint method.
+
+    Attributes:
+        graph: matches, priors.
+        kernel_px: scales of the robust kernel, outer iteration by outer iteration; the last one stays [px].
+        max_outer: most outer iterations.
+        step_sigmas: an outer step, at the last kernel scale, shorter than this many standard deviations of
+            the frozen problem ends the outer loop.
+        inner_iterations: most Levenberg-Marquardt iterations on frozen matches.
+        min_matches: fewest matches in all for an answer.
+    """
+
+    graph: GraphConfig = field(default_factory=GraphConfig)
+    kernel_px: tuple[float, ...] = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
+    max_outer: int = 40
+    step_sigmas: float = 0.2
+    inner_iterations: int = 4
+    min_matches: int = 30
+
+
+@dataclass(frozen=True)
+class JointSolution:
+    """Where the outer loop ended.
+
+    Attributes:
+        state: the estimate.
+        pairs: its matches.
+        graph, values: the last frozen graph and its optimum.
+        outer_iterations: outer iterations done.
+        converged: the last step was short beside the frozen problem's own uncertainty.
+    """
+
+    state: State
+    pairs: list[PairMatches]
+    graph: gtsam.NonlinearFactorGraph
+    values: gtsam.Values
+    outer_iterations: int
+    converged: bool
+
+
+def solve_joint(
+    drives: Sequence[Drive], start: State, config: JointConfig, progress: Progress | None = None
+) -> JointSolution:
+    """Re-pair, re-match, optimise, until nothing moves.
+
+    Raises:
+        EstimationError: too few matches at any step.
+    """
+    tracks = Tracks(drives)
+    state, converged, outer = start, False, 0
+    for outer in range(config.max_outer):
+        # 1. Matches at the current estimate, under a kernel that narrows.
+        scale = config.kernel_px[min(outer, len(config.kernel_px) - 1)]
+        kernel = RobustKernel("geman_mcclure", scale)
+        pairs = associate(drives, tracks, state, kernel, config.graph)
+        _check_matches(pairs, config)
+        # 2. Inner optimisation with the matches frozen.
+        graph, values = joint_graph(pairs, state, config.graph)
+        values = _optimise(graph, values, config.inner_iterations)
+        # 3. Move; stop when the step is small at the last scale.
+        moved = state_from(values, state, pairs)
+        last, state = state, moved
+        if progress is not None:
+            progress("joint", outer + 1, config.max_outer)
+        if (
+            outer + 1 >= len(config.kernel_px)
+            and _step_sigmas(last, pairs, graph, values) < config.step_sigmas
+        ):
+            converged = True
+            break
+    _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, len(pairs))
+    return JointSolution(state, pairs, graph, values, outer + 1, converged)
+
+
+def _check_matches(pairs: Sequence[PairMatches], config: JointConfig) -> None:
+    matches = sum(len(pair) for pair in pairs)
+    if matches < config.min_matches:
+        raise EstimationError(
+            f"{matches} silhouette matches in {len(pairs)} pairs of scan and image, "
+            f"expected {config.min_matches} or more"
+        )
+
+
+def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setlambdaInitial(1e-6)
+    params.setRelativeErrorTol(1e-7)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _step_sigmas(
+    last: State, pairs: Sequence[PairMatches], graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
+) -> float:
+    """Length of the step from ``last`` to the optimum, in standard deviations of the frozen problem."""
+    unknowns = Unknowns.of(last, pairs)
+    covariance = marginal_covariance(graph, values, unknowns)
+    size = 6 + len(last.offsets_s)
+    rotation_translation = gtsam.Pose3.Logmap(last.cTl.between(values.atPose3(EXTRINSIC)))
+    offsets = [
+        values.atVector(delay_key(clock))[0] - offset_s for clock, offset_s in enumerate(last.offsets_s)
+    ]
+    step = np.concatenate([rotation_translation, offsets])
+    return float(np.sqrt(step @ np.linalg.solve(covariance[:size, :size], step)))

@@ -1,0 +1,106 @@
+"""From a guess, or none, to a start that the joint solution can be trusted to converge from."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from sst_graph.association.pairing import pair_by_time
+from sst_graph.association.search import Candidate, SearchConfig, search_start
+from sst_graph.association.votes import SearchFrame
+from sst_graph.errors import EstimationError
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import Tracks
+from sst_graph.types import SemanticClass
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StartConfig:
+    """Whether and how the start is searched.
+
+    Attributes:
+        search: the global search.
+        enabled: False takes the guess as it is.
+        rival_ratio: a second, different candidate with at least this fraction of the best score is a rival.
+        min_class_points: fewest points of the searched classes that make a frame worth looking at.
+    """
+
+    search: SearchConfig = field(default_factory=SearchConfig)
+    enabled: bool = True
+    rival_ratio: float = 0.9
+    min_class_points: int = 30
+
+
+def find_start(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    guess: gtsam.Pose3 | None,
+    offset_s: float,
+    config: StartConfig,
+) -> list[Candidate]:
+    """Candidates from the drive that shows most, best first.
+
+    Raises:
+        EstimationError: no frame shows a searched class to both sensors, or no guess and no search.
+    """
+    if not config.enabled:
+        if guess is None:
+            raise EstimationError("no guess to start from, and the search is switched off")
+        return [Candidate(guess, offset_s, 0.0)]
+    frames = [
+        _search_frames(number, drive, tracks, classes, offset_s, config)
+        for number, drive in enumerate(drives)
+    ]
+    richest = max(range(len(drives)), key=lambda number: len(frames[number]))
+    if not frames[richest]:
+        raise EstimationError(
+            "no frame in which LiDAR and camera both show " + " or ".join(c.name.lower() for c in classes)
+        )
+    candidates = search_start(
+        frames[richest], drives[richest].camera, classes, guess, offset_s, config.search
+    )
+    _LOG.info("start: %d frames, scores %s", len(frames[richest]), [round(c.score, 4) for c in candidates])
+    return candidates
+
+
+def _search_frames(
+    number: int,
+    drive: Drive,
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    offset_s: float,
+    config: StartConfig,
+) -> list[SearchFrame]:
+    """Frames spread over the drive that show the classes to both sensors."""
+    usable = []
+    for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, drive.image_period_s):
+        scan, image = drive.scans[pair.scan], drive.images[pair.image]
+        points = int(np.isin(scan.classes, classes).sum())
+        if points >= config.min_class_points and image.contours:
+            usable.append(pair)
+    chosen = np.unique(np.linspace(0, len(usable) - 1, config.search.frames).round().astype(int))
+    frames = []
+    for pair in (usable[i] for i in chosen if usable):
+        scan, image = drive.scans[pair.scan], drive.images[pair.image]
+        sample = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
+        twist = np.zeros(6) if sample is None else sample.twist
+        frames.append(SearchFrame(scan.lPs, scan.classes, image.mask, pair.base_tau_s, twist))
+    return frames
+
+
+def rivals(candidates: Sequence[Candidate], config: StartConfig) -> list[Candidate]:
+    """Candidates far from the best one whose score comes close to its."""
+    best, *others = candidates
+    return [
+        other
+        for other in others
+        if other.score > config.rival_ratio * best.score
+        and np.linalg.norm(gtsam.Rot3.Logmap(best.cTl.between(other.cTl).rotation())) > np.radians(5.0)
+    ]

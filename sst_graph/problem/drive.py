@@ -1,0 +1,187 @@
+"""What the estimators keep of a drive: boundary points, contours, a few points, motion; in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.association.boundary import Boundaries, BoundaryConfig, find_boundaries
+from sst_graph.association.contour import ContourMap
+from sst_graph.errors import DataError
+from sst_graph.odometry.features import FeatureTracker
+from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
+from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.problem.trajectory import TwistTrack
+from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """What is taken from every frame.
+
+    Attributes:
+        boundary: boundary points.
+        lidar_odometry: motion between scans.
+        visual_odometry: motion between images.
+        use_visual_odometry: track image features at all.
+        sample_points: most labelled points of a scan kept for search and checks, of each class.
+    """
+
+    boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
+    lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
+    visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
+    use_visual_odometry: bool = True
+    sample_points: int = 3000
+
+
+@dataclass(frozen=True)
+class ScanFeatures:
+    """What is kept of a scan.
+
+    Attributes:
+        index: of its frame in the drive.
+        stamp_ns: LiDAR-clock stamp.
+        boundaries: boundary points of each class.
+        lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
+        depth_lPs, depth_offsets_s: points for depth of image features (all classes) [m], [s].
+    """
+
+    index: int
+    stamp_ns: int
+    boundaries: dict[SemanticClass, Boundaries]
+    lPs: FloatArray
+    classes: NDArray[np.uint8]
+    offsets_s: FloatArray
+    depth_lPs: NDArray[np.float32]
+    depth_offsets_s: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What is kept of an image: its mask and the signed distance to each class's contour."""
+
+    index: int
+    stamp_ns: int
+    mask: NDArray[np.uint8]
+    contours: dict[SemanticClass, ContourMap]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive, reduced to what calibration needs.
+
+    Attributes:
+        name: of the source.
+        camera: of all images.
+        scans, images: in the order of their stamps.
+        lidar_motions: between consecutive scans; empty for a single scan.
+        image_pairs: tracks between consecutive images; empty for a single image.
+    """
+
+    name: str
+    camera: PinholeCamera
+    scans: tuple[ScanFeatures, ...]
+    images: tuple[ImageFeatures, ...]
+    lidar_motions: tuple[RelativeMotion, ...]
+    image_pairs: tuple[ImagePair, ...]
+
+    @property
+    def scan_stamps_ns(self) -> list[int]:
+        return [scan.stamp_ns for scan in self.scans]
+
+    @property
+    def image_stamps_ns(self) -> list[int]:
+        return [image.stamp_ns for image in self.images]
+
+    @property
+    def image_period_s(self) -> float:
+        """Median interval between images [s]; 0.1 for a single one."""
+        stamps = self.image_stamps_ns
+        return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def lidar_track(self) -> TwistTrack | None:
+        """Twists of the LiDAR over time, or None for a single scan."""
+        return TwistTrack(self.lidar_motions) if self.lidar_motions else None
+
+
+def prepare_drive(
+    source: Source,
+    classes: Sequence[SemanticClass],
+    config: PrepareConfig | None = None,
+    progress: Progress | None = None,
+) -> Drive:
+    """Read every frame of a source once and keep what calibration needs.
+
+    Raises:
+        DataError: the source has no scan or no image, or its stamps do not rise.
+    """
+    config = config or PrepareConfig()
+    odometry = LidarOdometry(config.lidar_odometry)
+    tracker = FeatureTracker(config.visual_odometry.features)
+    scans, images, motions, pairs = [], [], [], []
+    total = len(source)
+    for position, frame in enumerate(source):
+        if frame.scan is not None:
+            motion = odometry.add(frame.scan)
+            if motion is not None:
+                motions.append(motion)
+            scans.append(scan_features(frame.index, frame.scan, classes, config))
+        if frame.image is not None:
+            if config.use_visual_odometry:
+                tracks = tracker.add(frame.image)
+                if tracks is not None:
+                    direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
+                    pairs.append(ImagePair(tracks, direction))
+            images.append(image_features(frame.index, frame.image, classes))
+        if progress is not None:
+            progress(f"reading {source.name}", position + 1, total)
+    if not scans or not images:
+        missing = "scan" if not scans else "image"
+        raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
+    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs))
+
+
+def scan_features(
+    index: int, scan: Scan, classes: Sequence[SemanticClass], config: PrepareConfig
+) -> ScanFeatures:
+    """Boundaries of a scan and a sample of its points."""
+    offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
+    chosen = _sample(scan, config.sample_points)
+    depth = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)[:: max(1, len(scan.points) // 30_000)]
+    return ScanFeatures(
+        index,
+        scan.stamp_ns,
+        find_boundaries(scan, classes, config.boundary),
+        scan.points[chosen].astype(np.float64),
+        scan.classes[chosen],
+        offsets[chosen].astype(np.float64),
+        scan.points[depth],
+        offsets[depth],
+    )
+
+
+def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
+    """Evenly spread indices of at most ``most`` points of every known class, 2 to 60 m away."""
+    distance = np.linalg.norm(scan.points, axis=1)
+    usable = (distance > 2.0) & (distance < 60.0) & (scan.classes != SemanticClass.IGNORE)
+    parts = [np.zeros(0, dtype=np.intp)]
+    for c in np.unique(scan.classes[usable]):
+        members = np.flatnonzero(usable & (scan.classes == c))
+        parts.append(members[:: max(1, -(-len(members) // most))])
+    return np.concatenate(parts)
+
+
+def image_features(index: int, image: CameraImage, classes: Sequence[SemanticClass]) -> ImageFeatures:
+    """Mask and contours of an image."""
+    fields = {c: ContourMap.of(image.mask, c) for c in classes}
+    contours = {c: field for c, field in fields.items() if field is not None}
+    return ImageFeatures(index, image.stamp_ns, image.mask, contours)

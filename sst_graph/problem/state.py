@@ -1,0 +1,57 @@
+"""The estimate that travels through the outer loop, and its keys in the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+
+from sst_graph.types import SemanticClass
+
+EXTRINSIC = gtsam.symbol("E", 0)
+"""Key of the extrinsic cTl (Pose3)."""
+
+_IMAGES_PER_DRIVE = 10_000_000
+
+
+def delay_key(clock: int = 0) -> int:
+    """Key of the time offset of a clock (``Vector(1)``); drives share clock 0 unless each has its own."""
+    return int(gtsam.symbol("D", clock))
+
+
+def twist_key(drive: int, image: int) -> int:
+    """Key of the camera's twist at an image (``Vector(6)``)."""
+    return int(gtsam.symbol("V", drive * _IMAGES_PER_DRIVE + image))
+
+
+def bias_key(drive: int, semantic_class: SemanticClass) -> int:
+    """Key of the mask bias of a class in a drive (``Vector(1)``, px)."""
+    return int(gtsam.symbol("B", drive * 256 + int(semantic_class)))
+
+
+@dataclass(frozen=True)
+class State:
+    """The current estimate.
+
+    Attributes:
+        cTl: extrinsic.
+        offsets_s: time offset of each clock [s].
+        biases_px: mask bias by (drive, class) [px]; 0 where it is missing.
+    """
+
+    cTl: gtsam.Pose3
+    offsets_s: tuple[float, ...] = (0.0,)
+    biases_px: Mapping[tuple[int, SemanticClass], float] = field(default_factory=dict)
+
+    def clock(self, drive: int) -> int:
+        """Number of the clock that a drive's time offset belongs to."""
+        return drive if len(self.offsets_s) > 1 else 0
+
+    def offset_s(self, drive: int) -> float:
+        """Time offset of a drive [s]."""
+        return self.offsets_s[self.clock(drive)]
+
+    def biases_of(self, drive: int) -> dict[SemanticClass, float]:
+        """Mask biases of a drive by class [px]."""
+        return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}

@@ -1,0 +1,69 @@
+"""Twist of a sensor at any time, from its motions between stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.types import RelativeMotion
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TwistSample:
+    """Twist of a sensor at an instant, in its own frame.
+
+    Attributes:
+        twist: (6,) [rad/s, m/s].
+        acceleration: (6,) rate of change [rad/s^2, m/s^2].
+        covariance: (6, 6) of the twist.
+    """
+
+    twist: FloatArray
+    acceleration: FloatArray
+    covariance: FloatArray
+
+
+class TwistTrack:
+    """Twists over time: linear between the middles of the measured intervals, constant beyond the ends.
+
+    The mean twist over an interval equals the twist at its middle up to the third derivative of the
+    motion, so two intervals give twist and acceleration at the stamp between them.
+    """
+
+    def __init__(self, motions: Sequence[RelativeMotion]) -> None:
+        """motions: consecutive, at least one, stamps rising [ns]."""
+        self._epoch = motions[0].from_ns
+        middles = [0.5 * (m.from_ns - self._epoch + m.to_ns - self._epoch) * 1e-9 for m in motions]
+        self._middles = np.array(middles)
+        self._lengths = np.array([m.seconds for m in motions])
+        self._twists = np.stack([m.mean_twist for m in motions])
+        self._covariances = np.stack([m.covariance / m.seconds**2 for m in motions])
+
+    def at(self, stamp_ns: int) -> TwistSample:
+        """Twist and acceleration at a stamp of the sensor's clock."""
+        t = (stamp_ns - self._epoch) * 1e-9
+        n = len(self._middles)
+        if n == 1:
+            return TwistSample(self._twists[0], np.zeros(6), self._covariances[0])
+        i = int(np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2))
+        span = self._middles[i + 1] - self._middles[i]
+        slope = (self._twists[i + 1] - self._twists[i]) / span
+        fraction = float(np.clip((t - self._middles[i]) / span, -0.5, 1.5))
+        a, b = 1.0 - fraction, fraction
+        covariance = a * a * self._covariances[i] + b * b * self._covariances[i + 1]
+        if not 0.0 <= fraction <= 1.0:
+            overshoot = span * (max(-fraction, fraction - 1.0))
+            covariance = covariance + np.diag((slope * overshoot) ** 2)
+        return TwistSample(self._twists[i] + fraction * span * slope, slope, covariance)
+
+
+def camera_twist(sample: TwistSample, cTl: gtsam.Pose3) -> TwistSample:
+    """The camera's twist from the LiDAR's: c_twist = Ad(cTl) l_twist (rigidly joined sensors)."""
+    Ad = np.asarray(cTl.AdjointMap())
+    return TwistSample(Ad @ sample.twist, Ad @ sample.acceleration, Ad @ sample.covariance @ Ad.T)

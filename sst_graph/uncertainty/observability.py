@@ -1,0 +1,114 @@
+"""Which combinations of the seven unknowns the data do not tell, in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.result import DIRECTION_SCALES, WeakDirection
+
+FloatArray = NDArray[np.float64]
+
+_NAMES = (
+    "rotation about x",
+    "rotation about y",
+    "rotation about z",
+    "x",
+    "y",
+    "z",
+    "time offset",
+)
+
+
+@dataclass(frozen=True)
+class ObservabilityConfig:
+    """Largest standard deviations of an answer that may be called ok.
+
+    Attributes:
+        rotation_deg: of any rotation [deg].
+        translation_m: of any translation [m].
+        offset_s: of the time offset [s].
+    """
+
+    rotation_deg: float = 0.5
+    translation_m: float = 0.05
+    offset_s: float = 0.005
+
+
+def weak_directions(
+    covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
+) -> tuple[WeakDirection, ...]:
+    """Directions whose standard deviation is past the limits, the weakest first.
+
+    The eigenvectors of the (7, 7) covariance, each unknown measured in its own limit: an eigenvalue above
+    1 is a combination known worse than the limits allow.
+    """
+    limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
+    scaled = covariance / np.outer(limits, limits)
+    values, vectors = np.linalg.eigh(scaled)
+    found = []
+    for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
+        if value <= 1.0:
+            break
+        found.append(_describe(limits * vector * np.sqrt(value), cTl))
+    return tuple(found)
+
+
+def _describe(step: FloatArray, cTl: gtsam.Pose3) -> WeakDirection:
+    """A weak direction from its one-sigma step (7,) [rad, m, s]."""
+    scaled = step / DIRECTION_SCALES
+    sigma = float(np.linalg.norm(scaled))
+    vector = scaled / sigma
+    if vector[np.abs(vector).argmax()] < 0:
+        step, vector = -step, -vector
+    c_step = np.asarray(cTl.rotation().matrix()) @ step[3:6]
+    sentence, advice = _words(step[:3], c_step, float(step[6]), vector)
+    return WeakDirection(vector, sigma, sentence, advice)
+
+
+def _words(
+    rotation: FloatArray, c_translation: FloatArray, offset_s: float, vector: FloatArray
+) -> tuple[str, str]:
+    """What one sigma along a weak direction means, and what to record."""
+    parts = {
+        "rotation": float(np.linalg.norm(vector[:3])),
+        "translation": float(np.linalg.norm(vector[3:6])),
+        "offset": abs(float(vector[6])),
+    }
+    translation_m = float(np.linalg.norm(c_translation))
+    words = _axis_words(c_translation)
+    if parts["offset"] > 0.1 and parts["translation"] > 0.1:
+        rate_ms = abs(offset_s) * 1e3 / translation_m if translation_m else 0.0
+        sign = "later" if offset_s > 0 else "earlier"
+        return (
+            f"the LiDAR {words} cannot be told from the image taken {sign}: "
+            f"1 m equals {rate_ms:.0f} ms of time offset (one sigma: {100 * translation_m:.1f} cm, "
+            f"{abs(offset_s) * 1e3:.1f} ms)",
+            "record a stop, a change of speed or a turn",
+        )
+    if parts["offset"] >= max(parts["rotation"], parts["translation"]):
+        return (
+            f"the time offset is known to {abs(offset_s) * 1e3:.1f} ms only (one sigma)",
+            "record motion: several frames at some speed, with a change of speed or a turn",
+        )
+    if parts["rotation"] > parts["translation"]:
+        angle = np.degrees(float(np.linalg.norm(rotation)))
+        return (
+            f"the rotation is known to {angle:.2f} deg only (one sigma) about the LiDAR axis "
+            + np.array2string(rotation / max(float(np.linalg.norm(rotation)), 1e-12), precision=2),
+            "record objects on all sides of the image, near and far",
+        )
+    return (
+        f"the translation is known to {100 * translation_m:.1f} cm only (one sigma), the LiDAR {words}",
+        "record objects nearer to the sensors, at several distances",
+    )
+
+
+def _axis_words(c_translation: FloatArray) -> str:
+    """Which way a shift in the camera frame goes, in a word."""
+    names = (("right", "left"), ("down", "up"), ("forward", "backward"))
+    axis = int(np.abs(c_translation).argmax())
+    return "shifted " + names[axis][0 if c_translation[axis] > 0 else 1]
