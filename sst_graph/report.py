@@ -53,8 +53,8 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
         rows += [("", line) for line in error_lines(comparison.errors)]
     rows += [("reason", reason) for reason in result.reasons]
     for weak in result.weak_directions:
-        rows.append(("weak", weak.sentence))
-        rows.append(("", weak.advice))
+        if not any(weak.sentence in reason for reason in result.reasons):
+            rows += [("weak", weak.sentence), ("", weak.advice)]
     return "\n".join(f"{name:<15} {text}".rstrip() for name, text in rows)
 
 
@@ -79,7 +79,7 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
     """A short Markdown page; ``pictures`` are file names beside it."""
     blocks = [
         "# Calibration",
-        f"Status: **{result.status}**. {' '.join(result.reasons)}".strip(),
+        f"Status: **{result.status}**{': ' * bool(result.reasons)}{'; '.join(result.reasons)}",
         _table(
             ("", "value", "sigma"),
             [

@@ -58,7 +58,7 @@ def verdict(result: CalibrationResult) -> int:
     """Exit code of a result; one line on stderr says why it is not to be trusted."""
     if result.status == "ok":
         return 0
-    reasons = " ".join(result.reasons) or "the result carries no reason"
+    reasons = "; ".join(result.reasons) or "the result carries no reason"
     print(f"sst-graph: {result.status}: {' '.join(reasons.split())}", file=sys.stderr)
     return 3
 

@@ -92,3 +92,13 @@ def test_every_command_has_its_module() -> None:
     folder = Path(__file__).resolve().parents[2] / "sst_graph" / "cli"
     assert [name for name in COMMANDS if not (folder / f"{name}.py").is_file()] == []
     assert build_parser().parse_args(["demo"]).command == "demo"
+
+
+def test_the_package_offers_its_names_on_demand() -> None:
+    code = (
+        "import sys, sst_graph\n"
+        "heavy = [m for m in ('cv2', 'scipy', 'small_gicp') if m in sys.modules]\n"
+        "print(heavy, all(callable(getattr(sst_graph, name)) for name in sst_graph.__all__))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[] True\n"
