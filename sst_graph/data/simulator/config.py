@@ -34,7 +34,8 @@ class SimulationConfig:
         azimuth_limit_deg: points beyond this azimuth, either side of forward, are cut off [deg].
         azimuth_step_deg: nominal angle between two firings of one laser [deg].
         range_noise_m: standard deviation of the range [m].
-        drop_out: share of returns lost on ordinary surfaces (dark paint and glass lose more).
+        drop_out: share of returns lost on ordinary surfaces (dark paint, glass and far things lose
+            more); 0 switches all losses off.
         beam_divergence_mrad: full width of the laser beam [mrad]; 0 makes ideal rays. A return comes
             from one of two sub-beams half a radius to the left or right of the reported direction,
             so that borders are blurred but not moved; vertical width is not modelled.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -18,7 +18,7 @@ from sst_graph.data.simulator.render import Look, View, shade
 from sst_graph.data.simulator.segmentation import noisy_mask, noisy_points
 from sst_graph.data.simulator.street import Street, build_street, is_instance
 from sst_graph.data.simulator.surfaces import SEMANTIC_CLASS, Kind
-from sst_graph.data.simulator.textures import detail_atlas, material_atlas, sky_panorama
+from sst_graph.data.simulator.textures import Atlas, detail_atlas, material_atlas, sky_panorama
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
 
 VIEW_RANGE_M = 140.0
@@ -83,19 +83,21 @@ class SimulatedDrive:
     truth: GroundTruth
     street: Street
     stamps_ns: NDArray[np.int64]
-    lidar: Lidar
 
     @property
     def name(self) -> str:
         """Name of the drive: motion and seed."""
         return f"simulated-{self.config.motion}-{self.config.seed}"
 
-    @cached_property
+    @property
+    def lidar(self) -> Lidar:
+        """The sensor."""
+        return make_lidar(self.config)
+
+    @property
     def look(self) -> Look:
         """What the street is painted with; drawn when the first picture is asked for."""
-        paint = np.random.default_rng([self.config.seed, 11])
-        atlas, detail, sky = material_atlas(paint), detail_atlas(paint), sky_panorama(paint)
-        return Look(atlas, detail, sky, self.street.sun, float(paint.uniform(0.35, 0.65)))
+        return Look(*_textures(self.config.seed), self.street.sun, self.street.sunlight)
 
     def __len__(self) -> int:
         return self.config.frames
@@ -174,6 +176,13 @@ class SimulatedDrive:
         return pixels, *noisy_mask(kinds, numbers, config.label_noise, (config.seed, index))
 
 
+@lru_cache(maxsize=2)
+def _textures(seed: int) -> tuple[Atlas, Atlas, NDArray[np.uint8]]:
+    """Materials, fine grain and sky of a seed (some 60 MB, 0.3 s: kept for the last two seeds)."""
+    rng = np.random.default_rng([seed, 11])
+    return material_atlas(rng), detail_atlas(rng), sky_panorama(rng)
+
+
 def simulate(config: SimulationConfig) -> SimulatedDrive:
     """The drive of a configuration: the street is built now, frames are made when asked for."""
     rng = np.random.default_rng([config.seed, 10])
@@ -190,4 +199,4 @@ def simulate(config: SimulationConfig) -> SimulatedDrive:
     jitter[0] = 0.0
     stamps = np.rint((np.arange(config.frames) * config.period_s + jitter) * 1e6).astype(np.int64) * 1000
     street = build_street(config)
-    return SimulatedDrive(config, camera, NOMINAL_CTL, truth, street, stamps, make_lidar(config))
+    return SimulatedDrive(config, camera, NOMINAL_CTL, truth, street, stamps)

@@ -149,5 +149,5 @@ def _developed(colour: NDArray[Any], rng: np.random.Generator) -> NDArray[np.uin
     """Lens blur, exposure and sensor noise, then 8 bits."""
     blurred: NDArray[Any] = cv2.GaussianBlur(colour, (0, 0), 0.55)
     blurred *= float(rng.normal(1.0, 0.01))
-    blurred += 2.0 * rng.standard_normal(blurred.shape, dtype=np.float32)
+    blurred += 1.7 * rng.standard_normal(blurred.shape, dtype=np.float32)
     return np.asarray(cv2.convertScaleAbs(np.maximum(blurred, 0.0)), np.uint8)

@@ -86,6 +86,7 @@ class Street:
         instances: (n,) uint16 instance of each static face.
         movers: what moves.
         sun: (3,) unit vector to the sun.
+        sunlight: share of the light that comes from the sun.
     """
 
     path: Path
@@ -97,6 +98,7 @@ class Street:
     instances: NDArray[np.uint16]
     movers: tuple[Mover, ...]
     sun: FloatArray
+    sunlight: float
 
     def snapshot(self, t: float, range_m: float) -> Snapshot:
         """The faces within about ``range_m`` of the vehicle at time t [s]."""
@@ -181,10 +183,12 @@ def build_street(config: SimulationConfig) -> Street:
     )
     ego_rng = np.random.default_rng([config.seed, 7])
     ego = ego_motion(config, path, s, -profile.lane / 2, LIDAR_HEIGHT_M, ego_rng)
-    return _assembled(builder, path, ego, movers, sun)
+    return _assembled(builder, path, ego, movers, sun, float(root.uniform(0.35, 0.65)))
 
 
-def _assembled(builder: _Builder, path: Path, ego: EgoMotion, movers: list[Mover], sun: FloatArray) -> Street:
+def _assembled(
+    builder: _Builder, path: Path, ego: EgoMotion, movers: list[Mover], sun: FloatArray, sunlight: float
+) -> Street:
     """The street from its objects."""
     sizes = np.array([len(mesh) for mesh in builder.meshes])
     corners = [mesh.triangles[:, :, :2].reshape(-1, 2) for mesh in builder.meshes]
@@ -192,7 +196,9 @@ def _assembled(builder: _Builder, path: Path, ego: EgoMotion, movers: list[Mover
     radii = np.array([np.linalg.norm(c - m, axis=1).max() for c, m in zip(corners, centres, strict=True)])
     owners = np.repeat(np.arange(len(sizes)), sizes)
     instances = np.array(builder.instances, dtype=np.uint16)[owners]
-    return Street(path, ego, merged(builder.meshes), owners, centres, radii, instances, tuple(movers), sun)
+    return Street(
+        path, ego, merged(builder.meshes), owners, centres, radii, instances, tuple(movers), sun, sunlight
+    )
 
 
 def _profile(rng: np.random.Generator) -> tuple[scenery.Profile, tuple[bool, bool]]:

@@ -61,13 +61,20 @@ def make_atlas(tiles: list[Image]) -> Atlas:
 
 def smooth_noise(rng: np.random.Generator, sigma: float, size: int = TILE) -> FloatArray:
     """(size, size) periodic noise of zero mean and unit deviation, correlated over ``sigma`` pixels."""
-    white = rng.standard_normal((size, size)).astype(np.float32)
+    coarse = 1
+    while sigma / coarse >= 4.0:
+        coarse *= 2
+    small = size // coarse
+    white = rng.standard_normal((small, small), dtype=np.float32)
     if sigma <= 0.3:
         return white.astype(np.float64)
-    pad = min(size, int(4 * sigma) + 1)
+    pad = min(small, int(4 * sigma / coarse) + 2)
     padded = cv2.copyMakeBorder(white, pad, pad, pad, pad, cv2.BORDER_WRAP)
-    blurred = cv2.GaussianBlur(padded, (0, 0), sigma)[pad:-pad, pad:-pad].astype(np.float64)
-    return np.asarray((blurred - blurred.mean()) / blurred.std())
+    blurred = cv2.GaussianBlur(padded, (0, 0), sigma / coarse)
+    if coarse > 1:
+        blurred = cv2.resize(blurred, (blurred.shape[1] * coarse, blurred.shape[0] * coarse))
+    inner = blurred[pad * coarse : pad * coarse + size, pad * coarse : pad * coarse + size].astype(np.float64)
+    return np.asarray((inner - inner.mean()) / inner.std())
 
 
 def _tile(luminance: FloatArray, tint: FloatArray | None = None) -> Image:
