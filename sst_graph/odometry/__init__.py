@@ -1,1 +1,28 @@
 """Motion of each sensor by itself: LiDAR odometry, visual odometry, standing frames."""
+
+from __future__ import annotations
+
+from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig, lidar_odometry
+from sst_graph.odometry.standing import StandingConfig, standing_frames
+from sst_graph.odometry.visual import (
+    ImagePair,
+    VisualOdometry,
+    VisualOdometryConfig,
+    image_pairs,
+    metric_motions,
+    visual_odometry,
+)
+
+__all__ = [
+    "ImagePair",
+    "LidarOdometry",
+    "LidarOdometryConfig",
+    "StandingConfig",
+    "VisualOdometry",
+    "VisualOdometryConfig",
+    "image_pairs",
+    "lidar_odometry",
+    "metric_motions",
+    "standing_frames",
+    "visual_odometry",
+]

@@ -40,6 +40,10 @@ class LidarOdometryConfig:
         plane_ratio: most points of the main surface (ground), per point of another direction.
         max_distance_m: farthest pair of a point and a voxel [m].
         max_iterations: Gauss-Newton steps of one registration.
+        search_m, search_step_m: where the speed is unknown (first pair, or after a failure), shifts of the
+            start up to this far in the LiDAR's horizontal plane, and this far apart, are tried [m].
+        search_iterations: Gauss-Newton steps of each trial.
+        missed_cost: what a point without a voxel to pair with costs in the choice among trials.
         min_inlier_ratio: a registration with fewer points paired than this fraction has failed.
         compensations: most registrations of one scan while its sweep compensation settles.
         movers: how standing objects are told from moving ones.
@@ -62,6 +66,10 @@ class LidarOdometryConfig:
     plane_ratio: float = 0.5
     max_distance_m: float = 1.0
     max_iterations: int = 30
+    search_m: float = 3.0
+    search_step_m: float = 0.6
+    search_iterations: int = 6
+    missed_cost: float = 1.0
     min_inlier_ratio: float = 0.3
     compensations: int = 3
     movers: MoverConfig = field(default_factory=MoverConfig)
@@ -84,6 +92,7 @@ class LidarOdometry:
         self._twist: FloatArray | None = None
         self._covariance = np.zeros((6, 6))
         self._voxel_m = self.config.voxel_m
+        self._lost = True
 
     @property
     def pose(self) -> gtsam.Pose3:
@@ -106,11 +115,14 @@ class LidarOdometry:
             raise DataError("LiDAR odometry", f"a scan {seconds:.6f} s after the one before", "rising stamps")
         # 1. Constant velocity predicts; registration to the map corrects.
         registration = self._register(scan, seconds)
-        if registration is not None and self._twist is None and last.offsets_s is not None:
+        if self._twist is None and last.offsets_s is not None:
             # 2. Only now is the first scan's own sweep known: build the map anew and register again.
-            self._twist = registration.twist
-            self._restart_map(last)
-            registration = self._register(scan, seconds) or registration
+            for _ in range(self.config.compensations):
+                if registration is None:
+                    break
+                self._twist, self._lost = registration.twist, False
+                self._restart_map(last)
+                registration = self._register(scan, seconds)
         # 3. The map grows, or starts again where the registration failed.
         return self._advance(last, scan, registration)
 
@@ -118,6 +130,8 @@ class LidarOdometry:
         """Pose of the scan in the map, its sweep compensated by its own motion; None where it fails."""
         config = self.config
         wTl = self._wTl @ _exp(self._twist, seconds)
+        if self._lost:
+            wTl = self._searched(self._points(scan, self._twist).still, wTl)
         twist: FloatArray | None = self._twist
         for _ in range(config.compensations):
             points = self._points(scan, twist)
@@ -132,22 +146,48 @@ class LidarOdometry:
             wTl, twist = found.wTl, found.twist
         return found
 
+    def _searched(self, points: FloatArray, wTl: FloatArray) -> FloatArray:
+        """The pose from which registration goes best, among shifts of the predicted one all around it.
+
+        With nothing known of the speed, registration alone ends in the nearest of many local minima.
+        """
+        config = self.config
+        if self._map is None or len(points) < config.min_points:
+            return wTl
+        cloud = registration_cloud(points, 2.0 * self._voxel_m, config.neighbours, config.plane_ratio)
+        best, least = wTl, np.inf
+        for shift in _shifts(config.search_m, config.search_step_m):
+            start = wTl.copy()
+            start[:3, 3] += wTl[:3, :3] @ shift
+            result = self._registered(cloud, start, config.search_iterations)
+            missed = cloud.size() - result.num_inliers
+            misfit = (2.0 * result.error + config.missed_cost * missed) / cloud.size()
+            if np.isfinite(result.T_target_source).all() and misfit < least:
+                best, least = _orthonormal(np.asarray(result.T_target_source)), misfit
+        return best
+
+    def _registered(
+        self, cloud: small_gicp.PointCloud, wTl: FloatArray, iterations: int
+    ) -> small_gicp.RegistrationResult:
+        """A cloud registered to the map from a start."""
+        return small_gicp.align(
+            self._map,
+            cloud,
+            wTl,
+            max_correspondence_distance=self.config.max_distance_m,
+            num_threads=1,
+            max_iterations=iterations,
+            rotation_epsilon=1e-4,
+            translation_epsilon=5e-4,
+        )
+
     def _align(self, points: FloatArray, wTl: FloatArray, seconds: float) -> _Registration | None:
         """Points (n, 3) registered to the map from a start; None where that fails."""
         config = self.config
         if self._map is None or len(points) < config.min_points:
             return None
         cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
-        result = small_gicp.align(
-            self._map,
-            cloud,
-            wTl,
-            max_correspondence_distance=config.max_distance_m,
-            num_threads=1,
-            max_iterations=config.max_iterations,
-            rotation_epsilon=1e-4,
-            translation_epsilon=5e-4,
-        )
+        result = self._registered(cloud, wTl, config.max_iterations)
         found = np.asarray(result.T_target_source)
         if not np.isfinite(found).all() or result.num_inliers < config.min_inlier_ratio * cloud.size():
             return None
@@ -174,6 +214,7 @@ class LidarOdometry:
             covariance = registration.covariance + bHa @ self._covariance @ bHa.T + np.diag(floor)
             self._covariance = registration.covariance
         ok = registration is not None
+        self._lost = not ok
         return RelativeMotion(last.stamp_ns, scan.stamp_ns, gtsam.Pose3(step), covariance, ok)
 
     def _remember(self, scan: Scan, registered: int) -> None:
@@ -249,6 +290,15 @@ def _registration_covariance(
     variance = 2.0 * result.error / max(result.num_inliers - 6, 1)
     hessian = np.asarray(result.H) + 1e-6 * np.eye(6)
     return np.asarray(config.inflation**2 * variance * np.linalg.inv(hessian))
+
+
+def _shifts(far: float, step: float) -> list[FloatArray]:
+    """Horizontal translations (3,) on rings ``step`` apart up to ``far``, eight to a ring, none first [m]."""
+    shifts = [np.zeros(3)]
+    for radius in np.arange(step, far + 1e-9, step):
+        for angle in np.arange(8) * (np.pi / 4.0):
+            shifts.append(radius * np.array([np.cos(angle), np.sin(angle), 0.0]))
+    return shifts
 
 
 def _exp(twist: FloatArray | None, seconds: float) -> FloatArray:

@@ -102,7 +102,7 @@ def motion_from_depths(
         terms, noise = problem.linearize(pose, noise)
         step = np.linalg.solve(terms.information + 1e-9 * np.eye(6), -terms.gradient)
         pose = pose.retract(step)
-        if np.abs(step).max() < 1e-6:
+        if np.abs(step).max() < 1e-5:
             break
     terms, _ = problem.linearize(pose, noise)
     if terms.depth_inliers < config.min_depths:
