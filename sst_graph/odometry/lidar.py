@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""
-SETTLED_M = 2e-3
+SETTLED_M = 5e-3
 """Sweep compensation has settled where another pass would move no point farther than this [m]."""
 
 

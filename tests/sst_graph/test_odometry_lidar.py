@@ -215,7 +215,8 @@ def test_a_moving_truck_does_not_pull_the_motion() -> None:
         scans.append(scan_at(pose, k * PERIOD_NS, k, (trucks, SemanticClass.VEHICLE), share=0.4))
     for k, motion in enumerate(lidar_odometry(scans)):
         error = poses[k].between(poses[k + 1]).between(motion.aTb).translation()
-        assert np.linalg.norm(error) < 0.02
+        # measured: 4 mm; 19 mm where the trucks are not known to be movable
+        assert np.linalg.norm(error) < 0.008
 
 
 # --- failures ---------------------------------------------------------------------------------------------
