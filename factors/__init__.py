@@ -56,6 +56,7 @@ from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
 from .regularizer import beta_regularizer
 from .robust import KernelKind, RobustKernel
 from .silhouette import silhouette_factor
+from .slam import pose_alignment_factor
 from .twist_transfer import twist_transfer_factor
 from .velocity import (
     mean_velocity_factor,
@@ -92,6 +93,7 @@ __all__ = [
     "move_points",
     "pixel_to_point_factor",
     "point_to_pixel_factor",
+    "pose_alignment_factor",
     "residuals",
     "rotation_hand_eye",
     "silhouette_factor",

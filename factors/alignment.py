@@ -103,7 +103,7 @@ def frame_factor(
     Raises:
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
-    frame = _frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
+    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
     def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
@@ -145,8 +145,8 @@ class _Part:
 
 
 @dataclass(frozen=True)
-class _FrameResidual:
-    """The frozen data behind a frame's factor."""
+class FrameResidual:
+    """The frozen data behind a frame's factor; ``values`` are those of ``keys``, in their order."""
 
     parts: tuple[_Part, ...]
     cTl: _Source
@@ -174,14 +174,18 @@ class _FrameResidual:
             total += cost(part.alignment, evaluate(part.alignment, *state, part.bias_px(values), False))
         return total
 
-    def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+    def gram(self, values: Sequence[Any]) -> tuple[FloatArray, float]:
+        """Gram matrix (cols + 1, cols + 1) of the weighted [J r] of all matches, and their constant."""
         G = np.zeros((self.cols + 1, self.cols + 1))
         constant = 0.0
         for part in self.parts:
             evaluated, part_constant = self._weighted(part, values)
             G[np.ix_(part.targets, part.targets)] += evaluated.gram()[np.ix_(part.columns, part.columns)]
             constant += part_constant
-        return condense(G, constant)
+        return G, constant
+
+    def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        return condense(*self.gram(values))
 
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         blocks, constant = [], 0.0
@@ -207,9 +211,9 @@ class _FrameResidual:
         return np.concatenate([*blocks, [np.sqrt(constant)]])
 
 
-def _frame_residual(
+def frame_residual(
     alignments: Sequence[Alignment], cTl: Any, offset_s: Any, c_twist: Any, biases_px: Any
-) -> _FrameResidual:
+) -> FrameResidual:
     if not alignments:
         raise FactorError("alignments of a frame", "none", "one or more")
     variables = _Variables()
@@ -236,7 +240,7 @@ def _frame_residual(
                 targets += list(range(start, start + len(_COLUMNS[name])))
         residual = 13 if bias is None else 14
         parts.append(_Part(alignment, bias, [*columns, residual], [*targets, cols]))
-    return _FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
+    return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
 
 
 def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | None]:

@@ -1,0 +1,259 @@
+"""Alignment in somebody else's graph: on the poses of a trajectory instead of a twist.
+
+    cP_i = Exp(-tau_i c_twist) . cTl . lTs . lP_i,      residuals as in :mod:`factors.reprojection`
+    c_twist = Ad(cTl) Ad(lTb) Log(wTb_a^-1 wTb_b) / seconds
+    lTs = lTb . wTb_a^-1 . wTb_s . bTl
+
+X_a and X_b are two poses of the trajectory around the image's instant, ``seconds`` apart, between which
+the body moves with one twist; tau is the interval from X_a to the image, so that the camera stands at
+the pose interpolated between X_a and X_b. The scan was taken at X_s, X_a itself by default (lTs = 1): a
+scan of long ago then ties X_s to X_a and X_b, which is what makes a trajectory better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from .alignment import FrameResidual, frame_residual
+from .condensed import condense, cost_rows
+from .custom import custom_factor
+from .errors import FactorError, checked_positive
+from .matches import Alignment
+from .motion import se3_left_jacobian, twist_ad
+
+FloatArray = NDArray[np.float64]
+
+
+def pose_alignment_factor(
+    alignments: Sequence[Alignment],
+    X_a: int,
+    X_b: int,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float,
+    seconds: float,
+    *,
+    X_scan: int | None = None,
+    bTl: gtsam.Pose3 | None = None,
+    biases_px: Sequence[int | float | None] | int | float | None = None,
+    image_after_middle_s: float | None = None,
+    condensed: bool = True,
+) -> gtsam.CustomFactor:
+    """All alignments of one image as one factor on the user's own keys; the equation is the module's.
+
+    Goes into any ``NonlinearFactorGraph``, LM, iSAM2 or fixed-lag smoother. Its matches are frozen: make
+    it anew when the estimate has moved by more than about a pixel.
+
+    Args:
+        alignments: one or more, over the same image. With ``X_scan`` their points count as taken at the
+            instant of X_a: ``base_taus_s`` is t_image_stamp - t_a.
+        X_a, X_b: keys of wTb before and after (Pose3), distinct.
+        cTl: key of the extrinsic, or a fixed pose.
+        offset_s: key of the time offset, or a fixed offset [s].
+        seconds: from X_a to X_b, in the LiDAR's clock [s].
+        X_scan: key of wTb at the scan's stamp, where that is another pose than X_a.
+        bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
+        biases_px: as in :func:`factors.frame_factor`.
+        image_after_middle_s: t_image_stamp minus the middle between X_a and X_b [s]. Given, the twist at
+            the image's instant is the mean one plus (offset + image_after_middle_s) times the
+            alignments' common ``c_acceleration``; None: the mean twist holds throughout.
+        condensed: False gives one or two rows a match and one more.
+
+    Returns:
+        A factor with unit noise on the distinct keys: X_a, X_b, X_scan, cTl, offset_s, biases.
+
+    Raises:
+        FactorError: keys or intervals that make no factor; see also :func:`factors.frame_factor`.
+    """
+    frame = _on_poses(
+        alignments, X_a, X_b, cTl, offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s
+    )
+    rows = sum(frame.dims) + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
+
+    def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        if not jacobians:
+            return frame.error(values, condensed, rows), None
+        error, J = frame.condensed(values) if condensed else frame.stacked(values)
+        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
+
+    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
+
+
+@dataclass(frozen=True)
+class _PoseFrame:
+    """The chain from poses to the frame's own quantities.
+
+    Attributes:
+        inner: residuals over extrinsic (in effect, with the scan's motion), offset, twist and biases. The
+            twist goes under the key X_a there; the extrinsic is always a variable.
+        keys, dims: of the factor.
+        X_a, X_b, X_s: keys of the poses.
+        cTl, offset_s: key or constant.
+        lTb: pose of the body in the LiDAR.
+        seconds: from X_a to X_b [s].
+        c_acceleration: (6,) [rad/s^2, m/s^2], zero where the mean twist is used as it is.
+        image_after_middle_s: see :func:`pose_alignment_factor`.
+    """
+
+    inner: FrameResidual
+    keys: tuple[int, ...]
+    dims: tuple[int, ...]
+    X_a: int
+    X_b: int
+    X_s: int
+    cTl: int | gtsam.Pose3
+    offset_s: int | float
+    lTb: gtsam.Pose3
+    seconds: float
+    c_acceleration: FloatArray
+    image_after_middle_s: float
+
+    def error(self, values: Sequence[Any], condensed: bool, rows: int) -> FloatArray:
+        """(rows,) error, without the work for its Jacobian."""
+        inner = self.inner_values(values)
+        return cost_rows(self.inner.cost(inner), rows) if condensed else self.inner.stacked_error(inner)
+
+    def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        G, constant = self.inner.gram(self.inner_values(values))
+        cols = sum(self.dims)
+        lift = np.zeros((len(G), cols + 1))
+        lift[:-1, :-1], lift[-1, -1] = self.lift(values), 1.0
+        return condense(lift.T @ G @ lift, constant)
+
+    def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        error, J = self.inner.stacked(self.inner_values(values))
+        return error, J @ self.lift(values)
+
+    def _named(self, values: Sequence[Any]) -> dict[int, Any]:
+        return dict(zip(self.keys, values, strict=True))
+
+    def _extrinsic(self, named: dict[int, Any]) -> gtsam.Pose3:
+        return self.cTl if isinstance(self.cTl, gtsam.Pose3) else cast(gtsam.Pose3, named[self.cTl])
+
+    def _late_s(self, named: dict[int, Any]) -> float:
+        """True time of the image after the middle between X_a and X_b [s]."""
+        offset_s = named[self.offset_s][0] if isinstance(self.offset_s, int) else self.offset_s
+        return float(offset_s) + self.image_after_middle_s
+
+    def _step(self, named: dict[int, Any]) -> FloatArray:
+        """Log(wTb_a^-1 wTb_b)."""
+        return np.asarray(gtsam.Pose3.Logmap(named[self.X_a].between(named[self.X_b])))
+
+    def _lTs(self, named: dict[int, Any]) -> gtsam.Pose3:
+        aTs = cast(gtsam.Pose3, named[self.X_a].between(named[self.X_s]))
+        return self.lTb * aTs * self.lTb.inverse()
+
+    def inner_values(self, values: Sequence[Any]) -> list[Any]:
+        """Values of the inner residual's keys."""
+        named = self._named(values)
+        cTl = self._extrinsic(named)
+        l_twist = np.asarray(self.lTb.AdjointMap()) @ self._step(named) / self.seconds
+        c_twist = np.asarray(cTl.AdjointMap()) @ l_twist
+        special = {
+            _EXTRINSIC: cTl if self.X_s == self.X_a else cTl * self._lTs(named),
+            self.X_a: c_twist + self._late_s(named) * self.c_acceleration,
+        }
+        return [special[key] if key in special else named[key] for key in self.inner.keys]
+
+    def lift(self, values: Sequence[Any]) -> FloatArray:
+        """(inner cols, cols) derivative of the inner variables by those of the factor."""
+        named = self._named(values)
+        outer, inner = _places(self.keys, self.dims), _places(self.inner.keys, self.inner.dims)
+        L = np.zeros((self.inner.cols, sum(self.dims)))
+        for key, place in inner.items():
+            if key not in (_EXTRINSIC, self.X_a):
+                L[place, outer[key]] += np.eye(place.stop - place.start)
+        cTl = self._extrinsic(named)
+        self._lift_twist(L[inner[self.X_a]], outer, named, np.asarray(cTl.AdjointMap()))
+        self._lift_extrinsic(L[inner[_EXTRINSIC]], outer, named)
+        return L
+
+    def _lift_twist(
+        self, rows: FloatArray, outer: dict[int, slice], named: dict[int, Any], Ad_cTl: FloatArray
+    ) -> None:
+        step = self._step(named)
+        Ad_lTb = np.asarray(self.lTb.AdjointMap())
+        scaled = Ad_cTl @ Ad_lTb / self.seconds
+        # Log(Exp(-d_a) Exp(step) Exp(d_b)): J_l(step)^-1 on the left, J_r^-1 = J_l(-step)^-1 on the right
+        rows[:, outer[self.X_a]] -= scaled @ np.linalg.inv(se3_left_jacobian(step))
+        rows[:, outer[self.X_b]] += scaled @ np.linalg.inv(se3_left_jacobian(-step))
+        if isinstance(self.cTl, int):
+            rows[:, outer[self.cTl]] -= Ad_cTl @ twist_ad(Ad_lTb @ step / self.seconds)
+        if isinstance(self.offset_s, int):
+            rows[:, outer[self.offset_s]] += self.c_acceleration[:, None]
+
+    def _lift_extrinsic(self, rows: FloatArray, outer: dict[int, slice], named: dict[int, Any]) -> None:
+        """By cTl, and where the scan has a pose of its own by X_s and X_a."""
+        if self.X_s == self.X_a:
+            if isinstance(self.cTl, int):
+                rows[:, outer[self.cTl]] += np.eye(6)
+            return
+        sTl = self._lTs(named).inverse()
+        if isinstance(self.cTl, int):
+            rows[:, outer[self.cTl]] += np.asarray(sTl.AdjointMap())
+        rows[:, outer[self.X_s]] += np.asarray(self.lTb.AdjointMap())
+        rows[:, outer[self.X_a]] -= np.asarray((sTl * self.lTb).AdjointMap())
+
+
+_EXTRINSIC = -1
+"""Stands for the extrinsic in effect among the inner residual's keys; no key of gtsam is negative."""
+
+
+def _places(keys: Sequence[int], dims: Sequence[int]) -> dict[int, slice]:
+    ends = np.cumsum(dims).tolist()
+    return {key: slice(end - dim, end) for key, dim, end in zip(keys, dims, ends, strict=True)}
+
+
+def _on_poses(
+    alignments: Sequence[Alignment],
+    X_a: int,
+    X_b: int,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float,
+    seconds: float,
+    X_scan: int | None,
+    bTl: gtsam.Pose3 | None,
+    biases_px: Any,
+    image_after_middle_s: float | None,
+) -> _PoseFrame:
+    X_a, X_b = int(X_a), int(X_b)
+    X_s = X_a if X_scan is None else int(X_scan)
+    if X_a == X_b:
+        raise FactorError("poses of an alignment", "one key for both ends", "two distinct keys")
+    E = cTl if isinstance(cTl, gtsam.Pose3) else int(cTl)
+    D = int(offset_s) if isinstance(offset_s, int | np.integer) else float(offset_s)
+    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px)
+    biases = [key for key in inner.keys if key not in (_EXTRINSIC, D, X_a)]
+    poses = [X_a, X_b] if X_s in (X_a, X_b) else [X_a, X_b, X_s]
+    variables = {key: 6 for key in poses}
+    for key, dim in [(E, 6), (D, 1), *((bias, 1) for bias in biases)]:
+        if isinstance(key, int):
+            if key in variables:
+                raise FactorError("keys of an alignment", "one key for two variables", "distinct keys")
+            variables[key] = dim
+    return _PoseFrame(
+        inner,
+        tuple(variables),
+        tuple(variables.values()),
+        X_a,
+        X_b,
+        X_s,
+        E,
+        D,
+        gtsam.Pose3() if bTl is None else bTl.inverse(),
+        checked_positive("seconds between the poses", seconds),
+        np.zeros(6) if image_after_middle_s is None else _common_acceleration(alignments),
+        image_after_middle_s or 0.0,
+    )
+
+
+def _common_acceleration(alignments: Sequence[Alignment]) -> FloatArray:
+    first = alignments[0].c_acceleration
+    if any((alignment.c_acceleration != first).any() for alignment in alignments):
+        raise FactorError("c_acceleration of the alignments", "several", "one for all: they share the image")
+    return first
