@@ -83,8 +83,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     _add_source_options(calibrate)
     calibrate.add_argument(
         "--method",
-        choices=("joint", "paper", "static"),
-        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: extrinsic alone",
+        choices=("joint", "paper", "static", "semalign"),
+        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: its first stage, the "
+        "extrinsic alone; semalign: sampled starts, the extrinsic alone",
     )
     calibrate.add_argument(
         "--init",

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import to_dict
+from sst_graph.association.search import Candidate
 from sst_graph.errors import ConfigError, EstimationError
-from sst_graph.estimators.config import CalibrationConfig
+from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
+from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
+from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, solve_joint
 from sst_graph.estimators.start import find_start, rivals
@@ -22,14 +22,11 @@ from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
-from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
 from sst_graph.uncertainty.covariance import robust_covariance
-from sst_graph.uncertainty.observability import weak_directions
 
 FloatArray = NDArray[np.float64]
-
-PACKAGES = ("sst-graph", "gtsam", "numpy", "opencv-python-headless", "scipy", "small_gicp")
 
 
 def calibrate(
@@ -62,13 +59,31 @@ def calibrate(
     _check(sources, config)
     began = time.perf_counter()
     drives = [prepare_drive(source, config.classes, config.prepare, progress) for source in sources]
-    prepared = time.perf_counter()
+    seconds = time.perf_counter() - began
+    result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
+    timing = {"prepare": seconds, **result.diagnostics["seconds"]}
+    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+
+
+def calibrate_prepared(
+    drives: Sequence[Drive],
+    initial: gtsam.Pose3 | None = None,
+    config: CalibrationConfig | None = None,
+    *,
+    initial_offset_s: float = 0.0,
+    progress: Progress | None = None,
+) -> CalibrationResult:
+    """:func:`calibrate` of drives that were prepared before, with the same classes and settings."""
+    config = config or CalibrationConfig()
+    guess = Guess(initial, initial_offset_s)
+    began = time.perf_counter()
     try:
-        result = _joint(drives, initial, initial_offset_s, config, progress)
+        answer = _METHODS[config.method](drives, guess, config, progress)
+        result = result_of(answer, drives, guess, config)
     except EstimationError as error:
-        result = _unanswered(drives, initial, initial_offset_s, config, str(error))
-    timing = {"prepare": prepared - began, "estimate": time.perf_counter() - prepared}
-    return _with_diagnostics(result, {"seconds": timing})
+        result = no_answer(drives, guess, config, str(error))
+    timing = {"estimate": time.perf_counter() - began}
+    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -77,18 +92,17 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
     names = [source.name for source in sources]
     if len(set(names)) < len(names) and config.delay_per_drive:
         raise ConfigError(f"delay_per_drive needs drives of different names, found {names}")
+    if config.delay_per_drive and config.method != "joint":
+        raise ConfigError(f"delay_per_drive needs method joint, found {config.method}")
 
 
-def _joint(
-    drives: Sequence[Drive],
-    initial: gtsam.Pose3 | None,
-    initial_offset_s: float,
-    config: CalibrationConfig,
-    progress: Progress | None,
-) -> CalibrationResult:
+def answer_joint(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> Answer:
+    """The default: a global start, then silhouettes over the whole drive."""
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
-    candidates = find_start(drives, tracks, config.classes, initial, initial_offset_s, config.start)
+    candidates = find_start(drives, tracks, config.classes, guess.cTl, guess.offset_s, config.start)
     # 2. Silhouettes over all frames, outer and inner loop.
     clocks = len(drives) if config.delay_per_drive else 1
     start = State(candidates[0].cTl, (candidates[0].offset_s,) * clocks)
@@ -97,33 +111,13 @@ def _joint(
     covariance, model, _ = robust_covariance(
         solution.graph, solution.values, solution.pairs, solution.state, [object_tracks(d) for d in drives]
     )
-    covariance7 = covariance[:7, :7]
-    weak = weak_directions(covariance7, solution.state.cTl, config.observability)
-    reasons = [f"{w.sentence}: {w.advice}" for w in weak]
-    status: Status = "unobservable" if weak else "ok"
-    if not solution.converged:
-        status = "not_converged"
-        reasons.insert(0, f"the outer loop still moved after {solution.outer_iterations} iterations")
-    for rival in rivals(candidates, config.start):
-        status = "not_converged"
-        reasons.append(
-            f"another pose explains the labels almost as well (score {rival.score:.3f} against "
-            f"{candidates[0].score:.3f}): record more varied scenes or give a closer guess"
-        )
-    return CalibrationResult(
-        T_camera_lidar=solution.state.cTl,
-        time_offset_s=solution.state.offsets_s[0],
-        covariance=covariance7,
-        status=status,
-        camera=drives[0].camera,
-        reasons=tuple(reasons),
-        weak_directions=weak,
-        frames_used=_frames_used(drives, solution),
+    return Answer(
+        solution.state.cTl,
+        solution.state.offsets_s[0],
+        covariance[:7, :7],
+        _frames_used(drives, solution),
+        doubts=_doubts(solution, candidates, config),
         drive_offsets=_drive_offsets(drives, solution, covariance),
-        method="joint",
-        config=to_dict(config),
-        initial=initial,
-        initial_offset_s=initial_offset_s,
         diagnostics={
             "outer_iterations": solution.outer_iterations,
             "matches": sum(len(pair) for pair in solution.pairs),
@@ -135,8 +129,22 @@ def _joint(
             },
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
         },
-        versions=_versions(),
     )
+
+
+def _doubts(
+    solution: JointSolution, candidates: Sequence[Candidate], config: CalibrationConfig
+) -> tuple[str, ...]:
+    """Why the joint estimate may be wrong altogether."""
+    doubts = []
+    if not solution.converged:
+        doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+    for rival in rivals(candidates, config.start):
+        doubts.append(
+            f"another pose explains the labels almost as well (score {rival.score:.3f} against "
+            f"{candidates[0].score:.3f}): record more varied scenes or give a closer guess"
+        )
+    return tuple(doubts)
 
 
 def _frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:
@@ -158,33 +166,10 @@ def _drive_offsets(
     )
 
 
-def _unanswered(
-    drives: Sequence[Drive],
-    initial: gtsam.Pose3 | None,
-    initial_offset_s: float,
-    config: CalibrationConfig,
-    reason: str,
-) -> CalibrationResult:
-    """What is known when no estimate could be made: the guess, with sigmas that say so."""
-    sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
-    return CalibrationResult(
-        T_camera_lidar=initial or gtsam.Pose3(),
-        time_offset_s=initial_offset_s,
-        covariance=np.diag(sigmas**2),
-        status="unobservable",
-        camera=drives[0].camera,
-        reasons=(reason,),
-        method=config.method,
-        config=to_dict(config),
-        initial=initial,
-        initial_offset_s=initial_offset_s,
-        versions=_versions(),
-    )
-
-
-def _with_diagnostics(result: CalibrationResult, more: dict[str, Any]) -> CalibrationResult:
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, **more})
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+_Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], Answer]
+_METHODS: dict[Method, _Method] = {
+    "joint": answer_joint,
+    "paper": answer_paper,
+    "static": answer_static,
+    "semalign": answer_semalign,
+}

@@ -6,12 +6,14 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from sst_graph.estimators.joint import JointConfig
+from sst_graph.estimators.paper import PaperConfig
+from sst_graph.estimators.semalign import SemAlignConfig
 from sst_graph.estimators.start import StartConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.observability import ObservabilityConfig
 
-Method = Literal["joint", "paper", "static"]
+Method = Literal["joint", "paper", "static", "semalign"]
 
 
 @dataclass(frozen=True)
@@ -19,12 +21,15 @@ class CalibrationConfig:
     """What to do and how; one part a stage, written beside every result.
 
     Attributes:
-        method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage).
+        method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage),
+            ``semalign`` (sampled starts, points to pixels).
         classes: semantic classes to align.
         delay_per_drive: each drive has a time offset of its own, instead of one for all.
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
+        paper: both stages of the paper.
+        semalign: sampled starts.
         observability: when a direction counts as unobservable.
     """
 
@@ -34,4 +39,6 @@ class CalibrationConfig:
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

@@ -1,0 +1,165 @@
+"""Nearest pixel of a class for each point, nearest point for each pixel: the matches of SST-Calib.
+
+Both ways are exact: pixels by an index map of the mask, points by a KD-tree of their projections.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import cKDTree
+
+from factors import Alignment, MotionModel, PinholeCamera, move_points
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class NearestPixels:
+    """For every pixel of an image the nearest pixel of a class.
+
+    Attributes:
+        index: (h, w) int32, row * w + column of the nearest pixel of the class, by centres.
+    """
+
+    index: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> NearestPixels | None:
+        """The map of a class in a mask (h, w), or None where the mask shows none of it."""
+        outside = mask != semantic_class
+        if outside.all():
+            return None
+        rows, columns = distance_transform_edt(outside, return_distances=False, return_indices=True)
+        return cls(np.asarray(rows * np.int32(mask.shape[1]) + columns, dtype=np.int32))
+
+    def at(self, uvs: FloatArray) -> FloatArray:
+        """(n, 2) centre of the class's pixel nearest to the pixel that each of uvs (n, 2) lies in [px].
+
+        uvs must lie on the image (see :meth:`factors.PinholeCamera.in_image`).
+        """
+        h, w = self.index.shape
+        columns = np.clip((uvs[:, 0] + 0.5).astype(np.intp), 0, w - 1)
+        rows = np.clip((uvs[:, 1] + 0.5).astype(np.intp), 0, h - 1)
+        nearest_rows, nearest_columns = np.divmod(self.index[rows, columns], np.int32(w))
+        return np.stack([nearest_columns, nearest_rows], axis=1).astype(np.float64)
+
+
+def nearest_points(uvs: FloatArray, pixels: FloatArray) -> NDArray[np.intp]:
+    """(m,) number of the projected point among uvs (n, 2), n >= 1, nearest to each of pixels (m, 2) [px]."""
+    tree = cKDTree(uvs, balanced_tree=False, compact_nodes=False)
+    return np.asarray(tree.query(pixels)[1], dtype=np.intp)
+
+
+def sample_pixels(
+    mask: NDArray[np.uint8], semantic_class: SemanticClass, share: float, rng: np.random.Generator
+) -> FloatArray:
+    """(m, 2) a random share of a class's pixels in a mask (h, w), at least one if it has any [px]."""
+    rows, columns = np.nonzero(mask == semantic_class)
+    count = min(len(rows), max(1, round(share * len(rows))))
+    chosen = rng.choice(len(rows), count, replace=False) if len(rows) else np.zeros(0, dtype=np.intp)
+    return np.stack([columns[chosen], rows[chosen]], axis=1).astype(np.float64)
+
+
+@dataclass(frozen=True)
+class ClassView:
+    """One class in one scan and its image, ready to be matched again and again.
+
+    Attributes:
+        camera: of the image.
+        lPs: (n, 3) points of the class [m].
+        base_tau_s: image stamp minus scan stamp [s].
+        nearest: nearest pixels of the class in the mask.
+        pixels: (m, 2) a sample of the class's pixels [px].
+    """
+
+    camera: PinholeCamera
+    lPs: FloatArray
+    base_tau_s: float
+    nearest: NearestPixels
+    pixels: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        camera: PinholeCamera,
+        lPs: FloatArray,
+        base_tau_s: float,
+        mask: NDArray[np.uint8],
+        semantic_class: SemanticClass,
+        share: float,
+        rng: np.random.Generator,
+    ) -> ClassView | None:
+        """A view, or None where the scan or the mask shows none of the class."""
+        nearest = NearestPixels.of(mask, semantic_class)
+        if nearest is None or len(lPs) == 0:
+            return None
+        return cls(camera, lPs, base_tau_s, nearest, sample_pixels(mask, semantic_class, share, rng))
+
+
+@dataclass(frozen=True)
+class NearestMatches:
+    """Frozen matches of a class, both ways.
+
+    Attributes:
+        point_to_pixel: each projected point on the image with its nearest pixel.
+        pixel_to_point: each sampled pixel with its nearest projected point, or None where it counts nothing.
+    """
+
+    point_to_pixel: Alignment
+    pixel_to_point: Alignment | None
+
+    @property
+    def alignments(self) -> list[Alignment]:
+        both = (self.point_to_pixel, self.pixel_to_point)
+        return [alignment for alignment in both if alignment is not None]
+
+
+def match_nearest(
+    view: ClassView,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    c_twist: FloatArray,
+    pixel_weight: float,
+    motion_model: MotionModel = "translation",
+) -> NearestMatches | None:
+    """Matches at a pose and offset; None where no point falls on the image. SST-Calib, eq. 2 to 4.
+
+    L = L_p2i + w_l (n_p / n_i) L_i2p, n_p projected points on the image, n_i sampled pixels; each match
+    with a sigma of 1 px.
+
+    Args:
+        c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
+        pixel_weight: w_l; 0 leaves the pixels out.
+        motion_model: see :mod:`factors.motion`; the paper's is "translation".
+    """
+    tau_s = offset_s + view.base_tau_s
+    cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), motion_model).cPs.T
+    uvs = view.camera.project(cPs)
+    on_image = np.flatnonzero(view.camera.in_front(cPs) & view.camera.in_image(uvs))
+    if len(on_image) == 0:
+        return None
+    lPs, uvs = view.lPs[on_image], uvs[on_image]
+
+    def frozen(points: FloatArray, pixels: FloatArray, weight: float) -> Alignment:
+        return Alignment(
+            view.camera,
+            points,
+            np.asarray(view.base_tau_s),
+            pixels,
+            np.asarray(1.0),
+            motion_model=motion_model,
+            weight=weight,
+        )
+
+    point_to_pixel = frozen(lPs, view.nearest.at(uvs), 1.0)
+    if pixel_weight == 0.0:
+        return NearestMatches(point_to_pixel, None)
+    chosen = nearest_points(uvs, view.pixels)
+    weight = pixel_weight * len(lPs) / len(view.pixels)
+    return NearestMatches(point_to_pixel, frozen(lPs[chosen], view.pixels, weight))

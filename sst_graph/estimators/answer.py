@@ -1,0 +1,104 @@
+"""From what a method found to a result: status, reasons, versions; the same for every method."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import to_dict
+from sst_graph.estimators.config import CalibrationConfig
+from sst_graph.problem.drive import Drive
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
+from sst_graph.uncertainty.observability import weak_directions
+
+FloatArray = NDArray[np.float64]
+
+PACKAGES = ("sst-graph", "gtsam", "numpy", "opencv-python-headless", "scipy", "small_gicp")
+
+
+@dataclass(frozen=True)
+class Guess:
+    """What is known at first: an extrinsic, or None, and a time offset [s]."""
+
+    cTl: gtsam.Pose3 | None
+    offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method found.
+
+    Attributes:
+        cTl, offset_s: the estimate.
+        covariance: (7, 7), see :class:`~sst_graph.result.CalibrationResult`.
+        frames: that took part.
+        doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
+        remarks: what else was missing, for the reader.
+        drive_offsets: an offset for each drive, where one each was asked for.
+        diagnostics: JSON-able numbers about the run.
+    """
+
+    cTl: gtsam.Pose3
+    offset_s: float
+    covariance: FloatArray
+    frames: tuple[FrameId, ...]
+    doubts: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    drive_offsets: tuple[DriveOffset, ...] = ()
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+
+def result_of(
+    answer: Answer, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+) -> CalibrationResult:
+    """The result: unobservable where the covariance says so, not_converged where there are doubts."""
+    weak = weak_directions(answer.covariance, answer.cTl, config.observability)
+    status: Status = "not_converged" if answer.doubts else "unobservable" if weak else "ok"
+    sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
+    return CalibrationResult(
+        T_camera_lidar=answer.cTl,
+        time_offset_s=answer.offset_s,
+        covariance=answer.covariance,
+        status=status,
+        camera=drives[0].camera,
+        reasons=(*answer.doubts, *answer.remarks, *sentences),
+        weak_directions=weak,
+        frames_used=answer.frames,
+        drive_offsets=answer.drive_offsets,
+        method=config.method,
+        config=to_dict(config),
+        initial=guess.cTl,
+        initial_offset_s=guess.offset_s,
+        diagnostics=answer.diagnostics,
+        versions=_versions(),
+    )
+
+
+def no_answer(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
+) -> CalibrationResult:
+    """What is known when no estimate could be made: the guess, with sigmas that say so."""
+    sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+    return CalibrationResult(
+        T_camera_lidar=guess.cTl or gtsam.Pose3(),
+        time_offset_s=guess.offset_s,
+        covariance=np.diag(sigmas**2),
+        status="unobservable",
+        camera=drives[0].camera,
+        reasons=(reason,),
+        method=config.method,
+        config=to_dict(config),
+        initial=guess.cTl,
+        initial_offset_s=guess.offset_s,
+        versions=_versions(),
+    )
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in PACKAGES}

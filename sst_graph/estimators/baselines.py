@@ -1,0 +1,93 @@
+"""The paper's method and other baselines as methods of ``calibrate``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.answer import Answer, Guess
+from sst_graph.estimators.config import CalibrationConfig
+from sst_graph.estimators.paper import NearestSolution, solve_paper, solve_static
+from sst_graph.estimators.rematch import Calibration, agreement
+from sst_graph.estimators.semalign import solve_semalign
+from sst_graph.problem.drive import Drive, Progress
+
+
+def answer_paper(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> Answer:
+    """SST-Calib, static and joint stage."""
+
+    def solve(start: Calibration) -> NearestSolution:
+        odometry = config.prepare.visual_odometry
+        return solve_paper(drives, start, config.classes, config.paper, odometry, progress)
+
+    return _judged(solve, drives, guess, config)
+
+
+def answer_static(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> Answer:
+    """SST-Calib's static stage alone."""
+
+    def solve(start: Calibration) -> NearestSolution:
+        odometry = config.prepare.visual_odometry
+        return solve_static(drives, start, config.classes, config.paper, odometry, progress)
+
+    return _judged(solve, drives, guess, config)
+
+
+def answer_semalign(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> Answer:
+    """SemAlign."""
+
+    def solve(start: Calibration) -> NearestSolution:
+        odometry = config.prepare.visual_odometry
+        return solve_semalign(
+            drives, start, config.classes, config.semalign, config.paper, odometry, progress
+        )
+
+    return _judged(solve, drives, guess, config)
+
+
+def _judged(
+    solve: Callable[[Calibration], NearestSolution],
+    drives: Sequence[Drive],
+    guess: Guess,
+    config: CalibrationConfig,
+) -> Answer:
+    """The solution with doubts where the labels do not agree under it.
+
+    Raises:
+        EstimationError: no guess, or nothing to solve.
+    """
+    if guess.cTl is None:
+        raise EstimationError(f"method {config.method} needs a guess to start from: it has no search")
+    start = Calibration(guess.cTl, guess.offset_s)
+    solution = solve(start)
+    at = solution.calibration
+    before = agreement(solution.frames, drives, config.classes, start)
+    after = agreement(solution.frames, drives, config.classes, at)
+    doubts = []
+    if after.score < before.score:
+        doubts.append(f"the labels agree less than at the start ({after.score:.2f}, {before.score:.2f})")
+    if after.score < config.paper.min_agreement:
+        doubts.append(
+            f"the labels agree by {after.score:.2f} only (1: perfect, 0: chance), "
+            f"expected {config.paper.min_agreement:g} or more"
+        )
+    return Answer(
+        at.cTl,
+        at.offset_s,
+        solution.covariance,
+        tuple(frame.id for frame in solution.frames),
+        doubts=tuple(doubts),
+        remarks=solution.reasons,
+        diagnostics={
+            "covariance": "of the frozen matches, taken for independent: too sure",
+            "agreement": after.score,
+            "agreement_at_start": before.score,
+            **solution.diagnostics,
+        },
+    )
