@@ -127,10 +127,10 @@ def fit_error_model(table: MatchTable) -> ErrorModel:
     count = frame_w**2 / np.maximum(frame_w2, 1e-12)
     side_of_frame = np.zeros(len(frame_w), dtype=np.intp)
     side_of_frame[table.side_frames] = table.sides
-    side_frame = _excess(frame_mean, match / count, side_of_frame)
+    side_frame = spread_beyond(frame_mean, match / count, side_of_frame)
     v = 1.0 / (match / count + side_frame)
     side_mean, side_w, _ = _means(frame_mean, v, side_of_frame)
-    side = _excess(side_mean, 1.0 / side_w, np.zeros(len(side_mean), dtype=np.intp), centre=0.0)
+    side = spread_beyond(side_mean, 1.0 / side_w, np.zeros(len(side_mean), dtype=np.intp), centre=0.0)
     return ErrorModel(side, side_frame, match)
 
 
@@ -141,7 +141,7 @@ def _means(values: FloatArray, w: FloatArray, groups: IntArray) -> tuple[FloatAr
     return mean, np.asarray(total, np.float64), np.asarray(np.bincount(groups, w * w), np.float64)
 
 
-def _excess(means: FloatArray, variances: FloatArray, groups: IntArray, centre: float | None = None) -> float:
+def spread_beyond(means: FloatArray, variances: FloatArray, groups: IntArray, centre: float | None = None) -> float:
     """Variance of ``means`` around their group's mean beyond what their own variances explain."""
     v = 1.0 / np.maximum(variances, 1e-9)
     group_mean, group_v, group_v2 = _means(means, v, groups)
