@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.boundary import Boundaries
 from sst_graph.problem.drive import Drive
 from sst_graph.types import SemanticClass
 
@@ -19,27 +20,52 @@ _REACH_M = 2.0
 """Farthest an object's centre may seem to jump between scans [m]."""
 
 
+class ObjectTracker:
+    """Tracks of objects, scan by scan; those not seen lately are forgotten."""
+
+    def __init__(self, memory: int | None = None, first: int = 0) -> None:
+        """memory: scans after which an unseen track is forgotten, or None for never; first: its number."""
+        self._memory = memory
+        self._live: dict[int, tuple[SemanticClass, FloatArray]] = {}
+        self._seen: dict[int, int] = {}
+        self._scans = 0
+        self.following = first
+
+    def add(
+        self, boundaries: Mapping[SemanticClass, Boundaries], wTl: gtsam.Pose3
+    ) -> dict[tuple[SemanticClass, int], int]:
+        """Number of the track of each (class, object) of the next scan, posed at ``wTl``."""
+        tracks: dict[tuple[SemanticClass, int], int] = {}
+        seen: dict[int, tuple[SemanticClass, FloatArray]] = {}
+        for c, points in boundaries.items():
+            numbers, which = np.unique(points.objects, return_inverse=True)
+            for k, number in enumerate(numbers):
+                centre = wTl.transformFrom(points.lPs[which == k].mean(axis=0))
+                track = _nearest(self._live, seen, c, centre)
+                if track is None:
+                    track, self.following = self.following, self.following + 1
+                tracks[c, int(number)] = track
+                seen[track] = (c, centre)
+                self._seen[track] = self._scans
+        self._live.update(seen)
+        self._scans += 1
+        if self._memory is not None:
+            for track in [t for t, last in self._seen.items() if last < self._scans - self._memory]:
+                del self._live[track], self._seen[track]
+        return tracks
+
+
 def object_tracks(drive: Drive) -> dict[ObjectId, int]:
     """Number of the track that each object of each scan belongs to.
 
     Centres of an object's boundary points are carried into the world by LiDAR odometry and joined to
-    the nearest track of the same class that was seen lately.
+    the nearest track of the same class that was seen before.
     """
+    tracker = ObjectTracker()
     tracks: dict[ObjectId, int] = {}
-    live: dict[int, tuple[SemanticClass, FloatArray]] = {}
-    following = 0
     for position, wTl in enumerate(_scan_poses(drive)):
-        seen: dict[int, tuple[SemanticClass, FloatArray]] = {}
-        for c, boundaries in drive.scans[position].boundaries.items():
-            numbers, which = np.unique(boundaries.objects, return_inverse=True)
-            for k, number in enumerate(numbers):
-                centre = wTl.transformFrom(boundaries.lPs[which == k].mean(axis=0))
-                track = _nearest(live, seen, c, centre)
-                if track is None:
-                    track, following = following, following + 1
-                tracks[position, c, int(number)] = track
-                seen[track] = (c, centre)
-        live.update(seen)
+        for (c, number), track in tracker.add(drive.scans[position].boundaries, wTl).items():
+            tracks[position, c, number] = track
     return tracks
 
 
