@@ -66,7 +66,7 @@ def pixel_to_point_factor(
     """r_j = uv(cP_j) - q_j, P_j the point that projects nearest to the mask pixel q_j; two rows a pixel [px].
 
     SST-Calib, eq. 3: the same residual as :func:`point_to_pixel_factor` over matches found the other
-    way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weight``.
+    way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weights``.
     """
     _require_points(alignment)
     return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)

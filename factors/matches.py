@@ -34,7 +34,7 @@ class Alignment:
         kernel: robust kernel on each match's whitened residual (its 2-norm where it has two rows).
         c_acceleration: (6,) twist's rate of change [rad/s^2, m/s^2].
         motion_model: "se3" or the first-order "translation" (see :mod:`factors.motion`).
-        weight: factor on the cost of every match (after the kernel).
+        weights: (n,) or one number: factor on the cost of each match (after the kernel).
     """
 
     camera: PinholeCamera
@@ -46,13 +46,13 @@ class Alignment:
     kernel: RobustKernel = field(default_factory=RobustKernel)
     c_acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
     motion_model: MotionModel = "se3"
-    weight: float = 1.0
+    weights: FloatArray | float = 1.0
 
     def __post_init__(self) -> None:
         store = object.__setattr__
         store(self, "lPs", checked_array("lPs of an alignment", self.lPs, (None, 3)))
         n = len(self.lPs)
-        for name in ("base_taus_s", "sigmas_px"):
+        for name in ("base_taus_s", "sigmas_px", "weights"):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             value = np.full(n, value) if value.ndim == 0 else value
             store(self, name, checked_array(f"{name} of an alignment", value, (n,)))
@@ -69,7 +69,8 @@ class Alignment:
         store(self, "c_acceleration", acceleration)
         if self.motion_model not in get_args(MotionModel):
             raise FactorError("motion model", repr(self.motion_model), " or ".join(get_args(MotionModel)))
-        checked_positive("weight of an alignment", self.weight)
+        if (np.asarray(self.weights) <= 0.0).any():
+            raise FactorError("weights of an alignment", f"{np.min(self.weights):.3g}", "values above 0")
 
     def __len__(self) -> int:
         return len(self.lPs)

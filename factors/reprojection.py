@@ -105,7 +105,7 @@ def alignment_cost(
     c_twist: FloatArray,
     bias_px: float | None = None,
 ) -> float:
-    """Robust cost: weight * sum rho(|r_i| / sigma_i), with points behind as the module says."""
+    """Robust cost: sum weight_i rho(|r_i| / sigma_i), with points behind as the module says."""
     return cost(alignment, evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=False))
 
 
@@ -204,22 +204,22 @@ def _sizes(alignment: Alignment, evaluated: Evaluated) -> FloatArray:
     return np.asarray(size / alignment.sigmas_px)
 
 
-def _behind_cost(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
+def _behind_costs(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
     """Cost of the matches behind the camera: a residual of the image's diagonal each."""
     diagonal = float(np.hypot(alignment.camera.width, alignment.camera.height))
-    return float(alignment.kernel.loss(diagonal / alignment.sigmas_px[behind]).sum())
+    return float(alignment.weights[behind] @ alignment.kernel.loss(diagonal / alignment.sigmas_px[behind]))
 
 
 def cost(alignment: Alignment, evaluated: Evaluated) -> float:
-    cost = float(alignment.kernel.loss(_sizes(alignment, evaluated)).sum())
+    cost = float(alignment.weights @ alignment.kernel.loss(_sizes(alignment, evaluated)))
     if evaluated.behind is not None:
-        cost += _behind_cost(alignment, evaluated.behind)
-    return alignment.weight * cost
+        cost += _behind_costs(alignment, evaluated.behind)
+    return cost
 
 
 def weigh(alignment: Alignment, evaluated: Evaluated) -> float:
     """Multiply the rows by sqrt(weight w) / sigma in place; return 2 cost - |weighted r|^2."""
-    scale = np.sqrt(alignment.weight) / alignment.sigmas_px
+    scale = np.sqrt(alignment.weights) / alignment.sigmas_px
     if alignment.kernel.kind == "none":
         np.multiply(evaluated.rows, scale, out=evaluated.rows)
         constant = 0.0
@@ -227,7 +227,7 @@ def weigh(alignment: Alignment, evaluated: Evaluated) -> float:
         x = _sizes(alignment, evaluated)
         w = alignment.kernel.weight(x)
         np.multiply(evaluated.rows, scale * np.sqrt(w), out=evaluated.rows)
-        constant = float((2.0 * alignment.kernel.loss(x) - w * x * x).sum())
+        constant = float(alignment.weights @ (2.0 * alignment.kernel.loss(x) - w * x * x))
     if evaluated.behind is not None:
-        constant += 2.0 * _behind_cost(alignment, evaluated.behind)
-    return max(alignment.weight * constant, 0.0)
+        constant += 2.0 * _behind_costs(alignment, evaluated.behind)
+    return max(constant, 0.0)

@@ -1,8 +1,10 @@
 """Boundary points of a scan: where a scan line leaves an object for what is behind it.
 
 The edge lies between the last return on the object and the next beam, so the mid-direction at the
-object's range is an unbiased boundary point, uniform over half a beam step to either side. Where the
-neighbour is *nearer* the edge belongs to the neighbour and is skipped.
+object's range is an unbiased direction, uniform over half a beam step to either side. Where the neighbour is *nearer* the
+edge belongs to the neighbour and is skipped. The range is carried on over the half step with the slope
+of the last two returns: on a roof seen at a grazing angle the edge lies a metre behind the last return,
+and a camera beside the LiDAR sees that metre.
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ class BoundaryConfig:
         max_elevation_gap_deg: largest gap between neighbouring rings [deg].
         max_range_m: farthest object [m].
         min_points: objects with fewer points are left out.
+        max_slope_m: most that the range is carried on from the last return to the edge [m].
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
 
@@ -50,6 +53,7 @@ class BoundaryConfig:
     max_elevation_gap_deg: float = 0.9
     max_range_m: float = 60.0
     min_points: int = 15
+    max_slope_m: float = 1.0
     cell_m: float = 0.3
 
 
@@ -125,13 +129,28 @@ def _side_edges(
     """
     a, b = beams.order[:-1], beams.order[1:]
     last, following = (a, b) if side > 0 else (b, a)
+    place = np.arange(len(a)) if side > 0 else np.arange(1, len(beams.order))
+    before = beams.order[np.clip(place - side, 0, len(beams.order) - 1)]
     gap = side * (beams.azimuth[following] - beams.azimuth[last])
     parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
     ok = (beams.ring[a] == beams.ring[b]) & (gap < config.max_steps * beams.step + parallax)
     ok &= mask[last] & ~mask[following] & _is_behind(beams.rho, last, following, config)
-    last = last[ok]
+    last, before = last[ok], before[ok]
+    steps = side * (beams.azimuth[last] - beams.azimuth[before])
+    known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
+    known &= steps < config.max_steps * beams.step
+    edge = _carried_on(points[last], beams.rho[last], beams.rho[before], known, config)
     half = 0.5 * side * beams.step
-    return _Edges(last, _turn(points[last], half), _turn(points[last], 3.0 * half), Edge.SIDE)
+    return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), Edge.SIDE)
+
+
+def _carried_on(
+    points: FloatArray, rho: FloatArray, before: FloatArray, known: NDArray[np.bool_], config: BoundaryConfig
+) -> FloatArray:
+    """Points pushed along their rays by half the range step from the return before, where that is known."""
+    push = np.where(known, np.clip(0.5 * (rho - before), -config.max_slope_m, config.max_slope_m), 0.0)
+    push = np.where(np.abs(rho - before) < 2.0 * config.max_slope_m, push, 0.0)
+    return np.asarray(points * (1.0 + push / rho)[:, None])
 
 
 def _turn(points: FloatArray, angle: float) -> FloatArray:
@@ -162,11 +181,25 @@ def _top_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config
     z_above = (1.0 - fraction) * z_left + fraction * z_right
     rise = (z_above - points[i, 2]) / rho
     ok = (rise > 0.0) & (rise < np.radians(config.max_elevation_gap_deg))
-    i, z_above = i[ok], z_above[ok]
-    lPs, outward = points[i].copy(), points[i].copy()
-    lPs[:, 2] = 0.5 * (points[i, 2] + z_above)
-    outward[:, 2] = 1.5 * z_above - 0.5 * points[i, 2]
+    i, rise = i[ok], rise[ok]
+    below, known = _nearest_in_ring(beams, keys, i, beams.ring[i] - 1)
+    edge = _carried_on(points[i], beams.rho[i], beams.rho[below], known & mask[below], config)
+    half = 0.5 * rise * np.hypot(edge[:, 0], edge[:, 1])
+    lPs, outward = edge.copy(), edge.copy()
+    lPs[:, 2] += half
+    outward[:, 2] += 3.0 * half
     return _Edges(i, lPs, outward, Edge.TOP)
+
+
+def _nearest_in_ring(
+    beams: Beams, keys: FloatArray, index: IntArray, ring: IntArray
+) -> tuple[IntArray, NDArray[np.bool_]]:
+    """The point of a ring nearest in azimuth to each of ``index``, and whether it is within a step or so."""
+    wanted = ring * 10.0 + beams.azimuth[index]
+    place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
+    place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
+    found = beams.order[place]
+    return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < 1.5 * beams.step)
 
 
 def _is_behind(

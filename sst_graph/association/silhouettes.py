@@ -26,12 +26,15 @@ class MatchConfig:
 
     Attributes:
         mask_sigma_px: deviation of a mask's contour from the object's [px].
+        side_sigma_px: error that all matches on one side of one object in one image share [px]; it
+            bounds what a side may claim, however many points it has.
         gate: farthest match, in units of the kernel's scale.
         min_cosine: least agreement between the contour's normal and the way out of the object.
         top_edges: use boundaries towards the ring above.
     """
 
     mask_sigma_px: float = 1.0
+    side_sigma_px: float = 0.0
     gate: float = 3.0
     min_cosine: float = 0.5
     top_edges: bool = True
@@ -101,19 +104,28 @@ def match_silhouettes(
         if len(index) == 0:
             continue
         beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
+        sigmas = np.hypot(config.mask_sigma_px, beam_sigma)
+        sides = np.where(points.edges[index] == Edge.TOP, 2, (way[index, 0] > 0).astype(np.intp))
         alignment = Alignment(
             camera=camera,
             lPs=points.lPs[index],
             base_taus_s=base_taus[index],
             pixels=feet.feet[index],
-            sigmas_px=np.hypot(config.mask_sigma_px, beam_sigma),
+            sigmas_px=sigmas,
             normals=feet.normals[index],
             kernel=kernel,
             c_acceleration=motion.c_acceleration,
+            weights=_shared_weights(points.objects[index] * 3 + sides, sigmas, config.side_sigma_px),
         )
-        sides = np.where(points.edges[index] == Edge.TOP, 2, (way[index, 0] > 0).astype(np.intp))
         found[c] = SilhouetteMatches(alignment, points.objects[index], sides, index)
     return found
+
+
+def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: float) -> FloatArray:
+    """(n,) weights under which a group's mean counts with sigma^2 / n + shared^2 instead of sigma^2 / n."""
+    numbers = np.unique(groups, return_inverse=True)[1].reshape(-1)
+    information = np.bincount(numbers, sigmas_px**-2.0)[numbers]
+    return np.asarray(1.0 / (1.0 + information * shared_px**2))
 
 
 def _project(

@@ -86,7 +86,7 @@ def test_pixels_are_those_of_a_gtsam_camera(make_scene, per_point):
 
 def test_weighted_rows_and_constant_make_the_robust_cost(make_scene):
     kernel = RobustKernel("geman_mcclure", 1.5)
-    alignment, *state = make_scene(2, kernel=kernel, weight=3.0)
+    alignment, *state = make_scene(2, kernel=kernel, weights=3.0)
     r, J = residuals(alignment, *state)
     rw, Jw, constant = weighted_residuals(alignment, *state)
     x = np.linalg.norm(r.reshape(2, -1), axis=0) / alignment.sigmas_px
