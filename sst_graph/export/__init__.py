@@ -1,0 +1,25 @@
+"""A calibration in the formats of others, and as a factor for graphs of others."""
+
+from __future__ import annotations
+
+from sst_graph.export.formats import FORMATS, ExportOptions, export_text
+from sst_graph.export.marginal import (
+    DELAY,
+    EXTRINSIC,
+    CalibrationMarginal,
+    fuse_marginals,
+    marginal_of_graph,
+    marginal_of_result,
+)
+
+__all__ = [
+    "DELAY",
+    "EXTRINSIC",
+    "FORMATS",
+    "CalibrationMarginal",
+    "ExportOptions",
+    "export_text",
+    "fuse_marginals",
+    "marginal_of_graph",
+    "marginal_of_result",
+]

@@ -1,0 +1,228 @@
+"""The marginal on (E, D): what it says, in another process, and fused."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import Alignment, delay_prior, frame_factor, residuals
+from factors.camera import PinholeCamera
+from sst_graph.errors import DataError, EstimationError
+from sst_graph.export import (
+    DELAY,
+    EXTRINSIC,
+    CalibrationMarginal,
+    fuse_marginals,
+    marginal_of_graph,
+    marginal_of_result,
+)
+from sst_graph.result import CalibrationResult
+
+CAMERA = PinholeCamera(718.0, 718.0, 607.0, 185.0, 1242, 375)
+FORWARD = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+TRUE = gtsam.Pose3(FORWARD, np.array([0.06, -0.08, -0.27]))
+OFFSET_S = 0.07
+
+
+def covariance(seed: int) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(7, 12)) * np.array([0.002] * 3 + [0.02] * 3 + [0.004])[:, None]
+    return np.asarray(A @ A.T / 12.0)
+
+
+def marginal(seed: int) -> CalibrationMarginal:
+    d = np.random.default_rng(seed + 100).multivariate_normal(np.zeros(7), covariance(seed))
+    result = CalibrationResult(TRUE.retract(d[:6]), OFFSET_S + d[6], covariance(seed), "ok", CAMERA)
+    return marginal_of_result(result)
+
+
+def drive(seed: int, frames: int = 6) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """A drive's frozen graph: its own twists and mask bias, the shared E and D; and a common point."""
+    rng = np.random.default_rng(seed)
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(EXTRINSIC, TRUE.retract(np.full(6, 0.01)))
+    values.insert(DELAY, np.array([OFFSET_S + 0.01]))
+    bias = gtsam.symbol("B", seed)
+    values.insert(bias, np.zeros(1))
+    graph.add(delay_prior(bias, 0.0, 3.0))
+    for k in range(frames):
+        lPs = np.stack([rng.uniform(6, 40, 60), rng.uniform(-6, 6, 60), rng.uniform(-2, 1, 60)], axis=1)
+        angle = rng.uniform(0.0, 2.0 * np.pi, 60)
+        normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        blank = Alignment(CAMERA, lPs, -0.02, np.zeros((60, 2)), 1.5)
+        twist = rng.normal(0.0, 1.0, 6) * [0.1, 0.3, 0.1, 0.5, 0.3, 6.0]
+        pixels, _ = residuals(blank, TRUE, OFFSET_S, twist, jacobians=False)
+        noisy = pixels.reshape(2, -1).T + rng.normal(0.0, 1.5, (60, 2))
+        seen = replace(blank, pixels=noisy, normals=normals)
+        key = gtsam.symbol("V", 1000 * seed + k)
+        noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.01, 0.1], 3))
+        graph.add(gtsam.PriorFactorVector(key, twist, noise))
+        values.insert(key, twist)
+        graph.add(frame_factor([seen], EXTRINSIC, DELAY, key, bias))
+    return graph, values
+
+
+def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gtsam.Pose3, float]:
+    """One Gauss-Newton step of the whole graph, the dense way."""
+    ordering = gtsam.Ordering()
+    for key in values.keys():  # noqa: SIM118
+        ordering.push_back(key)
+    H, g = graph.linearize(values).hessian(ordering)
+    step = np.linalg.solve(H, g)
+    at = {}
+    for key in values.keys():  # noqa: SIM118
+        dim = 6 if chr(gtsam.Symbol(key).chr()) in "EV" else 1
+        at[key], step = step[:dim], step[dim:]
+    cTl = values.atPose3(EXTRINSIC).retract(at[EXTRINSIC])
+    return cTl, float(values.atVector(DELAY)[0] + at[DELAY][0])
+
+
+def in_sigmas(found: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> float:
+    """Distance of the marginal's optimum from an estimate, in the marginal's own sigmas."""
+    best, best_offset_s = found.best()
+    d = np.append(best.localCoordinates(cTl), offset_s - best_offset_s)
+    return float(np.sqrt(d @ found.information @ d))
+
+
+def test_the_marginal_of_a_result_is_its_robust_covariance() -> None:
+    found = marginal(3)
+    np.testing.assert_allclose(found.covariance(), covariance(3), rtol=1e-8, atol=1e-14)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(found.factor())
+    marginals = gtsam.Marginals(graph, found.point())
+    np.testing.assert_allclose(
+        marginals.marginalCovariance(EXTRINSIC), covariance(3)[:6, :6], rtol=1e-6, atol=1e-12
+    )
+    assert marginals.marginalCovariance(DELAY).item() == pytest.approx(covariance(3)[6, 6], rel=1e-6)
+
+
+def test_the_error_is_the_documented_quadratic() -> None:
+    found = replace(marginal(4), vector=np.arange(7.0), constant=5.0)
+    d = np.random.default_rng(0).normal(size=7) * 0.01
+    values = gtsam.Values()
+    values.insert(EXTRINSIC, found.cTl * gtsam.Pose3.Expmap(d[:6]))
+    values.insert(DELAY, np.array([found.offset_s + d[6]]))
+    expected = 0.5 * d @ found.information @ d - found.vector @ d + 0.5 * found.constant
+    assert found.factor().error(values) == pytest.approx(expected, rel=1e-6)
+
+
+READER = """
+import json, pickle, sys
+import gtsam, numpy as np
+document = json.load(open(sys.argv[1]))
+E, D = (int(variable["key"]) for variable in document["variables"])
+assert E == gtsam.symbol("E", 0) and D == gtsam.symbol("D", 0)
+# rebuilt from the plain numbers
+L, g = np.array(document["information"]), np.array(document["vector"])
+hessian = gtsam.HessianFactor(E, D, L[:6, :6], L[:6, 6:], g[:6], L[6:, 6:], g[6:], document["constant"])
+point = gtsam.Values()
+point.insert(E, gtsam.Pose3(np.array(document["linearization_point"]["T_camera_lidar"])))
+point.insert(D, np.array([document["linearization_point"]["time_offset_s"]]))
+plain = gtsam.LinearContainerFactor(hessian, point)
+# from the Boost archive, and from the pickle
+archive = gtsam.LinearContainerFactor(gtsam.HessianFactor())
+archive.deserialize(document["gtsam_serialized"])
+pickled = pickle.load(open(sys.argv[2], "rb"))
+elsewhere = gtsam.Values()
+elsewhere.insert(E, point.atPose3(E).retract(np.full(6, 0.01)))
+elsewhere.insert(D, point.atVector(D) + 0.01)
+assert "sst_graph" not in sys.modules and "factors" not in sys.modules
+print(json.dumps([factor.error(elsewhere) for factor in (plain, archive, pickled)]))
+"""
+
+
+def test_reads_back_in_a_fresh_process_without_us(tmp_path: Path) -> None:
+    found = replace(marginal(5), vector=np.arange(7.0), constant=2.0)
+    (tmp_path / "marginal.json").write_text(found.to_json())
+    (tmp_path / "marginal.pickle").write_bytes(pickle.dumps(found.factor()))
+    (tmp_path / "reader.py").write_text(READER)
+    command = [sys.executable, "-I", "reader.py", "marginal.json", "marginal.pickle"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    values = gtsam.Values()
+    values.insert(EXTRINSIC, found.cTl.retract(np.full(6, 0.01)))
+    values.insert(DELAY, np.array([found.offset_s + 0.01]))
+    assert json.loads(done.stdout) == pytest.approx([found.factor().error(values)] * 3, rel=1e-9)
+
+
+def test_json_reads_back() -> None:
+    found = replace(marginal(6), vector=np.arange(7.0), constant=2.0)
+    again = CalibrationMarginal.from_json(found.to_json())
+    np.testing.assert_array_equal(again.information, found.information)
+    np.testing.assert_array_equal(again.vector, found.vector)
+    assert again.cTl.equals(found.cTl, 1e-12) and again.offset_s == found.offset_s
+    assert again.constant == found.constant
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"format": "sst-graph/marginal", "version": 2}', "[1]"])
+def test_refuses_other_files(text: str) -> None:
+    with pytest.raises(DataError, match=r"marginal\.json"):
+        CalibrationMarginal.from_json(text)
+
+
+def test_fusing_two_drives_equals_the_joint_batch() -> None:
+    drives = [drive(1), drive(2)]
+    fused = fuse_marginals([marginal_of_graph(g, v, EXTRINSIC, DELAY) for g, v in drives])
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for one, start in drives:
+        graph.push_back(one)
+        values.insert_or_assign(start)
+    cTl, offset_s = solved(graph, values)
+    assert in_sigmas(fused, cTl, offset_s) < 1e-3
+    joint = marginal_of_graph(graph, values, EXTRINSIC, DELAY)
+    # the fused one is written about its own optimum
+    J = np.eye(7)
+    J[:6, :6] = gtsam.Pose3.LogmapDerivative(joint.cTl.localCoordinates(fused.cTl))
+    expected = J.T @ joint.information @ J
+    np.testing.assert_allclose(fused.information, expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+def test_fusing_two_optima_is_within_a_thousandth_of_a_sigma_of_the_batch_optimum() -> None:
+    # each drive solved by itself, linearized at its own optimum: the fusion against the joint LM
+    drives, marginals = [drive(3, 20), drive(4, 20)], []
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    for one, start in drives:
+        at = gtsam.LevenbergMarquardtOptimizer(one, start, params).optimize()
+        marginals.append(marginal_of_graph(one, at, EXTRINSIC, DELAY))
+        graph.push_back(one)
+        values.insert_or_assign(at)
+    batch = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    fused = fuse_marginals(marginals)
+    assert in_sigmas(fused, batch.atPose3(EXTRINSIC), float(batch.atVector(DELAY)[0])) < 2e-2
+    assert in_sigmas(marginals[0], batch.atPose3(EXTRINSIC), float(batch.atVector(DELAY)[0])) > 0.3
+
+
+def test_fusion_is_that_of_gtsam_on_the_factors() -> None:
+    parts = [marginal(7), marginal(8), marginal(9)]
+    graph = gtsam.NonlinearFactorGraph()
+    for part in parts:
+        graph.add(part.factor())
+    found = gtsam.LevenbergMarquardtOptimizer(graph, parts[0].point()).optimize()
+    fused = fuse_marginals(parts)
+    assert in_sigmas(fused, found.atPose3(EXTRINSIC), float(found.atVector(DELAY)[0])) < 0.02
+    alone = min(np.sqrt(np.diag(part.covariance())).tolist() for part in parts)
+    assert (np.sqrt(np.diag(fused.covariance())) < alone).all()
+
+
+def test_refuses_what_is_not_determined() -> None:
+    with pytest.raises(EstimationError, match="no marginal"):
+        fuse_marginals([])
+    flat = replace(marginal(1), information=np.zeros((7, 7)))
+    with pytest.raises(EstimationError, match="information"):
+        flat.best()
+    graph, values = drive(1, 2)
+    graph.add(gtsam.PriorFactorVector(DELAY, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1.0)))
+    values.insert(99, np.zeros(1))
+    graph.add(gtsam.PriorFactorVector(99, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1e300)))
+    with pytest.raises(EstimationError, match="to eliminate"):
+        marginal_of_graph(graph, values, EXTRINSIC, DELAY)
