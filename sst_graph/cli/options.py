@@ -31,7 +31,7 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
     )
-    for add in (_add_demo, _add_simulate, _add_calibrate, _add_evaluate, _add_overlay):
+    for add in (_add_demo, _add_simulate, _add_calibrate, _add_evaluate, _add_overlay, _add_export):
         command = add(commands)
         command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
     return parser
@@ -151,6 +151,44 @@ def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argu
     )
     overlay.add_argument("--overwrite", action="store_true", help="replace the picture")
     return overlay
+
+
+def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "write a result in the format of another program"
+    export = commands.add_parser(
+        "export",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}; docs/export.md tells frames and signs.",
+    )
+    export.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    export.add_argument(
+        "--to",
+        required=True,
+        choices=("kitti", "ros-tf", "urdf", "kalibr", "autoware", "opencv", "gtsam"),
+        help="format; gtsam: the marginal on (E, D) as JSON with a serialized LinearContainerFactor",
+    )
+    export.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: stdout)")
+    export.add_argument("--overwrite", action="store_true", help="replace the file")
+    export.add_argument(
+        "--force", action="store_true", help="export a result whose status is not ok, with a warning"
+    )
+    export.add_argument(
+        "--calib",
+        type=Path,
+        metavar="FILE",
+        help="kitti only: calib.txt whose P lines place the camera beside camera 0 "
+        "(without it the camera counts as camera 0)",
+    )
+    export.add_argument(
+        "--camera-frame",
+        default="camera_optical_frame",
+        metavar="NAME",
+        help="the camera's optical frame, the parent (default %(default)s)",
+    )
+    export.add_argument(
+        "--lidar-frame", default="lidar", metavar="NAME", help="the LiDAR's frame (default %(default)s)"
+    )
+    return export
 
 
 def _add_source_options(command: argparse.ArgumentParser) -> None:
