@@ -21,15 +21,22 @@ _REACH_M = 2.0
 
 
 class ObjectTracker:
-    """Tracks of objects, scan by scan; those not seen lately are forgotten."""
+    """Tracks of objects, scan by scan; those not seen lately are forgotten.
 
-    def __init__(self, memory: int | None = None, first: int = 0) -> None:
-        """memory: scans after which an unseen track is forgotten, or None for never; first: its number."""
-        self._memory = memory
-        self._live: dict[int, tuple[SemanticClass, FloatArray]] = {}
-        self._seen: dict[int, int] = {}
-        self._scans = 0
-        self.following = first
+    Attributes:
+        memory: scans after which an unseen track is forgotten, or None for never.
+        live: class and place (3,) in the world [m] of each track, by its number.
+        last_seen: scan that saw it last, counted from 0.
+        scans: scans so far.
+        following: number of the next new track.
+    """
+
+    def __init__(self, memory: int | None = None) -> None:
+        self.memory = memory
+        self.live: dict[int, tuple[SemanticClass, FloatArray]] = {}
+        self.last_seen: dict[int, int] = {}
+        self.scans = 0
+        self.following = 0
 
     def add(
         self, boundaries: Mapping[SemanticClass, Boundaries], wTl: gtsam.Pose3
@@ -41,17 +48,17 @@ class ObjectTracker:
             numbers, which = np.unique(points.objects, return_inverse=True)
             for k, number in enumerate(numbers):
                 centre = wTl.transformFrom(points.lPs[which == k].mean(axis=0))
-                track = _nearest(self._live, seen, c, centre)
+                track = _nearest(self.live, seen, c, centre)
                 if track is None:
                     track, self.following = self.following, self.following + 1
                 tracks[c, int(number)] = track
                 seen[track] = (c, centre)
-                self._seen[track] = self._scans
-        self._live.update(seen)
-        self._scans += 1
-        if self._memory is not None:
-            for track in [t for t, last in self._seen.items() if last < self._scans - self._memory]:
-                del self._live[track], self._seen[track]
+                self.last_seen[track] = self.scans
+        self.live.update(seen)
+        self.scans += 1
+        if self.memory is not None:
+            for track in [t for t, last in self.last_seen.items() if last < self.scans - self.memory]:
+                del self.live[track], self.last_seen[track]
         return tracks
 
 
