@@ -1,0 +1,118 @@
+"""One image against one scan, for a graph of the user's own: the matches behind his alignment factor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from factors.alignment import Alignment
+from factors.camera import PinholeCamera
+from factors.robust import RobustKernel
+from sst_graph.association.silhouettes import MatchConfig, Motion, match_silhouettes
+from sst_graph.errors import DataError
+from sst_graph.problem.drive import (
+    ImageFeatures,
+    PrepareConfig,
+    ScanFeatures,
+    image_features,
+    scan_features,
+)
+from sst_graph.types import CameraImage, Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+VEHICLES = (SemanticClass.VEHICLE,)
+SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
+"""In somebody else's graph nobody corrects the information afterwards: a side of an object counts once."""
+SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
+
+
+@dataclass(frozen=True)
+class FrameAlignments:
+    """Matches of one scan and one image, an alignment for each class that both show.
+
+    Attributes:
+        classes: semantic class of each alignment, for the keys of their mask biases.
+        alignments: for :func:`factors.frame_factor` or :func:`factors.pose_alignment_factor`.
+    """
+
+    classes: tuple[SemanticClass, ...]
+    alignments: tuple[Alignment, ...]
+
+    def __len__(self) -> int:
+        """Number of matches."""
+        return sum(len(alignment) for alignment in self.alignments)
+
+
+def align_frame(
+    scan: Scan | ScanFeatures,
+    image: CameraImage | ImageFeatures,
+    camera: PinholeCamera,
+    cTl: gtsam.Pose3,
+    offset_s: float,
+    l_twist: ArrayLike,
+    *,
+    l_acceleration: ArrayLike | None = None,
+    lTs: gtsam.Pose3 | None = None,
+    from_ns: int | None = None,
+    classes: Sequence[SemanticClass] = VEHICLES,
+    biases_px: Mapping[SemanticClass, float] | None = None,
+    kernel: RobustKernel = SLAM_KERNEL,
+    config: MatchConfig = SLAM_MATCHES,
+) -> FrameAlignments:
+    """Boundary points of a scan matched to the contours of an image, at the current estimate.
+
+    Args:
+        scan, image: as the data have them, or their features (:func:`sst_graph.problem.drive.scan_features`,
+            ``image_features``), which spare the work when the same frame is matched again.
+        camera: of the image.
+        cTl: current extrinsic.
+        offset_s: current time offset [s].
+        l_twist: (6,) the LiDAR's twist around the image's instant [rad/s, m/s]:
+            ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds``.
+        l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
+        lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
+            at ``from_ns``, ``wTl_a.between(wTl_s)``. Such a scan must be deskewed to its stamp.
+        from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
+        classes: to match.
+        biases_px: current mask biases by class [px].
+        kernel: robust kernel of the matches; its scale, times ``config.gate``, is also the gate [px].
+        config: how boundary points meet contours.
+
+    Returns:
+        The matches, possibly none: a frame without any gives no factor.
+
+    Raises:
+        DataError: ``lTs`` without ``from_ns`` or the other way round, or twists of a wrong shape.
+    """
+    if (lTs is None) != (from_ns is None):
+        raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
+    twist = _twist("l_twist", l_twist)
+    acceleration = _twist("l_acceleration", np.zeros(6) if l_acceleration is None else l_acceleration)
+    points = scan_features(0, scan, classes, PrepareConfig()) if isinstance(scan, Scan) else scan
+    contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
+    Ad = np.asarray(cTl.AdjointMap())
+    found = match_silhouettes(
+        {c: boundaries for c, boundaries in points.boundaries.items() if c in classes},
+        contours.contours,
+        camera,
+        cTl if lTs is None else cTl * lTs,
+        offset_s,
+        (contours.stamp_ns - (points.stamp_ns if from_ns is None else from_ns)) * 1e-9,
+        Motion(Ad @ twist, Ad @ acceleration),
+        biases_px or {},
+        kernel,
+        config,
+    )
+    return FrameAlignments(tuple(found), tuple(matches.alignment for matches in found.values()))
+
+
+def _twist(name: str, value: ArrayLike) -> FloatArray:
+    twist = np.asarray(value, dtype=np.float64)
+    if twist.shape != (6,) or not np.isfinite(twist).all():
+        raise DataError(f"align_frame: {name}", f"shape {twist.shape}", "6 finite numbers")
+    return twist
