@@ -127,8 +127,9 @@ def match_nearest(
     c_twist: FloatArray,
     pixel_weight: float,
     motion_model: MotionModel = "translation",
+    max_px: float = np.inf,
 ) -> NearestMatches | None:
-    """Matches at a pose and offset; None where no point falls on the image. SST-Calib, eq. 2 to 4.
+    """Matches at a pose and offset; None where there are none. SST-Calib, eq. 2 to 4.
 
     L = L_p2i + w_l (n_p / n_i) L_i2p, n_p projected points on the image, n_i sampled pixels; each match
     with a sigma of 1 px.
@@ -137,6 +138,7 @@ def match_nearest(
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
         pixel_weight: w_l; 0 leaves the pixels out.
         motion_model: see :mod:`factors.motion`; the paper's is "translation".
+        max_px: points farther than this from their pixel are left out [px].
     """
     tau_s = offset_s + view.base_tau_s
     cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), motion_model).cPs.T
@@ -145,6 +147,12 @@ def match_nearest(
     if len(on_image) == 0:
         return None
     lPs, uvs = view.lPs[on_image], uvs[on_image]
+    targets = view.nearest.at(uvs)
+    if np.isfinite(max_px):
+        near = np.linalg.norm(uvs - targets, axis=1) <= max_px
+        lPs, uvs, targets = lPs[near], uvs[near], targets[near]
+        if len(lPs) == 0:
+            return None
 
     def frozen(points: FloatArray, pixels: FloatArray, weight: float) -> Alignment:
         return Alignment(
@@ -154,10 +162,10 @@ def match_nearest(
             pixels,
             np.asarray(1.0),
             motion_model=motion_model,
-            weight=weight,
+            weights=weight,
         )
 
-    point_to_pixel = frozen(lPs, view.nearest.at(uvs), 1.0)
+    point_to_pixel = frozen(lPs, targets, 1.0)
     if pixel_weight == 0.0:
         return NearestMatches(point_to_pixel, None)
     chosen = nearest_points(uvs, view.pixels)

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.answer import Answer, Guess
+from sst_graph.estimators.challenge import challenge
 from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.paper import NearestSolution, solve_paper, solve_static
-from sst_graph.estimators.rematch import Calibration, agreement
+from sst_graph.estimators.rematch import Calibration
 from sst_graph.estimators.semalign import solve_semalign
 from sst_graph.problem.drive import Drive, Progress
 
@@ -57,7 +58,7 @@ def _judged(
     guess: Guess,
     config: CalibrationConfig,
 ) -> Answer:
-    """The solution with doubts where the labels do not agree under it.
+    """The solution, with doubts where a second opinion finds better.
 
     Raises:
         EstimationError: no guess, or nothing to solve.
@@ -67,27 +68,17 @@ def _judged(
     start = Calibration(guess.cTl, guess.offset_s)
     solution = solve(start)
     at = solution.calibration
-    before = agreement(solution.frames, drives, config.classes, start)
-    after = agreement(solution.frames, drives, config.classes, at)
-    doubts = []
-    if after.score < before.score:
-        doubts.append(f"the labels agree less than at the start ({after.score:.2f}, {before.score:.2f})")
-    if after.score < config.paper.min_agreement:
-        doubts.append(
-            f"the labels agree by {after.score:.2f} only (1: perfect, 0: chance), "
-            f"expected {config.paper.min_agreement:g} or more"
-        )
+    opinion = challenge(solution.frames, drives, config.classes, start, at, config.start.search)
     return Answer(
         at.cTl,
         at.offset_s,
         solution.covariance,
         tuple(frame.id for frame in solution.frames),
-        doubts=tuple(doubts),
+        doubts=tuple(opinion.doubts(config.challenge)),
         remarks=solution.reasons,
         diagnostics={
             "covariance": "of the frozen matches, taken for independent: too sure",
-            "agreement": after.score,
-            "agreement_at_start": before.score,
+            "scores": {"start": opinion.start, "answer": opinion.answer, "best_nearby": opinion.best},
             **solution.diagnostics,
         },
     )

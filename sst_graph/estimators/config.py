@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sst_graph.estimators.challenge import ChallengeConfig
 from sst_graph.estimators.joint import JointConfig
 from sst_graph.estimators.paper import PaperConfig
 from sst_graph.estimators.semalign import SemAlignConfig
@@ -30,6 +31,7 @@ class CalibrationConfig:
         joint: the outer and inner loop.
         paper: both stages of the paper.
         semalign: sampled starts.
+        challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
         observability: when a direction counts as unobservable.
     """
 
@@ -41,4 +43,5 @@ class CalibrationConfig:
     joint: JointConfig = field(default_factory=JointConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
+    challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

@@ -47,7 +47,6 @@ class PaperConfig:
         static_frames, joint_frames: most frames of each stage.
         velocity_every: iterations of the joint stage between renewals of the velocities.
         standing: what counts as standing.
-        min_agreement: agreement of the labels (1 perfect, 0 chance) below which an answer is not trusted.
         seed: of the sample of pixels.
     """
 
@@ -62,7 +61,6 @@ class PaperConfig:
     joint_frames: int = 20
     velocity_every: int = 5
     standing: StandingConfig = field(default_factory=StandingConfig)
-    min_agreement: float = 0.5
     seed: int = 0
 
     def __post_init__(self) -> None:

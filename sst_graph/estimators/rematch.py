@@ -10,9 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import delay_prior, frame_factor, move_points
+from factors import delay_prior, frame_factor
 from factors.matches import Alignment
-from sst_graph.association.agreement import Agreement, label_agreement
 from sst_graph.association.nearest import ClassView, match_nearest
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
@@ -126,7 +125,7 @@ def match_frames(
 
 
 def frame_alignments(
-    frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float
+    frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float, max_px: float = np.inf
 ) -> list[tuple[MatchFrame, list[Alignment]]]:
     """Fresh matches of every frame that has any.
 
@@ -135,7 +134,10 @@ def frame_alignments(
     """
     found = []
     for frame in frames:
-        matches = [match_nearest(v, at.cTl, at.offset_s, frame.c_twist, pixel_weight) for v in frame.views]
+        matches = [
+            match_nearest(view, at.cTl, at.offset_s, frame.c_twist, pixel_weight, max_px=max_px)
+            for view in frame.views
+        ]
         alignments = [a for match in matches if match is not None for a in match.alignments]
         if alignments:
             found.append((frame, alignments))
@@ -151,18 +153,20 @@ def step_once(
     beta: gtsam.CustomFactor | None = None,
     *,
     delay_free: bool = False,
+    max_px: float = np.inf,
 ) -> Calibration:
     """Match at ``at``, then one Levenberg-Marquardt step.
 
     Args:
         beta: regularizer of the extrinsic (key :data:`EXTRINSIC`).
         delay_free: whether the time offset moves too.
+        max_px: points farther than this from their pixel are left out [px].
 
     Raises:
         EstimationError: no point of any frame falls on its image.
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for frame, alignments in frame_alignments(frames, at, pixel_weight):
+    for frame, alignments in frame_alignments(frames, at, pixel_weight, max_px):
         graph.add(frame_factor(alignments, EXTRINSIC, DELAY if delay_free else at.offset_s, frame.c_twist))
     values.insert(EXTRINSIC, at.cTl)
     if beta is not None:
@@ -184,7 +188,9 @@ def _single_step() -> gtsam.LevenbergMarquardtParams:
     return params
 
 
-def frozen_covariance(frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float) -> FloatArray:
+def frozen_covariance(
+    frames: Sequence[MatchFrame], at: Calibration, pixel_weight: float, max_px: float = np.inf
+) -> FloatArray:
     """(7, 7) covariance as if the matches were certain and independent, scaled by their mean square.
 
     Too sure: neighbouring matches err together, and interior points claim half a pixel.
@@ -192,37 +198,20 @@ def frozen_covariance(frames: Sequence[MatchFrame], at: Calibration, pixel_weigh
     Raises:
         EstimationError: no point of any frame falls on its image.
     """
-    matched = frame_alignments(frames, at, pixel_weight)
+    matched = frame_alignments(frames, at, pixel_weight, max_px)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(EXTRINSIC, at.cTl)
     values.insert(DELAY, np.array([at.offset_s]))
     fitted = gtsam.NonlinearFactorGraph()
     for frame, alignments in matched:
         fitted.add(frame_factor(alignments, EXTRINSIC, DELAY, frame.c_twist))
-    rows = sum(2.0 * len(a) * a.weight for _, alignments in matched for a in alignments)
+    rows = sum(2.0 * float(np.sum(a.weights)) for _, alignments in matched for a in alignments)
     mean_square = max(2.0 * fitted.error(values) / rows, 1e-6)
     for frame, alignments in matched:
-        scaled = [replace(a, weight=a.weight / mean_square) for a in alignments]
+        scaled = [replace(a, weights=np.asarray(a.weights) / mean_square) for a in alignments]
         graph.add(frame_factor(scaled, EXTRINSIC, DELAY, frame.c_twist))
     graph.add(delay_prior(DELAY, at.offset_s, DELAY_SIGMA_S))
     rest = gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, at.cTl, rest))
     covariance = marginal_covariance(graph, values, Unknowns((EXTRINSIC, DELAY)))
     return 0.5 * (covariance + covariance.T)
-
-
-def agreement(
-    frames: Sequence[MatchFrame],
-    drives: Sequence[Drive],
-    classes: Sequence[SemanticClass],
-    at: Calibration,
-) -> Agreement:
-    """Agreement of all kept points with the masks under a calibration."""
-    total = Agreement()
-    for frame in frames:
-        pair = frame.pair
-        taus_s = at.offset_s + pair.base_tau_s
-        moved = move_points(at.cTl, pair.scan.lPs.T, taus_s, frame.c_twist, np.zeros(6), "translation")
-        uvs = drives[pair.drive].camera.project(moved.cPs.T)
-        total += label_agreement(uvs, pair.scan.classes, pair.image.mask, classes)
-    return total

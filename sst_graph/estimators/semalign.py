@@ -75,10 +75,10 @@ def solve_semalign(
             progress("sampled starts", done, len(still.frames))
     at = Calibration(poses[int(scores.argmin())], guess.offset_s)
     for iteration in range(config.iterations):
-        at = step_once(still.frames, at, 0.0)
+        at = step_once(still.frames, at, 0.0, max_px=config.truncation_px)
         if progress is not None:
             progress("points to pixels", iteration + 1, config.iterations)
-    covariance = frozen_covariance(still.frames, at, 0.0)
+    covariance = frozen_covariance(still.frames, at, 0.0, config.truncation_px)
     best = float(scores.min()) / len(still.frames)
     return NearestSolution(at, covariance, still.frames, still.reasons, {"best_start_px": best})
 
