@@ -31,7 +31,15 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
     )
-    for add in (_add_demo, _add_simulate, _add_calibrate, _add_evaluate, _add_overlay, _add_export):
+    for add in (
+        _add_demo,
+        _add_simulate,
+        _add_calibrate,
+        _add_evaluate,
+        _add_overlay,
+        _add_export,
+        _add_experiment,
+    ):
         command = add(commands)
         command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
     return parser
@@ -84,8 +92,8 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     calibrate.add_argument(
         "--method",
         choices=("joint", "paper", "static", "semalign"),
-        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: its first stage, the "
-        "extrinsic alone; semalign: sampled starts, the extrinsic alone",
+        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: its first stage, "
+        "the extrinsic alone; semalign: sampled starts, the extrinsic alone",
     )
     calibrate.add_argument(
         "--init",
@@ -189,6 +197,21 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
         "--lidar-frame", default="lidar", metavar="NAME", help="the LiDAR's frame (default %(default)s)"
     )
     return export
+
+
+def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "make a table of accuracy on simulated streets, as Markdown"
+    experiment = commands.add_parser("experiment", help=text, description=text)
+    experiment.add_argument(
+        "name", metavar="NAME", help="paper-table: the paper's table; an unknown name lists all"
+    )
+    experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")
+    experiment.add_argument("--seed", type=int, help="seed of the first street")
+    experiment.add_argument("--methods", metavar="A,B", help="methods to compare, such as paper,joint")
+    _add_settings(experiment)
+    experiment.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: the terminal)")
+    experiment.add_argument("--overwrite", action="store_true", help="replace the file")
+    return experiment
 
 
 def _add_source_options(command: argparse.ArgumentParser) -> None:

@@ -1,0 +1,1 @@
+"""Experiments: tables of accuracy, made from seeds by one command each."""

@@ -1,0 +1,47 @@
+"""Every experiment by its name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from sst_graph.errors import ConfigError
+from sst_graph.experiments import paper_table
+from sst_graph.problem.drive import Progress
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An experiment.
+
+    Attributes:
+        summary: what it shows, in a line.
+        config: its default settings, a frozen dataclass.
+        run: makes its Markdown from settings of that class.
+    """
+
+    summary: str
+    config: Any
+    run: Callable[[Any, Progress | None], str]
+
+
+EXPERIMENTS: Mapping[str, Experiment] = {
+    "paper-table": Experiment(
+        "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
+        paper_table.PaperTableConfig(),
+        paper_table.run,
+    ),
+}
+
+
+def experiment(name: str) -> Experiment:
+    """The experiment of a name.
+
+    Raises:
+        ConfigError: there is none; the message names those that there are.
+    """
+    if name not in EXPERIMENTS:
+        known = "; ".join(f"{key} ({value.summary})" for key, value in EXPERIMENTS.items())
+        raise ConfigError(f"experiment '{name}': expected one of {known}")
+    return EXPERIMENTS[name]
