@@ -7,14 +7,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sst_graph.data import open_source
-    from sst_graph.estimators import CalibrationConfig, calibrate
+    from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.result import CalibrationResult
 
-__all__ = ["CalibrationConfig", "CalibrationResult", "calibrate", "open_source"]
+__all__ = [
+    "CalibrationConfig",
+    "CalibrationResult",
+    "TrackUpdate",
+    "Tracker",
+    "TrackerConfig",
+    "calibrate",
+    "open_source",
+]
 
 _HOMES = {
     "CalibrationConfig": "sst_graph.estimators",
     "CalibrationResult": "sst_graph.result",
+    "TrackUpdate": "sst_graph.estimators",
+    "Tracker": "sst_graph.estimators",
+    "TrackerConfig": "sst_graph.estimators",
     "calibrate": "sst_graph.estimators",
     "open_source": "sst_graph.data",
 }

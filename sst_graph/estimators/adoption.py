@@ -1,0 +1,68 @@
+"""Whether a candidate may replace the calibration in use: its covariance and held-out frames must agree."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from factors import alignment_cost
+from factors.robust import RobustKernel
+from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.tracker_config import AdoptionConfig
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import GraphConfig, Tracks, associate
+from sst_graph.types import SemanticClass
+
+
+class Adoption:
+    """The calibration in use, and the gate to it."""
+
+    def __init__(self, config: AdoptionConfig, adopted: Point | None = None) -> None:
+        self.config = config
+        self.adopted = adopted
+        self.costs: deque[tuple[float, float]] = deque(maxlen=config.held_out)
+
+    def restart(self) -> None:
+        """Forget the comparison; the calibration in use stays until a better one has shown itself."""
+        self.costs.clear()
+
+    def compare(self, candidate: float | None, in_use: float | None) -> None:
+        """Held-out costs of one frame: of the candidate made before it, and of the one in use."""
+        if candidate is not None and in_use is not None:
+            self.costs.append((candidate, in_use))
+
+    def offer(self, candidate: Point, trusted: bool) -> bool:
+        """Adopt the candidate if its covariance is within the limits and held-out frames agree."""
+        if not trusted or len(self.costs) < self.config.held_out:
+            return False
+        ours, theirs = np.mean(self.costs, axis=0)
+        if ours > (1.0 + self.config.margin) * theirs:
+            return False
+        self.adopted = candidate
+        return True
+
+
+def held_out_cost(
+    drive: Drive,
+    tracks: Tracks,
+    point: Point,
+    classes: tuple[SemanticClass, ...],
+    kernel: RobustKernel,
+    config: GraphConfig,
+) -> float | None:
+    """Mean robust cost of the boundary points of frames that took no part; None where none can be seen.
+
+    A point that finds no contour costs as much as the farthest match.
+    """
+    pairs = associate([drive], tracks, point.state(classes), kernel, config)
+    worst = float(kernel.loss(config.match.gate * kernel.scale))
+    cost, count = 0.0, 0
+    for pair in pairs:
+        total = sum(len(b) for b in drive.scans[pair.pair.scan].boundaries.values())
+        count += total
+        cost += worst * (total - len(pair))
+        for c, matches in pair.matches.items():
+            bias = float(point.biases_px[classes.index(c)])
+            cost += alignment_cost(matches.alignment, point.cTl, point.offset_s, pair.motion.c_twist, bias)
+    return cost / count if count else None

@@ -1,0 +1,373 @@
+"""Calibration frame by frame: :class:`Tracker`."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections import deque
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from factors.errors import FactorError
+from factors.robust import RobustKernel
+from sst_graph.errors import DataError, EstimationError
+from sst_graph.estimators.adoption import Adoption, held_out_cost
+from sst_graph.estimators.alarm import StepAlarm
+from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.history import History, HistoryEntry
+from sst_graph.estimators.scores import PairScore, score_pair, with_share
+from sst_graph.estimators.smoother import Entry, WindowSmoother
+from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
+from sst_graph.estimators.tracker_config import TrackerConfig
+from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
+from sst_graph.estimators.window import Window
+from sst_graph.odometry.lidar import LidarOdometry
+from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
+from sst_graph.problem.graph import PairMatches, Tracks, associate
+from sst_graph.result import WeakDirection
+from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
+from sst_graph.uncertainty.observability import weak_directions
+
+_LOG = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+Found = dict[int, tuple[PairMatches, PairScore, int]]
+
+_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""Of an estimate that does not exist yet [rad, m, s]."""
+
+
+class Tracker:
+    """Extrinsic and time offset of one LiDAR and one camera, frame by frame.
+
+    Frames, or scans and images on their own, come in the order of their stamps (images may come a little
+    late). Nothing that a frame brings raises: a frame that cannot be used leaves the estimate as it was,
+    and the answer says why.
+    """
+
+    def __init__(
+        self,
+        camera: PinholeCamera,
+        config: TrackerConfig | None = None,
+        initial: gtsam.Pose3 | None = None,
+        initial_offset_s: float = 0.0,
+    ) -> None:
+        """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
+        self.camera = camera
+        self.config = config or TrackerConfig()
+        calibration = self.config.calibration
+        self.classes = calibration.classes
+        self.kernel = RobustKernel("geman_mcclure", calibration.joint.kernel_px[-1])
+        self.window = Window(camera, self.config.window)
+        self.odometry = LidarOdometry(calibration.prepare.lidar_odometry)
+        self.last_scan: Scan | None = None
+        self.guess = Guess(initial, initial_offset_s, calibration.start.enabled)
+        self.smoother: WindowSmoother | None = None
+        self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
+        self.alarm = StepAlarm(self.config.alarm)
+        self.adoption = Adoption(self.config.adoption)
+        self.history_store = History(self.config.drift.history)
+        self.entered: deque[int] = deque(maxlen=4 * self.config.window)
+        self.alarmed = False
+        self.attempts = 0
+        self.waited = 0
+        self._inflation = 1.0
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate beyond the guess."""
+        return self.smoother is not None
+
+    @property
+    def point(self) -> Point:
+        """The present estimate, or the guess."""
+        if self.smoother is not None:
+            return self.smoother.point
+        biases = np.zeros(len(self.classes))
+        return Point(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, biases)
+
+    @property
+    def adopted(self) -> Point | None:
+        """The calibration in use: the last candidate that its covariance and held-out frames spoke for."""
+        return self.adoption.adopted
+
+    def add(self, frame: Frame) -> TrackUpdate:
+        """Take in a frame; its image, or its scan, may be missing."""
+        if frame.image is None and frame.scan is None:
+            return self._answer(0, "a frame without scan and without image")
+        reason = ""
+        if frame.image is not None:
+            update = self.add_image(frame.image)
+            if frame.scan is None:
+                return update
+            reason = update.reason
+        assert frame.scan is not None
+        update = self.add_scan(frame.scan)
+        if reason and update.accepted:
+            return dataclasses.replace(update, accepted=False, reason=reason)
+        return update
+
+    def add_image(self, image: CameraImage) -> TrackUpdate:
+        """Take in an image; it is used as soon as a scan close to it in true time is there."""
+        try:
+            self._check_image(image)
+            self.window.add_image(image_features(len(self.window.images), image, self.classes))
+        except (DataError, FactorError, ValueError) as error:
+            return self._answer(image.stamp_ns, str(error))
+        return self._answer(image.stamp_ns)
+
+    def add_scan(self, scan: Scan) -> TrackUpdate:
+        """Take in a scan, match it and whatever of the window is to be renewed, and estimate."""
+        try:
+            number = self._take_scan(scan)
+        except (DataError, FactorError, ValueError, RuntimeError) as error:
+            return self._answer(scan.stamp_ns, str(error))
+        try:
+            if self.smoother is None:
+                return self._start(scan.stamp_ns)
+            return self._track(scan.stamp_ns, number)
+        except (EstimationError, FactorError, ValueError, RuntimeError) as error:
+            return self._answer(scan.stamp_ns, " ".join(str(error).split()))
+
+    def history(self) -> list[HistoryEntry]:
+        """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
+        if self.smoother is None:
+            return []
+        return self.history_store.smoothed(self.smoother)
+
+    def _check_image(self, image: CameraImage) -> None:
+        expected = (self.camera.height, self.camera.width)
+        if image.mask.shape != expected:
+            raise DataError("tracker", f"a mask of {image.mask.shape}", f"{expected}, the camera's size")
+        newest = self.window.last_stamp_ns
+        if newest is not None and self.window.images:
+            true_ns = image.stamp_ns + round(self.point.offset_s * 1e9)
+            late = (newest - true_ns) * 1e-9
+            if late > self.config.late_s and image.stamp_ns < self.window.images[-1].stamp_ns:
+                raise DataError(
+                    "tracker",
+                    f"an image {late:.2f} s behind the newest scan",
+                    f"at most {self.config.late_s:g} s",
+                )
+
+    def _take_scan(self, scan: Scan) -> int:
+        """Features and motion of a scan into the window; its number."""
+        if not np.isfinite(scan.points).all():
+            raise DataError("tracker", "points that are NaN or inf", "finite points")
+        if len(scan.points) != len(scan.classes):
+            raise DataError("tracker", f"{len(scan.classes)} labels", f"{len(scan.points)}, one a point")
+        newest = self.window.last_stamp_ns
+        if newest is not None and scan.stamp_ns <= newest:
+            raise DataError("tracker", f"a scan of stamp {scan.stamp_ns} ns", f"one after {newest} ns")
+        prepare = self.config.calibration.prepare
+        features = scan_features(self.window.next_scan, scan, self.classes, prepare)
+        motion = self.odometry.add(scan)
+        self.last_scan = scan
+        return self.keep_scan(features, motion)
+
+    def keep_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
+        """Put prepared features of a scan into the window; its number."""
+        number = self.window.add_scan(features, motion)
+        oldest = self.window.scans[0][1].stamp_ns
+        margin = round((self.config.late_s + max(0.0, self.point.offset_s)) * 1e9)
+        if not self.started:
+            margin += 10**9
+        self.window.forget_images(oldest - margin)
+        return number
+
+    def _start(self, stamp_ns: int) -> TrackUpdate:
+        """Try the first batch solution where enough has been seen."""
+        config = self.config
+        self.waited += 1
+        needed = config.restart_scans if self.alarmed else config.start_scans
+        if self.waited < needed or self.waited % max(1, needed // 2) or not self.window.images:
+            return self._answer(stamp_ns, "collecting frames for a start")
+        drive, _ = self.window.drive()
+        try:
+            point = first_estimate(drive, self.guess, config)
+        except (EstimationError, FactorError, RuntimeError, np.linalg.LinAlgError) as error:
+            self.attempts += 1
+            if self.attempts >= config.start_attempts:
+                # The last estimate leads nowhere: look all around it.
+                self.guess = Guess(self.guess.cTl, self.guess.offset_s)
+            return self._answer(stamp_ns, f"no start yet: {error}")
+        calibration = config.calibration
+        start_ns = drive.scans[0].stamp_ns
+        prior = prior_belief(point, self.classes, calibration.joint.graph)
+        smoother = WindowSmoother(prior, start_ns, self.classes, calibration.joint.graph, config.drift)
+        found, _ = self.match(point, drive=None)
+        smoother.update(found, set(), self.window.first_scan)
+        self.covariance = smoother.covariance()[0]
+        self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
+        self.alarm.restart()
+        self.adoption.restart()
+        self.entered.extend(found)
+        _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
+        return self._answer(stamp_ns)
+
+    def _track(self, stamp_ns: int, number: int) -> TrackUpdate:
+        """One frame of the running tracker."""
+        smoother = self.smoother
+        assert smoother is not None
+        before = smoother.point
+        # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
+        chosen = self._to_match(number, smoother)
+        found, missing = self.match(before, drive=chosen)
+        new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
+        # 2. New frames, before they are used, against the estimate and against the calibration in use.
+        chi2 = self._watch(new, before)
+        if self.alarm.alarm:
+            return self._change(stamp_ns, chi2)
+        self._compare(new, before)
+        # 3. The graph takes all in, or nothing.
+        first = self.window.first_scan
+        if new or not missing <= {number}:
+            smoother.update(found, missing, first)
+        self.entered.extend(new)
+        covariance, naive = smoother.covariance()
+        if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()):
+            raise EstimationError("a covariance that is not finite")
+        self.covariance = covariance
+        self._inflation = max(1.0, float(np.trace(np.linalg.solve(naive, covariance)) / len(naive)))
+        # 4. A candidate that shows itself is adopted.
+        self.history_store.take(smoother)
+        reason = "" if new else "no match: no scan met an image that shows the same objects"
+        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new))
+
+    def _to_match(self, number: int, smoother: WindowSmoother) -> set[int]:
+        """Scans to match: the newest, those still without a pair, the oldest, and some in turn."""
+        numbers = [n for n, _ in self.window.scans]
+        waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
+        staleness = {n: self._stale(entry) for n, entry in smoother.entries.items()}
+        known = sorted(staleness, key=lambda n: -staleness[n])
+        stale = sum(value > self.config.stale_sigmas for value in staleness.values())
+        some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
+        return {number, *waiting[-4:], *numbers[:1], *some} | (set(numbers[-2:]) & set(known))
+
+    def _stale(self, entry: Entry) -> float:
+        """How far the estimate has moved since an entry was matched, in standard deviations."""
+        step = entry.score.belief.point.local(self.point)
+        return float(np.sqrt(max(0.0, step @ np.linalg.solve(self.covariance, step))))
+
+    def settle(self, most: int = 20) -> bool:
+        """Match the whole window again until the estimate rests, as at the end of a drive.
+
+        Returns:
+            Whether it rests: the last step was below 0.02 standard deviations.
+        """
+        smoother = self.smoother
+        if smoother is None:
+            return False
+        for _ in range(most):
+            before = smoother.point
+            found, missing = self.match(before, drive=None)
+            try:
+                smoother.update({k: v for k, v in found.items() if k in smoother.entries}, missing, 0)
+                self.covariance = smoother.covariance()[0]
+            except EstimationError as error:
+                _LOG.warning("tracker: not settled: %s", error)
+                return False
+            step = before.local(smoother.point)
+            if step @ np.linalg.solve(self.covariance, step) < 0.02**2:
+                return True
+        return False
+
+    def match(self, point: Point, drive: set[int] | None) -> tuple[Found, set[int]]:
+        """Matches of some scans of the window (None: all) at a point, and the scans that have none."""
+        part, numbers = self.window.drive(None if drive is None else drive.__contains__)
+        config = self.config.calibration.joint.graph
+        pairs = associate([part], Tracks([part]), point.state(self.classes), self.kernel, config)
+        found: Found = {}
+        for pair in pairs:
+            if len(pair) < self.config.min_frame_matches:
+                continue
+            number = numbers[pair.pair.scan]
+            if self._share < 1.0:
+                pair = with_share(pair, self._share)
+            tracks = self.window.tracks[number]
+            score = score_pair(pair, point, self.classes, tracks, config, self._share)
+            found[number] = (pair, score, part.scans[pair.pair.scan].stamp_ns)
+        return found, set(numbers) - set(found)
+
+    @property
+    def _share(self) -> float:
+        """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
+        return 1.0 / self._inflation if self.config.drift.enabled else 1.0
+
+    def _watch(self, new: list[int], before: Point) -> float | None:
+        """The change test on new frames, under its wide kernel."""
+        if not new or not self.config.alarm.enabled or self.smoother is None:
+            return None
+        part, numbers = self.window.drive(set(new).__contains__)
+        kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
+        config = self.config.calibration.joint.graph
+        pairs = associate([part], Tracks([part]), before.state(self.classes), kernel, config)
+        tracks = self.window.tracks
+        scores = [
+            score_pair(pair, before, self.classes, tracks[numbers[pair.pair.scan]], config) for pair in pairs
+        ]
+        return self.alarm.check(scores, self.covariance, self.smoother.model)
+
+    def _compare(self, new: list[int], before: Point) -> None:
+        """Held-out costs of the new frames."""
+        if not new or self.smoother is None:
+            return
+        part, _ = self.window.drive(set(new).__contains__)
+        config = self.config.calibration.joint.graph
+        in_use = self.adoption.adopted or self._guess_point()
+        tracks = Tracks([part])
+        candidate = held_out_cost(part, tracks, before, self.classes, self.kernel, config)
+        other = candidate
+        if in_use is not None and float(np.abs(before.local(in_use)).max()) > 0.0:
+            other = held_out_cost(part, tracks, in_use, self.classes, self.kernel, config)
+        self.adoption.compare(candidate, other)
+
+    def _guess_point(self) -> Point | None:
+        if self.guess.cTl is None:
+            return None
+        return Point(self.guess.cTl, self.guess.offset_s, np.zeros(len(self.classes)))
+
+    def _change(self, stamp_ns: int, chi2: float | None) -> TrackUpdate:
+        """The calibration has changed: begin again from the frames since, near the last estimate."""
+        point = self.point
+        _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
+        self.guess = Guess(point.cTl, point.offset_s, search=False)
+        self.smoother, self.alarmed = None, True
+        self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
+        self.window.keep_scans(self.config.alarm.frames + self.config.alarm.confirmations - 1)
+        self.waited = len(self.window.scans)
+        self.entered.clear()
+        self.history_store.cut()
+        self.alarm.restart()
+        self.adoption.restart()
+        return dataclasses.replace(
+            self._answer(stamp_ns, "the calibration has changed", chi2=chi2), alarm=True
+        )
+
+    def _answer(
+        self, stamp_ns: int, reason: str = "", *, chi2: float | None = None, offer: bool = False
+    ) -> TrackUpdate:
+        point, covariance = self.point, self.covariance[:7, :7]
+        status: TrackStatus = "alarm" if self.alarmed else "starting"
+        weak: tuple[WeakDirection, ...] = ()
+        if self.smoother is not None:
+            weak = weak_directions(covariance, point.cTl, self.config.calibration.observability)
+            status = "unobservable" if weak else "ok"
+        return TrackUpdate(
+            stamp_ns=stamp_ns,
+            T_camera_lidar=point.cTl,
+            time_offset_s=point.offset_s,
+            covariance=covariance.copy(),
+            status=status,
+            accepted=not reason,
+            reason=reason,
+            matches=0
+            if self.smoother is None
+            else sum(e.score.matches for e in self.smoother.entries.values()),
+            chi2=chi2,
+            adopted=offer and self.adoption.offer(point, status == "ok"),
+            weak_directions=weak,
+        )

@@ -1,0 +1,74 @@
+"""What the tracker answers to each frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.result import WeakDirection
+
+FloatArray = NDArray[np.float64]
+TrackStatus = Literal["starting", "ok", "unobservable", "alarm"]
+
+
+@dataclass(frozen=True)
+class TrackUpdate:
+    """The estimate after a frame. Signs and order: :mod:`factors`.
+
+    Attributes:
+        stamp_ns: of the scan or image that was added.
+        T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
+        time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
+        covariance: (7, 7) cluster-robust.
+        status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
+            converged again; else whether the limits of observability are met.
+        accepted: the frame was taken into the estimate; else ``reason`` says why not.
+        reason: why the frame was not accepted; empty where it was.
+        matches: silhouette matches in the window.
+        chi2: statistic of the change test, over its usual size, or None where it can't be told.
+        alarm: this frame raised the alarm: the calibration has changed.
+        adopted: the estimate is the calibration in use from now on.
+        weak_directions: what is known worse than the limits.
+    """
+
+    stamp_ns: int
+    T_camera_lidar: gtsam.Pose3
+    time_offset_s: float
+    covariance: FloatArray
+    status: TrackStatus
+    accepted: bool
+    reason: str = ""
+    matches: int = 0
+    chi2: float | None = None
+    alarm: bool = False
+    adopted: bool = False
+    weak_directions: tuple[WeakDirection, ...] = ()
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(7,) standard deviations [rad, m, s]."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """As one line of strict JSON; degrees nowhere, units in the names."""
+        sigmas = self.sigmas.tolist()
+        return {
+            "stamp_ns": self.stamp_ns,
+            "T_camera_lidar": self.T_camera_lidar.matrix().tolist(),
+            "time_offset_s": self.time_offset_s,
+            "sigma_rotation_rad": sigmas[:3],
+            "sigma_translation_m": sigmas[3:6],
+            "sigma_time_offset_s": sigmas[6],
+            "status": self.status,
+            "accepted": self.accepted,
+            "reason": self.reason,
+            "matches": self.matches,
+            "chi2": self.chi2,
+            "alarm": self.alarm,
+            "adopted": self.adopted,
+            "weak": [weak.sentence for weak in self.weak_directions],
+        }

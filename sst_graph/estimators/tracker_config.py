@@ -1,0 +1,127 @@
+"""Settings of the online tracker."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from sst_graph.estimators.config import CalibrationConfig
+
+
+@dataclass(frozen=True)
+class DriftConfig:
+    """Extrinsic and time offset as random walks.
+
+    Attributes:
+        enabled: False: one calibration for all time (until an alarm).
+        epoch_s: one calibration is estimated for each epoch of this length [s].
+        rotation_deg: of the walk, each axis [deg / sqrt(s)].
+        translation_m: of the walk, each axis [m / sqrt(s)].
+        offset_s: of the walk [s / sqrt(s)].
+        history: most epochs kept for smoothing; older ones are forgotten.
+    """
+
+    enabled: bool = False
+    epoch_s: float = 1.0
+    rotation_deg: float = 0.005
+    translation_m: float = 0.0005
+    offset_s: float = 0.0001
+    history: int = 5000
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "epoch_s", "rotation_deg", "translation_m", "offset_s", "history")
+
+
+@dataclass(frozen=True)
+class AlarmConfig:
+    """When the calibration counts as changed.
+
+    Attributes:
+        enabled: watch at all.
+        kernel_px: scale of the kernel under which a new frame is compared with the estimate, wide enough
+            for a step to stay in sight [px].
+        frames: new frames that are compared together.
+        chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
+        confirmations: frames in a row past the threshold.
+        baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
+            than any model says.
+        warm_up: frames after the start (or a restart) before anything is called an alarm.
+    """
+
+    enabled: bool = True
+    kernel_px: float = 12.0
+    frames: int = 4
+    chi2: float = 60.0
+    confirmations: int = 3
+    baseline: int = 300
+    warm_up: int = 15
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "baseline")
+
+
+@dataclass(frozen=True)
+class AdoptionConfig:
+    """When a candidate may replace the calibration in use.
+
+    Attributes:
+        held_out: frames, not yet used by the candidate, on which both are compared.
+        margin: the candidate's held-out cost may exceed that of the one in use by this fraction.
+    """
+
+    held_out: int = 10
+    margin: float = 0.02
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "held_out")
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """What the tracker does with each frame.
+
+    Attributes:
+        calibration: classes, preparation, start, matches and limits, as for ``calibrate``.
+        window: scans whose matches are renewed.
+        renew: scans of the window matched anew at each frame, besides the newest.
+        renew_most: as many while the estimate moves.
+        stale_sigmas: a match is stale where the estimate has moved farther since, in standard deviations.
+        start_scans: scans before the first batch solution is tried, and between attempts.
+        restart_scans: the same after an alarm.
+        start_attempts: failed attempts near the last estimate after an alarm before the search begins anew.
+        start_share: least share of the pairs that the first solution must still match.
+        start_gain: by which fraction of the cost a start whose time offset was searched must be better.
+        start_offset_step_s: damping of the time offset in the first solution, a step's prior deviation [s].
+        min_frame_matches: fewest matches of a scan that enters the graph.
+        late_s: images that come later than this behind the newest scan, in true time, are refused [s].
+        drift: random walks.
+        alarm: steps.
+        adoption: held-out check.
+    """
+
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+    window: int = 60
+    renew: int = 2
+    renew_most: int = 12
+    stale_sigmas: float = 0.1
+    start_scans: int = 12
+    restart_scans: int = 8
+    start_attempts: int = 4
+    start_share: float = 0.7
+    start_gain: float = 0.1
+    start_offset_step_s: float = 0.005
+    min_frame_matches: int = 8
+    late_s: float = 1.5
+    drift: DriftConfig = field(default_factory=DriftConfig)
+    alarm: AlarmConfig = field(default_factory=AlarmConfig)
+    adoption: AdoptionConfig = field(default_factory=AdoptionConfig)
+
+    def __post_init__(self) -> None:
+        _require_positive(self, "window", "start_scans", "restart_scans", "min_frame_matches", "late_s")
+        if self.window < max(self.start_scans, self.restart_scans):
+            raise ValueError(f"window {self.window}: expected at least start_scans and restart_scans")
+
+
+def _require_positive(config: object, *names: str) -> None:
+    for name in names:
+        if getattr(config, name) <= 0:
+            raise ValueError(f"{name} {getattr(config, name)}: expected a value above 0")

@@ -1,0 +1,124 @@
+"""The tracker's first estimate: a short batch over the window."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from factors.robust import RobustKernel
+from sst_graph.association.pairing import pair_by_time
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.adoption import held_out_cost
+from sst_graph.estimators.gaussian import Gaussian, Point
+from sst_graph.estimators.joint import solve_joint
+from sst_graph.estimators.start import find_start, rivals
+from sst_graph.estimators.tracker_config import TrackerConfig
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import GraphConfig, Tracks
+from sst_graph.problem.state import State
+from sst_graph.types import SemanticClass
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a start begins.
+
+    Attributes:
+        cTl: rough extrinsic, or None where nothing is known.
+        offset_s: rough time offset [s].
+        search: search around the guess; False trusts it to within a degree or two.
+    """
+
+    cTl: gtsam.Pose3 | None
+    offset_s: float
+    search: bool = True
+
+
+def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
+    """The batch solution of the window.
+
+    A short stretch of driving at one speed does not tell the time offset. So the offset stays with the
+    guess unless the labels clearly say otherwise: a solution whose search left the offset free must
+    explain them better by ``start_gain``, and within a solution a step of the offset is damped.
+
+    Raises:
+        EstimationError: too little to see, an ambiguous start, or a solution that did not settle.
+    """
+    reach = config.calibration.start.search.delay_s
+    solved: list[tuple[float, Point]] = []
+    reasons = []
+    for delay_s in (0.0, reach) if guess.search and reach > 0.0 else (0.0,):
+        try:
+            point = _solution(drive, guess, config, delay_s)
+        except EstimationError as error:
+            reasons.append(str(error))
+            continue
+        solved.append((_cost(drive, point, config), point))
+    if not solved:
+        raise EstimationError(reasons[-1])
+    (best, point), *others = solved
+    for cost, other in others:
+        if cost < (1.0 - config.start_gain) * best:
+            best, point = cost, other
+    return point
+
+
+def _solution(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Point:
+    """Search with offsets within ``delay_s`` of the guess's, then the joint method with a damped offset."""
+    calibration = config.calibration
+    search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
+    enabled = guess.search or guess.cTl is None
+    start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    candidates = find_start([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, start)
+    others = rivals(candidates, start)
+    if others:
+        raise EstimationError(
+            f"another pose explains the labels almost as well (score {others[0].score:.3f} "
+            f"against {candidates[0].score:.3f})"
+        )
+    best = candidates[0]
+    graph = dataclasses.replace(calibration.joint.graph, delay_sigma_s=config.start_offset_step_s)
+    joint = dataclasses.replace(calibration.joint, graph=graph)
+    solution = solve_joint([drive], State(best.cTl, (best.offset_s,)), joint)
+    if not solution.converged:
+        raise EstimationError(f"the first solution still moved after {solution.outer_iterations} iterations")
+    _check_pairs(drive, best.offset_s, len(solution.pairs), solution.state.offset_s(0), config)
+    state = solution.state
+    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
+    return Point(state.cTl, state.offset_s(0), np.array(biases))
+
+
+def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
+    """Mean cost of all boundary points of the window."""
+    joint, classes = config.calibration.joint, config.calibration.classes
+    kernel = RobustKernel("geman_mcclure", joint.kernel_px[-1])
+    cost = held_out_cost(drive, Tracks([drive]), point, classes, kernel, joint.graph)
+    if cost is None:
+        raise EstimationError("no boundary point meets an image")
+    return cost
+
+
+def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, config: TrackerConfig) -> None:
+    """Refuse a solution that has run off in time: it leaves pairs behind, or the searched offsets."""
+    limit = config.calibration.joint.graph.max_interval_periods * drive.image_period_s
+    seen = [
+        pair
+        for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, limit)
+        if drive.scans[pair.scan].boundaries and drive.images[pair.image].contours
+    ]
+    if pairs < config.start_share * len(seen):
+        raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
+    reach = config.calibration.start.search.delay_s
+    if abs(offset_s - start_s) > reach:
+        raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
+
+
+def prior_belief(point: Point, classes: tuple[SemanticClass, ...], config: GraphConfig) -> Gaussian:
+    """The batch's own priors, at a point: wide on the calibration, biases around 0."""
+    sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
+    information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * len(classes)]))
+    toward = np.concatenate([np.zeros(7), -point.biases_px])
+    return Gaussian(point, information, information @ toward)
