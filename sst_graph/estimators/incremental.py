@@ -241,8 +241,8 @@ class Tracker:
         """Scans to match: the newest, those still without a pair, the oldest, and some in turn."""
         numbers = [n for n, _ in self.window.scans]
         waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
-        staleness = {n: self._stale(entry) for n, entry in smoother.entries.items()}
-        known = sorted(staleness, key=lambda n: -staleness[n])
+        staleness: dict[int, float] = {n: self._stale(entry) for n, entry in smoother.entries.items()}
+        known = sorted(staleness, key=staleness.__getitem__, reverse=True)
         stale = sum(value > self.config.stale_sigmas for value in staleness.values())
         some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
         return {number, *waiting[-4:], *numbers[:1], *some} | (set(numbers[-2:]) & set(known))
@@ -250,7 +250,8 @@ class Tracker:
     def _stale(self, entry: Entry) -> float:
         """How far the estimate has moved since an entry was matched, in standard deviations."""
         step = entry.score.belief.point.local(self.point)
-        return float(np.sqrt(max(0.0, step @ np.linalg.solve(self.covariance, step))))
+        distance: float = step @ np.linalg.solve(self.covariance, step)
+        return float(np.sqrt(max(0.0, distance)))
 
     def settle(self, most: int = 20) -> bool:
         """Match the whole window again until the estimate rests, as at the end of a drive.
