@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.answer import Answer, Guess
 from sst_graph.estimators.challenge import challenge
@@ -72,13 +74,29 @@ def _judged(
     return Answer(
         at.cTl,
         at.offset_s,
-        solution.covariance,
+        solution.covariance + np.outer(solution.creep, solution.creep),
         tuple(frame.id for frame in solution.frames),
-        doubts=tuple(opinion.doubts(config.challenge)),
+        doubts=(*opinion.doubts(config.challenge), *_unfinished(solution, config)),
         remarks=solution.reasons,
         diagnostics={
-            "covariance": "of the frozen matches, taken for independent: too sure",
+            "covariance": "of the frozen matches, too sure, and of the way still to go",
             "scores": {"start": opinion.start, "answer": opinion.answer, "best_nearby": opinion.best},
             **solution.diagnostics,
         },
     )
+
+
+def _unfinished(solution: NearestSolution, config: CalibrationConfig) -> list[str]:
+    """A sentence where the last step, gone on with, would leave what counts as known."""
+    rotation, translation = np.linalg.norm(solution.creep[:3]), np.linalg.norm(solution.creep[3:6])
+    offset, limits = abs(float(solution.creep[6])), config.observability
+    if (
+        np.degrees(rotation) <= limits.rotation_deg
+        and translation <= limits.translation_m
+        and offset <= limits.offset_s
+    ):
+        return []
+    return [
+        f"the last step was still on its way: as many again would make {np.degrees(rotation):.2f} deg, "
+        f"{100 * translation:.1f} cm, {1e3 * offset:.1f} ms"
+    ]

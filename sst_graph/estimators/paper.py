@@ -77,6 +77,8 @@ class NearestSolution:
     Attributes:
         calibration: the estimate.
         covariance: (7, 7) of the frozen matches.
+        creep: (7,) way that the last step would make in as many steps again as its phase had [rad, m, s]:
+            a fixed number of steps may end on the way.
         frames: those that took part, moving as they were taken to.
         reasons: what was missing.
         diagnostics: JSON-able numbers.
@@ -84,6 +86,7 @@ class NearestSolution:
 
     calibration: Calibration
     covariance: FloatArray
+    creep: FloatArray
     frames: tuple[MatchFrame, ...]
     reasons: tuple[str, ...] = ()
     diagnostics: dict[str, object] = field(default_factory=dict)
@@ -120,18 +123,21 @@ def solve_paper(
             "no standing frame shows the classes to both sensors: the static stage needs the vehicle at rest"
         )
     # 2. The static stage.
-    static = _static_stage(still, guess, config, progress)
+    static, static_creep = _static_stage(still, guess, config, progress)
     # 3. The joint stage.
     moving = _moving(pairs, drives, motions, stands, classes, config)
     if not moving:
         covariance = frozen_covariance(still, static, config.static_weights[-1])
         reason = "no moving frame with a known velocity: the joint stage was left out"
-        return NearestSolution(static, covariance, tuple(still), (reason,), {"standing_frames": len(still)})
-    joint, moving = _joint_stage(drives, moving, static, motions, config, odometry, progress)
+        counts: dict[str, object] = {"standing_frames": len(still)}
+        return NearestSolution(static, covariance, static_creep, tuple(still), (reason,), counts)
+    joint, creep, moving = _joint_stage(drives, moving, static, motions, config, odometry, progress)
     # 4. What holds the extrinsic is the standing frames themselves: they stand in beta's place.
     covariance = frozen_covariance([*still, *moving], joint, config.joint_weight)
-    counts: dict[str, object] = {"standing_frames": len(still), "moving_frames": len(moving)}
-    return NearestSolution(joint, covariance, (*still, *moving), (), counts)
+    counts = {"standing_frames": len(still), "moving_frames": len(moving)}
+    # beta holds the extrinsic where the static stage left it: that stage's way is still to go.
+    creep[:6] = static_creep[:6]
+    return NearestSolution(joint, covariance, creep, (*still, *moving), (), counts)
 
 
 def solve_static(
@@ -148,11 +154,10 @@ def solve_static(
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
     still = still_frames(drives, guess, classes, config, odometry)
-    answer = _static_stage(still.frames, guess, config, progress)
+    answer, creep = _static_stage(still.frames, guess, config, progress)
     covariance = frozen_covariance(still.frames, answer, config.static_weights[-1])
-    return NearestSolution(
-        answer, covariance, still.frames, still.reasons, {"standing_frames": len(still.frames)}
-    )
+    counts: dict[str, object] = {"frames": len(still.frames)}
+    return NearestSolution(answer, covariance, creep, still.frames, still.reasons, counts)
 
 
 def still_frames(
@@ -266,15 +271,18 @@ def _moving(
 
 def _static_stage(
     frames: Sequence[MatchFrame], start: Calibration, config: PaperConfig, progress: Progress | None
-) -> Calibration:
-    at, done, total = start, 0, sum(config.static_iterations)
+) -> tuple[Calibration, FloatArray]:
+    """The estimate and its creep."""
+    at, creep = start, np.zeros(7)
+    done, total = 0, sum(config.static_iterations)
     for weight, iterations in zip(config.static_weights, config.static_iterations, strict=True):
         for _ in range(iterations):
-            at = step_once(frames, at, weight)
+            last, at = at, step_once(frames, at, weight)
+            creep = iterations * last.to(at)
             done += 1
             if progress is not None:
                 progress("static stage", done, total)
-    return at
+    return at, creep
 
 
 def _joint_stage(
@@ -285,16 +293,17 @@ def _joint_stage(
     config: PaperConfig,
     odometry: VisualOdometryConfig,
     progress: Progress | None,
-) -> tuple[Calibration, list[MatchFrame]]:
-    """The estimate, and the frames with the velocities that it was made with."""
+) -> tuple[Calibration, FloatArray, list[MatchFrame]]:
+    """The estimate, its creep, and the frames with the velocities that it was made with."""
     beta = beta_regularizer(EXTRINSIC, static.cTl, config.lambda_t, config.lambda_r)
-    at, moving = static, list(frames)
+    at, creep, moving = static, np.zeros(7), list(frames)
     for iteration in range(config.joint_iterations):
         if iteration % config.velocity_every == 0:
             motions = camera_motions(drives, at, motions, odometry)
             moving = [f.moving_at(velocity_at(motions[f.pair.drive], f.pair.image_position)) for f in moving]
-        at = step_once(moving, at, config.joint_weight, beta, delay_free=True)
+        last, at = at, step_once(moving, at, config.joint_weight, beta, delay_free=True)
+        creep = config.joint_iterations * last.to(at)
         if progress is not None:
             progress("joint stage", iteration + 1, config.joint_iterations)
     _LOG.info("paper: offset %.4f s after %d joint iterations", at.offset_s, config.joint_iterations)
-    return at, moving
+    return at, creep, moving

@@ -38,6 +38,11 @@ class Calibration:
     cTl: gtsam.Pose3
     offset_s: float
 
+    def to(self, other: Calibration) -> FloatArray:
+        """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""
+        xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        return np.append(np.asarray(xi, dtype=np.float64), other.offset_s - self.offset_s)
+
 
 @dataclass(frozen=True)
 class FramePair:

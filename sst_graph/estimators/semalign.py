@@ -74,13 +74,16 @@ def solve_semalign(
         if progress is not None:
             progress("sampled starts", done, len(still.frames))
     at = Calibration(poses[int(scores.argmin())], guess.offset_s)
+    creep = np.zeros(7)
     for iteration in range(config.iterations):
-        at = step_once(still.frames, at, 0.0, max_px=config.truncation_px)
+        last, at = at, step_once(still.frames, at, 0.0, max_px=config.truncation_px)
+        creep = config.iterations * last.to(at)
         if progress is not None:
             progress("points to pixels", iteration + 1, config.iterations)
     covariance = frozen_covariance(still.frames, at, 0.0, config.truncation_px)
     best = float(scores.min()) / len(still.frames)
-    return NearestSolution(at, covariance, still.frames, still.reasons, {"best_start_px": best})
+    numbers: dict[str, object] = {"frames": len(still.frames), "best_start_px": best}
+    return NearestSolution(at, covariance, creep, still.frames, still.reasons, numbers)
 
 
 def sampled_poses(guess: gtsam.Pose3, config: SemAlignConfig) -> list[gtsam.Pose3]:
