@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sst_graph.data import open_source
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
+    from sst_graph.problem.align import align_frame
     from sst_graph.result import CalibrationResult
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "TrackUpdate",
     "Tracker",
     "TrackerConfig",
+    "align_frame",
     "calibrate",
     "open_source",
 ]
@@ -26,6 +28,7 @@ _HOMES = {
     "TrackUpdate": "sst_graph.estimators",
     "Tracker": "sst_graph.estimators",
     "TrackerConfig": "sst_graph.estimators",
+    "align_frame": "sst_graph.problem.align",
     "calibrate": "sst_graph.estimators",
     "open_source": "sst_graph.data",
 }
