@@ -91,11 +91,8 @@ def align_frame(
     """
     if (lTs is None) != (from_ns is None):
         raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
-    twist = _twist("l_twist", l_twist)
-    acceleration = _twist("l_acceleration", np.zeros(6) if l_acceleration is None else l_acceleration)
     points = scan_features(0, scan, classes, PrepareConfig()) if isinstance(scan, Scan) else scan
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
-    Ad = np.asarray(cTl.AdjointMap())
     found = match_silhouettes(
         {c: boundaries for c, boundaries in points.boundaries.items() if c in classes},
         contours.contours,
@@ -103,12 +100,18 @@ def align_frame(
         cTl if lTs is None else cTl * lTs,
         offset_s,
         (contours.stamp_ns - (points.stamp_ns if from_ns is None else from_ns)) * 1e-9,
-        Motion(Ad @ twist, Ad @ acceleration),
+        _camera_motion(cTl, l_twist, l_acceleration),
         biases_px or {},
         kernel,
         config,
     )
     return FrameAlignments(tuple(found), tuple(matches.alignment for matches in found.values()))
+
+
+def _camera_motion(cTl: gtsam.Pose3, l_twist: ArrayLike, l_acceleration: ArrayLike | None) -> Motion:
+    Ad = np.asarray(cTl.AdjointMap())
+    acceleration = np.zeros(6) if l_acceleration is None else _twist("l_acceleration", l_acceleration)
+    return Motion(Ad @ _twist("l_twist", l_twist), Ad @ acceleration)
 
 
 def _twist(name: str, value: ArrayLike) -> FloatArray:

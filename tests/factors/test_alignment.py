@@ -80,6 +80,7 @@ def test_cost_is_the_sum_of_one_factor_a_match(make_scene):
             base_taus_s=alignment.base_taus_s[[i]],
             pixels=alignment.pixels[[i]],
             sigmas_px=alignment.sigmas_px[[i]],
+            weights=alignment.weights[[i]],
         )
         factor = point_to_pixel_factor(single, E, D, V)
         error += factor.error(values)

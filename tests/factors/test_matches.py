@@ -30,7 +30,7 @@ GOOD = {
         ("normals", np.ones((4, 2)), "1.41"),
         ("c_acceleration", np.zeros(3), r"\(3,\)"),
         ("motion_model", "se2", "se2"),
-        ("weight", -1.0, "-1"),
+        ("weights", -1.0, "-1"),
     ],
 )
 def test_says_what_is_wrong(name, value, found):
