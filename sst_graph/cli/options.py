@@ -35,6 +35,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_demo,
         _add_simulate,
         _add_calibrate,
+        _add_track,
         _add_evaluate,
         _add_overlay,
         _add_export,
@@ -118,6 +119,33 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
+
+
+def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "calibrate frame by frame: one line of JSON a frame on stdout"
+    track = commands.add_parser("track", help=text, description=text)
+    track.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder")
+    _add_source_options(track)
+    track.add_argument(
+        "--init",
+        metavar="dataset|none|FILE",
+        default="dataset",
+        help="start: the data's nominal calibration (default), no guess at all, or a file",
+    )
+    track.add_argument("--classes", metavar="vehicle|all|A,B", help="classes to align")
+    _add_settings(track)
+    track.add_argument("--checkpoint", type=Path, metavar="FILE", help="save the tracker here as it goes")
+    track.add_argument(
+        "--checkpoint-every", type=int, default=50, metavar="N", help="frames between saves (default 50)"
+    )
+    track.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on from the checkpoint, if it is there, with the frames after it",
+    )
+    track.add_argument("--out", type=Path, metavar="FILE", help="write the last estimate as calibration.json")
+    track.add_argument("--overwrite", action="store_true", help="replace the checkpoint and the result")
+    return track
 
 
 def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

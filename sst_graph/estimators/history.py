@@ -11,8 +11,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.estimators.epochs import RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, scaled_inverse
-from sst_graph.estimators.smoother import RetiredEpoch, WindowSmoother
+from sst_graph.estimators.smoother import WindowSmoother
 
 FloatArray = NDArray[np.float64]
 

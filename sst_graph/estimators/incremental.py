@@ -16,10 +16,11 @@ from factors.robust import RobustKernel
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.adoption import Adoption, held_out_cost
 from sst_graph.estimators.alarm import StepAlarm
+from sst_graph.estimators.epochs import Entry
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.scores import PairScore, score_pair, with_share
-from sst_graph.estimators.smoother import Entry, WindowSmoother
+from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
@@ -74,7 +75,7 @@ class Tracker:
         self.alarmed = False
         self.attempts = 0
         self.waited = 0
-        self._inflation = 1.0
+        self.inflation = 1.0
 
     @property
     def started(self) -> bool:
@@ -132,11 +133,22 @@ class Tracker:
         except (EstimationError, FactorError, ValueError, RuntimeError) as error:
             return self._answer(scan.stamp_ns, " ".join(str(error).split()))
 
+    def current(self) -> TrackUpdate:
+        """The present estimate as an answer, without a frame."""
+        return self._answer(self.window.last_stamp_ns or 0)
+
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
         if self.smoother is None:
             return []
         return self.history_store.smoothed(self.smoother)
+
+    def resume(self, smoother: WindowSmoother, scans: set[int], point: Point) -> None:
+        """Go on with a smoother that an earlier run left behind, some of the window's scans in it."""
+        found, _ = self.match(point, drive=None)
+        smoother.update({k: v for k, v in found.items() if k in scans}, set(), 0)
+        smoother.rest_at(point)
+        self.smoother = smoother
 
     def _check_image(self, image: CameraImage) -> None:
         expected = (self.camera.height, self.camera.width)
@@ -231,7 +243,7 @@ class Tracker:
         if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()):
             raise EstimationError("a covariance that is not finite")
         self.covariance = covariance
-        self._inflation = max(1.0, float(np.trace(np.linalg.solve(naive, covariance)) / len(naive)))
+        self.inflation = max(1.0, float(np.trace(np.linalg.solve(naive, covariance)) / len(naive)))
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
@@ -241,17 +253,16 @@ class Tracker:
         """Scans to match: the newest, those still without a pair, the oldest, and some in turn."""
         numbers = [n for n, _ in self.window.scans]
         waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
-        staleness: dict[int, float] = {n: self._stale(entry) for n, entry in smoother.entries.items()}
+        staleness = {n: self._stale(entry) for n, entry in smoother.entries.items()}
         known = sorted(staleness, key=staleness.__getitem__, reverse=True)
-        stale = sum(value > self.config.stale_sigmas for value in staleness.values())
+        stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
         some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
         return {number, *waiting[-4:], *numbers[:1], *some} | (set(numbers[-2:]) & set(known))
 
     def _stale(self, entry: Entry) -> float:
         """How far the estimate has moved since an entry was matched, in standard deviations."""
         step = entry.score.belief.point.local(self.point)
-        distance: float = step @ np.linalg.solve(self.covariance, step)
-        return float(np.sqrt(max(0.0, distance)))
+        return float(np.sqrt(np.maximum(0.0, step @ np.linalg.solve(self.covariance, step))))
 
     def settle(self, most: int = 20) -> bool:
         """Match the whole window again until the estimate rests, as at the end of a drive.
@@ -267,6 +278,7 @@ class Tracker:
             found, missing = self.match(before, drive=None)
             try:
                 smoother.update({k: v for k, v in found.items() if k in smoother.entries}, missing, 0)
+                smoother.polish()
                 self.covariance = smoother.covariance()[0]
             except EstimationError as error:
                 _LOG.warning("tracker: not settled: %s", error)
@@ -296,7 +308,7 @@ class Tracker:
     @property
     def _share(self) -> float:
         """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
-        return 1.0 / self._inflation if self.config.drift.enabled else 1.0
+        return 1.0 / self.inflation if self.config.drift.enabled else 1.0
 
     def _watch(self, new: list[int], before: Point) -> float | None:
         """The change test on new frames, under its wide kernel."""

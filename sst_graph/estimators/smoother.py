@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from factors import delay_drift, extrinsic_drift
 from sst_graph.errors import EstimationError
+from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
 from sst_graph.estimators.scores import PairScore, ScoreSums, pair_factors
 from sst_graph.estimators.tracker_config import DriftConfig
@@ -30,49 +31,28 @@ _RELINEARIZE = {
 """Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below what a frame tells."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A pair in the graph.
+def _parameters() -> gtsam.ISAM2Params:
+    params = gtsam.ISAM2Params()
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for name, steps in _RELINEARIZE.items():
+        thresholds.insert((name, steps))
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    return params
 
-    Attributes:
-        pair: its matches.
-        score: its belief and sums at the point of the matches.
-        epoch: which calibration it sees.
+
+def read_point(isam: gtsam.ISAM2, keys: Sequence[int]) -> Point:
+    """The estimate under [E, D, biases...].
+
+    Raises:
+        ValueError: it is not finite.
     """
-
-    pair: PairMatches
-    score: PairScore
-    epoch: int
-
-
-@dataclass(frozen=True)
-class Epoch:
-    """A stretch of time with one calibration.
-
-    Attributes:
-        number: of its keys.
-        start_ns: first scan's stamp [ns].
-        links: indices of the drift factors (extrinsic, offset) from the epoch before, or None for the oldest.
-    """
-
-    number: int
-    start_ns: int
-    links: tuple[int, int] | None = None
-
-
-@dataclass(frozen=True)
-class RetiredEpoch:
-    """An epoch whose pairs have all left the window.
-
-    Attributes:
-        start_ns: first scan's stamp [ns].
-        belief: of its pairs alone.
-        surplus: (n, n) variance of its score beyond that of independent matches.
-    """
-
-    start_ns: int
-    belief: Gaussian
-    surplus: FloatArray
+    cTl = isam.calculateEstimatePose3(keys[0])
+    scalars = np.array([isam.calculateEstimateVector(key)[0] for key in keys[1:]])
+    if not (np.isfinite(scalars).all() and np.isfinite(cTl.matrix()).all()):
+        raise ValueError("an estimate that is not finite")
+    return Point(cTl, float(scalars[0]), scalars[1:])
 
 
 class WindowSmoother:
@@ -101,7 +81,7 @@ class WindowSmoother:
         self._ids: dict[int, tuple[int, int]] = {}
         self._isam, self._past_id = self._begun()
         self._point = past.mean()
-        self._epoch_sums = _EpochSums.empty(past.point)
+        self._epoch_sums = EpochSums.empty(past.point)
 
     @property
     def point(self) -> Point:
@@ -124,14 +104,7 @@ class WindowSmoother:
         return [int(gtsam.symbol("E", epoch)), delay_key(epoch), *biases]
 
     def _begun(self) -> tuple[gtsam.ISAM2, int]:
-        params = gtsam.ISAM2Params()
-        thresholds = gtsam.ISAM2ThresholdMap()
-        for name, steps in _RELINEARIZE.items():
-            thresholds.insert((name, steps))
-        params.setRelinearizeThreshold(thresholds)
-        params.relinearizeSkip = 1
-        params.findUnusedFactorSlots = True
-        isam, graph, values = gtsam.ISAM2(params), gtsam.NonlinearFactorGraph(), gtsam.Values()
+        isam, graph, values = gtsam.ISAM2(_parameters()), gtsam.NonlinearFactorGraph(), gtsam.Values()
         keys = self.keys(self._epochs[0].number)
         graph.add(self.past.factor(keys))
         insert_point(values, keys, self.past.mean())
@@ -166,6 +139,42 @@ class WindowSmoother:
         self.retired += change.retired
         if self.entries or self.sums.recent:
             self.model = self.sums.error_model([entry.score for entry in self.entries.values()])
+
+    def rest_at(self, point: Point) -> None:
+        """Answer this estimate until the next update (that of a checkpoint)."""
+        self._point = point
+
+    def polish(self, iterations: int = 10) -> None:
+        """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
+
+        Raises:
+            EstimationError: it fails; nothing has changed.
+        """
+        graph, factors = gtsam.NonlinearFactorGraph(), self._isam.getFactorsUnsafe()
+        order = [self._past_id]
+        order += [index for epoch in self._epochs for index in epoch.links or ()]
+        order += [index for pair in self._ids.values() for index in pair]
+        for index in order:
+            graph.add(factors.at(index))
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(iterations)
+        params.setlambdaInitial(1e-6)
+        params.setRelativeErrorTol(1e-9)
+        try:
+            values = gtsam.LevenbergMarquardtOptimizer(
+                graph, self._isam.calculateEstimate(), params
+            ).optimize()
+            isam = gtsam.ISAM2(_parameters())
+            new = dict(zip(order, isam.update(graph, values).getNewFactorsIndices(), strict=True))
+            point = read_point(isam, self.keys(self._epochs[-1].number))
+        except (RuntimeError, ValueError) as error:
+            raise EstimationError(f"the window's optimisation failed: {error}") from error
+        self._isam, self._past_id, self._point = isam, new[self._past_id], point
+        self._ids = {scan: (new[a], new[b]) for scan, (a, b) in self._ids.items()}
+        self._epochs = tuple(
+            replace(epoch, links=None if epoch.links is None else (new[epoch.links[0]], new[epoch.links[1]]))
+            for epoch in self._epochs
+        )
 
     def walk(self, seconds: float) -> FloatArray:
         """(n,) variances of the random walk over some seconds."""
@@ -206,35 +215,12 @@ class WindowSmoother:
         """Epochs of the window, as if they retired now."""
         found = []
         for i, epoch in enumerate(self._epochs):
-            sums = self._epoch_sums.copy() if i == 0 else _EpochSums.empty(self.past.point)
+            sums = self._epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():
                 if entry.epoch == epoch.number:
                     sums.add(entry.score, scan)
             found.append(RetiredEpoch(epoch.start_ns, sums.belief, sums.surplus(self.model)))
         return found
-
-
-@dataclass
-class _EpochSums:
-    """Belief and score sums of the oldest epoch's retired pairs, for the history."""
-
-    belief: Gaussian
-    sums: ScoreSums
-
-    @classmethod
-    def empty(cls, point: Point) -> _EpochSums:
-        n = point.size
-        return cls(Gaussian(point, np.zeros((n, n)), np.zeros(n)), ScoreSums.empty(n))
-
-    def copy(self) -> _EpochSums:
-        return _EpochSums(self.belief, self.sums.copy())
-
-    def add(self, score: PairScore, scan: int) -> None:
-        self.belief = self.belief.plus(score.belief)
-        self.sums.add(score, scan)
-
-    def surplus(self, model: ErrorModel) -> FloatArray:
-        return self.sums.surplus([], model)
 
 
 class _Change:
@@ -273,11 +259,7 @@ class _Change:
         self._number(list(result.getNewFactorsIndices()))
         # 3. The estimate, if it is one.
         keys = self._smoother.keys(self.epochs[-1].number)
-        cTl = self.isam.calculateEstimatePose3(keys[0])
-        scalars = np.array([self.isam.calculateEstimateVector(key)[0] for key in keys[1:]])
-        self.point = Point(cTl, float(scalars[0]), scalars[1:])
-        if not (np.isfinite(scalars).all() and np.isfinite(cTl.matrix()).all()):
-            raise ValueError("an estimate that is not finite")
+        self.point = read_point(self.isam, keys)
 
     def _retire(self) -> None:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
@@ -344,7 +326,7 @@ class _Change:
         variances = smoother.walk(max(1e-3, (new.start_ns - old.start_ns) * 1e-9))
         surplus = self.epoch_sums.surplus(smoother.model)
         self.retired.append(RetiredEpoch(old.start_ns, self.epoch_sums.belief, surplus))
-        self.epoch_sums = _EpochSums.empty(self.past.point)
+        self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.advance(self.past.transition(variances))
         self.past = self.past.drifted(variances)
         self._remove += new.links or ()

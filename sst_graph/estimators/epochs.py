@@ -1,0 +1,83 @@
+"""What the online graph is made of: pairs, and epochs that share one calibration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.estimators.gaussian import Gaussian, Point
+from sst_graph.estimators.scores import PairScore, ScoreSums
+from sst_graph.problem.graph import PairMatches
+from sst_graph.uncertainty.covariance import ErrorModel
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A pair in the graph.
+
+    Attributes:
+        pair: its matches.
+        score: its belief and sums at the point of the matches.
+        epoch: which calibration it sees.
+    """
+
+    pair: PairMatches
+    score: PairScore
+    epoch: int
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """A stretch of time with one calibration.
+
+    Attributes:
+        number: of its keys.
+        start_ns: first scan's stamp [ns].
+        links: indices of the drift factors (extrinsic, offset) from the epoch before, or None for the oldest.
+    """
+
+    number: int
+    start_ns: int
+    links: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class RetiredEpoch:
+    """An epoch whose pairs have all left the window.
+
+    Attributes:
+        start_ns: first scan's stamp [ns].
+        belief: of its pairs alone.
+        surplus: (n, n) variance of its score beyond that of independent matches.
+    """
+
+    start_ns: int
+    belief: Gaussian
+    surplus: FloatArray
+
+
+@dataclass
+class EpochSums:
+    """Belief and score sums of the oldest epoch's retired pairs, for the history."""
+
+    belief: Gaussian
+    sums: ScoreSums
+
+    @classmethod
+    def empty(cls, point: Point) -> EpochSums:
+        n = point.size
+        return cls(Gaussian(point, np.zeros((n, n)), np.zeros(n)), ScoreSums.empty(n))
+
+    def copy(self) -> EpochSums:
+        return EpochSums(self.belief, self.sums.copy())
+
+    def add(self, score: PairScore, scan: int) -> None:
+        self.belief = self.belief.plus(score.belief)
+        self.sums.add(score, scan)
+
+    def surplus(self, model: ErrorModel) -> FloatArray:
+        return self.sums.surplus([], model)

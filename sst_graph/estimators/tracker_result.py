@@ -1,0 +1,48 @@
+"""The tracker's last estimate as a calibration result."""
+
+from __future__ import annotations
+
+from sst_graph.config import to_dict
+from sst_graph.estimators.incremental import Tracker
+from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
+
+
+def tracker_result(
+    tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
+) -> CalibrationResult:
+    """The present estimate with its covariance; frames used are those of the window."""
+    last = tracker.current()
+    status: Status = "ok" if last.status == "ok" else "not_converged"
+    reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
+    if last.status == "unobservable":
+        status = "unobservable"
+    elif last.status != "ok":
+        reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
+    entries = {} if tracker.smoother is None else tracker.smoother.entries
+    used = [FrameId(drive, scan.index) for number, scan in tracker.window.scans if number in entries]
+    model = None if tracker.smoother is None else tracker.smoother.model
+    return CalibrationResult(
+        T_camera_lidar=last.T_camera_lidar,
+        time_offset_s=last.time_offset_s,
+        covariance=last.covariance,
+        status=status,
+        camera=tracker.camera,
+        camera_name=camera_name,
+        reasons=reasons,
+        weak_directions=last.weak_directions,
+        frames_used=tuple(used),
+        method="track",
+        config=to_dict(tracker.config),
+        initial=tracker.guess.cTl,
+        initial_offset_s=tracker.guess.offset_s,
+        diagnostics={
+            "scans": tracker.window.next_scan,
+            "matches": last.matches,
+            "mask_bias_px": dict(
+                zip([c.name.lower() for c in tracker.classes], tracker.point.biases_px.tolist(), strict=True)
+            ),
+            "error_model": None
+            if model is None
+            else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+        },
+    )
