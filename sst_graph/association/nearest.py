@@ -162,7 +162,7 @@ def match_nearest(
             pixels,
             np.asarray(1.0),
             motion_model=motion_model,
-            weights=weight,
+            weights=np.asarray(weight),
         )
 
     point_to_pixel = frozen(lPs, targets, 1.0)
