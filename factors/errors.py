@@ -39,9 +39,10 @@ def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) ->
 def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
     """A (size, size) symmetric positive-definite covariance."""
     covariance = checked_array(what, value, (size, size))
-    if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=0.0):
-        raise FactorError(what, "an unsymmetric matrix", "a symmetric covariance")
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    # beside the sigmas: rounding leaves 1e-25 where a zero stands, of either sign
+    if (np.abs(covariance - covariance.T) > 1e-6 * np.outer(scale, scale)).any():
+        raise FactorError(what, "an unsymmetric matrix", "a symmetric covariance")
     smallest = float(np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0])
     if smallest <= 0.0:
         raise FactorError(
