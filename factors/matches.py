@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import get_args
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import PinholeCamera
-from .errors import FactorError, checked_array, checked_positive
+from .errors import FactorError, checked_array
 from .motion import MotionModel
 from .robust import RobustKernel
 
@@ -46,7 +46,7 @@ class Alignment:
     kernel: RobustKernel = field(default_factory=RobustKernel)
     c_acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
     motion_model: MotionModel = "se3"
-    weights: FloatArray | float = 1.0
+    weights: FloatArray = field(default_factory=lambda: np.ones(()))
 
     def __post_init__(self) -> None:
         store = object.__setattr__
@@ -74,6 +74,18 @@ class Alignment:
 
     def __len__(self) -> int:
         return len(self.lPs)
+
+    def take(self, index: NDArray[np.intp]) -> Alignment:
+        """Some of the matches, by position."""
+        return replace(
+            self,
+            lPs=self.lPs[index],
+            base_taus_s=self.base_taus_s[index],
+            pixels=self.pixels[index],
+            sigmas_px=self.sigmas_px[index],
+            normals=None if self.normals is None else self.normals[index],
+            weights=self.weights[index],
+        )
 
     @property
     def rows_per_match(self) -> int:

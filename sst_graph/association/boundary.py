@@ -1,10 +1,10 @@
 """Boundary points of a scan: where a scan line leaves an object for what is behind it.
 
-The edge lies between the last return on the object and the next beam, so the mid-direction at the
-object's range is an unbiased direction, uniform over half a beam step to either side. Where the neighbour is *nearer* the
-edge belongs to the neighbour and is skipped. The range is carried on over the half step with the slope
-of the last two returns: on a roof seen at a grazing angle the edge lies a metre behind the last return,
-and a camera beside the LiDAR sees that metre.
+The edge lies between the last return on the object and the next beam, so the direction half way is
+unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
+to the neighbour and is skipped. The range is carried on over the half step with the slope of the last
+two returns: on a roof seen at a grazing angle the edge lies a metre behind the last return, and a camera
+beside the LiDAR sees that metre.
 """
 
 from __future__ import annotations

@@ -11,8 +11,9 @@ masks; the best are refined in pose and time offset by the cross-entropy method 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -36,6 +37,9 @@ class SearchConfig:
         grid_step_deg: spacing of the rotation grid over all of SO(3) [deg].
         box_deg: half width of the box of rotation vectors around a guess [deg].
         box_step_deg: spacing within the box [deg].
+        reach_deg: largest angle from a guess to an answer [deg].
+        apart_deg: candidates closer than this count as one [deg].
+        held_translation_m: half width of the translations while they are held near the guess [m].
         translation_m: half width of the translations around a guess [m].
         free_translation_m: half width of the translations without a guess [m].
         delay_s: half width of the time offsets [s].
@@ -52,11 +56,14 @@ class SearchConfig:
     grid_step_deg: float = 7.5
     box_deg: float = 30.0
     box_step_deg: float = 5.0
+    reach_deg: float = 42.0
+    apart_deg: float = 4.0
+    held_translation_m: float = 0.1
     translation_m: float = 0.6
     free_translation_m: float = 2.0
     delay_s: float = 0.5
-    blurs_px: tuple[float, ...] = (60.0, 25.0, 10.0, 4.0)
-    candidates: tuple[int, ...] = (24, 10, 4, 3)
+    blurs_px: tuple[float, ...] = (45.0, 22.0, 10.0, 4.0)
+    candidates: tuple[int, ...] = (32, 12, 5, 3)
     free_breadth: int = 4
     shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
     population: int = 64
@@ -81,7 +88,7 @@ def search_start(
     offset_s: float = 0.0,
     config: SearchConfig | None = None,
 ) -> list[Candidate]:
-    """Refined candidates, best first, no two of them alike (closer than 3 deg and 30 cm).
+    """Refined candidates of two families in turn, best first in each: translation held, and free.
 
     Args:
         guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
@@ -98,19 +105,43 @@ def search_start(
     states = States(rotations, np.tile(translation, (len(rotations), 1)), np.full(len(rotations), offset_s))
     breadth = config.free_breadth if guess is None else 1
     apart = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
-    best = _peaks(states, levels[0].score(states), breadth * config.candidates[0], 1.5 * apart)
-    # 2. Refined at every blur; fewer candidates survive each.
-    spread_t = config.free_translation_m if guess is None else config.translation_m
+    best, _ = _peaks(states, levels[0].score(states), breadth * config.candidates[0], 1.5 * apart)
+    # 2. Refined at every blur, fewer surviving each: with the translation held near the guess, and free.
+    #    The first is hard to mislead, for it has less to give way with; the second reaches farther.
     spread_r = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
-    scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s])
-    if not votes.moving:
-        scale[6] = 0.0
-    limits = _Limits(translation, spread_t, offset_s, config.delay_s)
-    for level, blur, keep in zip(levels, config.blurs_px, config.candidates, strict=True):
-        best = best.take(slice(0, breadth * keep))
-        best = _cross_entropy(level, best, scale * (blur / config.blurs_px[0]) ** 0.7, limits, config, rng)
-    scores = levels[-1].score(best)
-    return _distinct(best, scores / (len(frames) * CELLS[0] * CELLS[1]))
+    free_t = config.free_translation_m if guess is None else config.translation_m
+    families = []
+    for spread_t in (config.held_translation_m, free_t):
+        scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s * votes.moving])
+        limits = _Limits(translation, spread_t, offset_s, config.delay_s)
+        families.append(_refined(best, levels, guess, scale, limits, config, rng))
+    found = [c for pair in itertools.zip_longest(*families) for c in pair if c is not None]
+    cells = len(frames) * CELLS[0] * CELLS[1]
+    return [replace(candidate, score=candidate.score / cells) for candidate in found]
+
+
+def _refined(
+    best: States,
+    levels: Sequence[Level],
+    guess: gtsam.Pose3 | None,
+    scale: FloatArray,
+    limits: _Limits,
+    config: SearchConfig,
+    rng: np.random.Generator,
+) -> list[Candidate]:
+    """Candidates after all blurs, the best first, with their plain scores."""
+    breadth = config.free_breadth if guess is None else 1
+    scores = np.zeros(len(best))
+    for number, (level, blur) in enumerate(zip(levels, config.blurs_px, strict=True)):
+        shrunk = scale * (blur / config.blurs_px[0]) ** 0.7
+        moved = _cross_entropy(level, best, shrunk, limits, config, rng)
+        near = moved.take(_within(moved, guess, np.radians(config.reach_deg)))
+        keep = breadth * config.candidates[min(number + 1, len(config.candidates) - 1)]
+        best, scores = _peaks(near, level.score(near), keep, np.radians(config.apart_deg))
+    return [
+        Candidate(gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t), float(offset), float(score))
+        for R, t, offset, score in zip(best.rotations, best.translations, best.offsets, scores, strict=True)
+    ]
 
 
 def _grid(guess: gtsam.Pose3 | None, config: SearchConfig) -> tuple[FloatArray, FloatArray]:
@@ -120,6 +151,7 @@ def _grid(guess: gtsam.Pose3 | None, config: SearchConfig) -> tuple[FloatArray, 
     n = round(config.box_deg / config.box_step_deg)
     axis = np.radians(config.box_step_deg) * np.arange(-n, n + 1)
     vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    vectors = vectors[np.linalg.norm(vectors, axis=1) <= np.radians(config.reach_deg)]
     rotations = rotation_matrices(vectors) @ np.asarray(guess.rotation().matrix())
     return rotations, np.asarray(guess.translation(), dtype=np.float64)
 
@@ -171,8 +203,17 @@ class _Limits:
         )
 
 
-def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> States:
-    """The best ``count`` states no two of which are closer in rotation than ``apart_rad``."""
+def _within(states: States, guess: gtsam.Pose3 | None, reach_rad: float) -> IntArray:
+    """Indices of the states whose rotation is in reach of the guess; all of them where none is."""
+    if guess is None:
+        return np.arange(len(states))
+    trace = np.einsum("mij,ij->m", states.rotations, np.asarray(guess.rotation().matrix()))
+    inside = np.flatnonzero(trace >= 1.0 + 2.0 * np.cos(reach_rad))
+    return inside if len(inside) else np.arange(len(states))
+
+
+def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> tuple[States, FloatArray]:
+    """The best ``count`` states, no two closer in rotation than ``apart_rad``, and their scores."""
     chosen: list[int] = []
     remaining = np.argsort(-scores, kind="stable")
     flat = states.rotations.reshape(len(scores), 9)
@@ -181,7 +222,8 @@ def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> 
         best = remaining[0]
         chosen.append(int(best))
         remaining = remaining[flat[remaining] @ flat[best] < largest_trace]
-    return states.take(np.array(chosen, dtype=np.intp))
+    index = np.array(chosen, dtype=np.intp)
+    return states.take(index), scores[index]
 
 
 def _cross_entropy(
@@ -227,18 +269,3 @@ def _perturbed(states: States, delta: FloatArray) -> States:
     translations = states.translations[:, None] + delta[..., 3:6]
     offsets = states.offsets[:, None] + delta[..., 6]
     return States(rotations.reshape(-1, 3, 3), translations.reshape(-1, 3), offsets.reshape(-1))
-
-
-def _distinct(states: States, scores: FloatArray) -> list[Candidate]:
-    found: list[Candidate] = []
-    for i in np.argsort(-scores, kind="stable"):
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(states.rotations[i]), states.translations[i])
-        difference = [other.cTl.between(pose) for other in found]
-        near = [
-            np.linalg.norm(gtsam.Rot3.Logmap(d.rotation())) < np.radians(3.0)
-            and np.linalg.norm(d.translation()) < 0.3
-            for d in difference
-        ]
-        if not any(near):
-            found.append(Candidate(pose, float(states.offsets[i]), float(scores[i])))
-    return found

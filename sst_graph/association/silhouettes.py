@@ -34,7 +34,7 @@ class MatchConfig:
     """
 
     mask_sigma_px: float = 1.0
-    side_sigma_px: float = 0.0
+    side_sigma_px: float = 0.7
     gate: float = 3.0
     min_cosine: float = 0.5
     top_edges: bool = True

@@ -20,8 +20,8 @@ IntArray = NDArray[np.intp]
 CELLS = (10, 32)
 """Rows and columns of the cells of an image whose votes share one voice."""
 
-_FLOOR = 0.03
-"""Probability that a label is wrong: bounds the vote of a single point."""
+_DOUBT = 0.1
+"""Share of labels that are no better than chance: a vote against a pose is never below its logarithm."""
 _BATCH_POINTS = 400_000
 
 
@@ -77,7 +77,7 @@ class Level:
     @property
     def voice(self) -> float:
         """Weight of the votes that give a cell half a voice."""
-        return 2.0 * float(self.weights.mean())
+        return 0.5 * float(self.weights.mean())
 
     def score(self, states: States) -> FloatArray:
         """(m,) scores of poses."""
@@ -170,7 +170,7 @@ class Votes:
                 lPs.append(frame.lPs[chosen])
                 frame_of.append(np.full(len(chosen), number))
                 class_of.append(np.full(len(chosen), c))
-                weights.append(np.full(len(chosen), np.sqrt(len(members) / len(chosen))))
+                weights.append(np.full(len(chosen), (len(members) / len(chosen)) ** 0.25))
         if not lPs or all(bool((c == len(classes)).all()) for c in class_of):
             raise EstimationError("no labelled point of a searched class in any frame")
         return cls(
@@ -229,6 +229,8 @@ def _vote_tables(
         share = cv2.GaussianBlur(share, (0, 0), max(blur, 0.3), borderType=cv2.BORDER_REPLICATE)
         prior = float(share.mean() / max(float(known.mean()), 1e-6))
         p = np.where(known > 0.05, share / np.maximum(known, 0.05), prior)
-        prior = min(max(prior, 0.02), 0.98)
-        tables.append(np.log((_FLOOR + (1.0 - 2.0 * _FLOOR) * p) / prior))
+        prior = max(prior, 0.02)
+        votes = np.log(_DOUBT + (1.0 - _DOUBT) * p / prior)
+        # Background on background is no evidence: a pose must not gain by seeing more of it.
+        tables.append(np.minimum(votes, 0.0) if c == len(classes) else votes)
     return np.stack(tables).astype(np.float32)

@@ -10,14 +10,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.search import Candidate
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
+from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, solve_joint
-from sst_graph.estimators.start import find_start, rivals
+from sst_graph.estimators.start import find_start
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.objects import object_tracks
@@ -103,11 +103,14 @@ def answer_joint(
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
     candidates = find_start(drives, tracks, config.classes, guess.cTl, guess.offset_s, config.start)
-    # 2. Silhouettes over all frames, outer and inner loop.
+    # 2. Where the best candidates lead to on a few frames; the best supported wins.
+    contest = hold_contest(drives, tracks, candidates, guess.cTl, guess.offset_s, config.joint, config.start)
+    # 3. Silhouettes over all frames.
     clocks = len(drives) if config.delay_per_drive else 1
-    start = State(candidates[0].cTl, (candidates[0].offset_s,) * clocks)
-    solution = solve_joint(drives, start, config.joint, progress)
-    # 3. How sure, and in which directions not at all.
+    start = State(contest.cTl, (contest.offset_s,) * clocks)
+    centre = prior_centre(start, guess.cTl, guess.offset_s)
+    solution = solve_joint(drives, start, config.joint, progress, centre)
+    # 4. How sure, and in which directions not at all.
     covariance, model, _ = robust_covariance(
         solution.graph, solution.values, solution.pairs, solution.state, [object_tracks(d) for d in drives]
     )
@@ -116,7 +119,7 @@ def answer_joint(
         solution.state.offsets_s[0],
         covariance[:7, :7],
         _frames_used(drives, solution),
-        doubts=_doubts(solution, candidates, config),
+        doubts=_doubts(solution, contest),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -132,18 +135,11 @@ def answer_joint(
     )
 
 
-def _doubts(
-    solution: JointSolution, candidates: Sequence[Candidate], config: CalibrationConfig
-) -> tuple[str, ...]:
+def _doubts(solution: JointSolution, contest: Contest) -> tuple[str, ...]:
     """Why the joint estimate may be wrong altogether."""
-    doubts = []
+    doubts = [] if contest.doubt is None else [contest.doubt]
     if not solution.converged:
         doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
-    for rival in rivals(candidates, config.start):
-        doubts.append(
-            f"another pose explains the labels almost as well (score {rival.score:.3f} against "
-            f"{candidates[0].score:.3f}): record more varied scenes or give a closer guess"
-        )
     return tuple(doubts)
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from factors import residuals
 from factors.robust import RobustKernel
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive, Progress
@@ -20,6 +21,7 @@ from sst_graph.problem.graph import (
     joint_graph,
     state_from,
 )
+from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
 from sst_graph.uncertainty.covariance import Unknowns, marginal_covariance
 
@@ -69,15 +71,27 @@ class JointSolution:
 
 
 def solve_joint(
-    drives: Sequence[Drive], start: State, config: JointConfig, progress: Progress | None = None
+    drives: Sequence[Drive],
+    start: State,
+    config: JointConfig,
+    progress: Progress | None = None,
+    guess: State | None = None,
+    tracks: Tracks | None = None,
 ) -> JointSolution:
     """Re-pair, re-match, optimise, until nothing moves.
+
+    Args:
+        guess: what the weak priors are centred on; the start where it is None.
+        tracks: twist and object tracks of the drives; made here where it is None.
 
     Raises:
         EstimationError: too few matches at any step.
     """
-    tracks = Tracks(drives)
+    if tracks is None:
+        by_object = config.graph.object_bias_sigma_px > 0.0
+        tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
     state, converged, outer = start, False, 0
+    guess = start if guess is None else guess
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
         scale = config.kernel_px[min(outer, len(config.kernel_px) - 1)]
@@ -85,7 +99,7 @@ def solve_joint(
         pairs = associate(drives, tracks, state, kernel, config.graph)
         _check_matches(pairs, config)
         # 2. Inner optimisation with the matches frozen.
-        graph, values = joint_graph(pairs, state, config.graph)
+        graph, values = joint_graph(pairs, state, config.graph, guess)
         values = _optimise(graph, values, config.inner_iterations)
         # 3. Move; stop when the step is small at the last scale.
         moved = state_from(values, state, pairs)
@@ -100,6 +114,24 @@ def solve_joint(
             break
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, len(pairs))
     return JointSolution(state, pairs, graph, values, outer + 1, converged)
+
+
+def support(solution: JointSolution) -> float:
+    """How much agrees with a solution: its matches, each counted by its robust weight."""
+    total = 0.0
+    for pair in solution.pairs:
+        for c, matches in pair.matches.items():
+            alignment = matches.alignment
+            r, _ = residuals(
+                alignment,
+                solution.state.cTl,
+                solution.state.offset_s(pair.drive),
+                pair.motion.c_twist,
+                solution.state.biases_px.get((pair.drive, c), 0.0),
+                jacobians=False,
+            )
+            total += float(alignment.kernel.weight(r / alignment.sigmas_px).sum())
+    return total
 
 
 def _check_matches(pairs: Sequence[PairMatches], config: JointConfig) -> None:

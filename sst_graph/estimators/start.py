@@ -27,12 +27,19 @@ class StartConfig:
     Attributes:
         search: the global search.
         enabled: False takes the guess as it is.
-        rival_ratio: a second, different candidate with at least this fraction of the best score is a rival.
+        contenders, free_contenders: most candidates whose joint solutions are compared, with and without
+            a guess.
+        contest_scans: scans of each drive that they are compared on.
+        rival_ratio: a different solution that at least this fraction of the best one's matches supports
+            makes the answer ambiguous.
         min_class_points: fewest points of the searched classes that make a frame worth looking at.
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
     enabled: bool = True
+    contenders: int = 6
+    free_contenders: int = 12
+    contest_scans: int = 10
     rival_ratio: float = 0.9
     min_class_points: int = 30
 
@@ -93,14 +100,3 @@ def _search_frames(
         twist = np.zeros(6) if sample is None else sample.twist
         frames.append(SearchFrame(scan.lPs, scan.classes, image.mask, pair.base_tau_s, twist))
     return frames
-
-
-def rivals(candidates: Sequence[Candidate], config: StartConfig) -> list[Candidate]:
-    """Candidates far from the best one whose score comes close to its."""
-    best, *others = candidates
-    return [
-        other
-        for other in others
-        if other.score > config.rival_ratio * best.score
-        and np.linalg.norm(gtsam.Rot3.Logmap(best.cTl.between(other.cTl).rotation())) > np.radians(5.0)
-    ]

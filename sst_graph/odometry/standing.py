@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,7 @@ class StandingConfig:
         max_speed_mps: fastest that a standing sensor may seem to move [m/s].
         max_turn_radps: fastest that it may seem to turn [rad/s].
         certainty: the speed plus this many of its sigmas must stay below twice ``max_speed_mps``.
+        rest_sigma_rad, rest_sigma_m: sigmas of the motion of a sensor that stands [rad, m].
         min_motions: fewest consecutive motions at rest that make a stop.
     """
 
@@ -26,6 +28,8 @@ class StandingConfig:
     max_turn_radps: float = 0.03
     certainty: float = 2.0
     min_motions: int = 2
+    rest_sigma_rad: float = 2e-5
+    rest_sigma_m: float = 2e-4
 
 
 def standing_frames(
@@ -43,6 +47,20 @@ def standing_frames(
     before = np.concatenate([at_rest[:1], at_rest])
     after = np.concatenate([at_rest, at_rest[-1:]])
     return before & after if len(motions) else np.zeros(1, np.bool_)
+
+
+def at_rest(motions: Sequence[RelativeMotion], config: StandingConfig | None = None) -> list[RelativeMotion]:
+    """The motions with those between standing frames replaced by none at all.
+
+    Odometry's noise would otherwise look like slow motion, which a time offset could feed on.
+    """
+    config = config or StandingConfig()
+    stands = standing_frames(motions, config)
+    covariance = np.diag(np.repeat([config.rest_sigma_rad, config.rest_sigma_m], 3) ** 2)
+    return [
+        replace(motion, aTb=gtsam.Pose3(), covariance=covariance) if stands[i] and stands[i + 1] else motion
+        for i, motion in enumerate(motions)
+    ]
 
 
 def _at_rest(motion: RelativeMotion, config: StandingConfig) -> bool:

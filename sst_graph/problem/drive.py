@@ -15,6 +15,7 @@ from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.standing import at_rest
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.trajectory import TwistTrack
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
@@ -109,8 +110,8 @@ class Drive:
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
     def lidar_track(self) -> TwistTrack | None:
-        """Twists of the LiDAR over time, or None for a single scan."""
-        return TwistTrack(self.lidar_motions) if self.lidar_motions else None
+        """Twists of the LiDAR over time, exactly zero while it stands; None for a single scan."""
+        return TwistTrack(at_rest(self.lidar_motions)) if self.lidar_motions else None
 
 
 def prepare_drive(

@@ -14,7 +14,8 @@ from factors.robust import RobustKernel
 from sst_graph.association.pairing import Pair, pair_by_time
 from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, twist_key
+from sst_graph.problem.objects import ObjectId
+from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
 from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
 
@@ -28,19 +29,22 @@ class GraphConfig:
     Attributes:
         match: how boundary points meet contours.
         max_interval_periods: farthest pair in true time, in image periods.
-        bias_sigma_px: prior deviation of a mask bias from 0 [px].
-        delay_sigma_s: prior deviation of the time offset from 0 [s].
-        rest_sigma_rad: prior deviation of the extrinsic's rotation from the start [rad].
-        rest_sigma_m: of its translation [m]; both so wide that they only keep an unseen direction finite.
+        bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
+        object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
+            of a class the same bias.
+        delay_sigma_s: prior deviation of the time offset from the guess [s].
+        rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
+        rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
     max_interval_periods: float = 1.0
     bias_sigma_px: float = 3.0
-    delay_sigma_s: float = 1.0
+    object_bias_sigma_px: float = 1.0
+    delay_sigma_s: float = 0.5
     rest_sigma_rad: float = 1.0
-    rest_sigma_m: float = 3.0
+    rest_sigma_m: float = 1.0
     still_sigma: tuple[float, float] = (0.05, 0.5)
 
 
@@ -54,6 +58,8 @@ class PairMatches:
         l_twist: the LiDAR's twist at the image's instant, or None where no odometry tells it.
         motion: the camera's, under the state that the matches were made at.
         matches: by class.
+        tracks: for each class, the track (n,) of the object that each match lies on; empty where objects
+            share their class's mask bias.
     """
 
     drive: int
@@ -61,16 +67,20 @@ class PairMatches:
     l_twist: TwistSample | None
     motion: Motion
     matches: Mapping[SemanticClass, SilhouetteMatches]
+    tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return sum(len(matches) for matches in self.matches.values())
 
 
 class Tracks:
-    """Twist tracks of all drives, made once."""
+    """Twist tracks of all drives, and tracks of their objects where those are given; made once."""
 
-    def __init__(self, drives: Sequence[Drive]) -> None:
+    def __init__(
+        self, drives: Sequence[Drive], objects: Sequence[Mapping[ObjectId, int]] | None = None
+    ) -> None:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track() for drive in drives]
+        self.objects = objects
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -104,8 +114,23 @@ def associate(
                 config.match,
             )
             if matches:
-                found.append(PairMatches(number, pair, l_twist, motion, matches))
+                on = _objects_of(
+                    matches, pair.scan, None if tracks.objects is None else tracks.objects[number]
+                )
+                found.append(PairMatches(number, pair, l_twist, motion, matches, on))
     return found
+
+
+def _objects_of(
+    matches: Mapping[SemanticClass, SilhouetteMatches], scan: int, tracks: Mapping[ObjectId, int] | None
+) -> dict[SemanticClass, NDArray[np.intp]]:
+    """Track of the object of each match, by class; empty without tracks."""
+    if tracks is None:
+        return {}
+    return {
+        c: np.array([tracks[scan, c, int(number)] for number in m.objects], dtype=np.intp)
+        for c, m in matches.items()
+    }
 
 
 def _camera_motion(l_twist: TwistSample | None, cTl: gtsam.Pose3) -> Motion:
@@ -116,11 +141,11 @@ def _camera_motion(l_twist: TwistSample | None, cTl: gtsam.Pose3) -> Motion:
 
 
 def joint_graph(
-    pairs: Sequence[PairMatches], state: State, config: GraphConfig
+    pairs: Sequence[PairMatches], state: State, config: GraphConfig, guess: State | None = None
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The whole problem at a state: silhouettes, motion, priors."""
+    """The whole problem at a state: silhouettes, motion, weak priors around the guess (or the state)."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    _add_calibration(graph, values, state, config)
+    _add_calibration(graph, values, state, guess or state, config)
     _add_biases(graph, values, pairs, state, config)
     for pair in pairs:
         _add_motion(graph, values, pair, state, config)
@@ -129,25 +154,40 @@ def joint_graph(
 
 
 def silhouettes_of(pair: PairMatches, state: State) -> gtsam.CustomFactor:
-    """All silhouette matches of one pair as one condensed factor on E, D, V(image), B(class)."""
-    classes = list(pair.matches)
+    """All silhouette matches of one pair as one condensed factor on E, D, V(image) and mask biases."""
+    alignments, biases = [], []
+    for c, matches in pair.matches.items():
+        for key, index in bias_groups(pair, c):
+            alignments.append(matches.alignment if index is None else matches.alignment.take(index))
+            biases.append(key)
     return frame_factor(
-        [pair.matches[c].alignment for c in classes],
+        alignments,
         EXTRINSIC,
         delay_key(state.clock(pair.drive)),
         twist_key(pair.drive, pair.pair.image),
-        [bias_key(pair.drive, c) for c in classes],
+        biases,
     )
 
 
+def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[np.intp] | None]]:
+    """Key of the mask bias, and the matches that share it (None for all): by object where it is tracked."""
+    tracks = pair.tracks.get(c)
+    if tracks is None:
+        return [(bias_key(pair.drive, c), None)]
+    return [
+        (object_bias_key(pair.drive, int(track)), np.flatnonzero(tracks == track))
+        for track in np.unique(tracks)
+    ]
+
+
 def _add_calibration(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, guess: State, config: GraphConfig
 ) -> None:
     sigmas = np.repeat([config.rest_sigma_rad, config.rest_sigma_m], 3)
-    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, state.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, guess.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     values.insert(EXTRINSIC, state.cTl)
     for clock, offset_s in enumerate(state.offsets_s):
-        graph.add(delay_prior(delay_key(clock), offset_s, config.delay_sigma_s))
+        graph.add(delay_prior(delay_key(clock), guess.offset_s(clock), config.delay_sigma_s))
         values.insert(delay_key(clock), np.array([offset_s]))
 
 
@@ -162,6 +202,25 @@ def _add_biases(
     for drive, c in sorted({(pair.drive, c) for pair in pairs for c in pair.matches}):
         graph.add(gtsam.PriorFactorVector(bias_key(drive, c), np.zeros(1), noise))
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))
+    if not (tracked := tracked_objects(pairs)):
+        return
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, config.object_bias_sigma_px)
+    for drive, c, track in tracked:
+        key = object_bias_key(drive, track)
+        graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))
+        values.insert(key, np.array([state.object_bias_px(drive, track, c)]))
+
+
+def tracked_objects(pairs: Sequence[PairMatches]) -> list[tuple[int, SemanticClass, int]]:
+    """(drive, class, track) of every object with a mask bias of its own."""
+    return sorted(
+        {
+            (pair.drive, c, int(track))
+            for pair in pairs
+            for c, tracks in pair.tracks.items()
+            for track in np.unique(tracks)
+        }
+    )
 
 
 def _add_motion(
@@ -199,5 +258,8 @@ def state_from(values: gtsam.Values, state: State, pairs: Sequence[PairMatches])
     biases = dict(state.biases_px)
     for drive, c in {(pair.drive, c) for pair in pairs for c in pair.matches}:
         biases[drive, c] = float(values.atVector(bias_key(drive, c))[0])
+    objects = dict(state.object_biases_px)
+    for drive, _, track in tracked_objects(pairs):
+        objects[drive, track] = float(values.atVector(object_bias_key(drive, track))[0])
     offsets = tuple(float(values.atVector(delay_key(i))[0]) for i in range(len(state.offsets_s)))
-    return State(values.atPose3(EXTRINSIC), offsets, biases)
+    return State(values.atPose3(EXTRINSIC), offsets, biases, objects)

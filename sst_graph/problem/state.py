@@ -30,6 +30,11 @@ def bias_key(drive: int, semantic_class: SemanticClass) -> int:
     return int(gtsam.symbol("B", drive * 256 + int(semantic_class)))
 
 
+def object_bias_key(drive: int, track: int) -> int:
+    """Key of the mask bias of one object, by its track (``Vector(1)``, px)."""
+    return int(gtsam.symbol("O", drive * _IMAGES_PER_DRIVE + track))
+
+
 @dataclass(frozen=True)
 class State:
     """The current estimate.
@@ -38,11 +43,13 @@ class State:
         cTl: extrinsic.
         offsets_s: time offset of each clock [s].
         biases_px: mask bias by (drive, class) [px]; 0 where it is missing.
+        object_biases_px: mask bias by (drive, track of an object) [px]; its class's where it is missing.
     """
 
     cTl: gtsam.Pose3
     offsets_s: tuple[float, ...] = (0.0,)
     biases_px: Mapping[tuple[int, SemanticClass], float] = field(default_factory=dict)
+    object_biases_px: Mapping[tuple[int, int], float] = field(default_factory=dict)
 
     def clock(self, drive: int) -> int:
         """Number of the clock that a drive's time offset belongs to."""
@@ -51,6 +58,11 @@ class State:
     def offset_s(self, drive: int) -> float:
         """Time offset of a drive [s]."""
         return self.offsets_s[self.clock(drive)]
+
+    def object_bias_px(self, drive: int, track: int, semantic_class: SemanticClass) -> float:
+        """Mask bias of one object [px]."""
+        of_class = self.biases_px.get((drive, semantic_class), 0.0)
+        return self.object_biases_px.get((drive, track), of_class)
 
     def biases_of(self, drive: int) -> dict[SemanticClass, float]:
         """Mask biases of a drive by class [px]."""

@@ -66,4 +66,5 @@ class TwistTrack:
 def camera_twist(sample: TwistSample, cTl: gtsam.Pose3) -> TwistSample:
     """The camera's twist from the LiDAR's: c_twist = Ad(cTl) l_twist (rigidly joined sensors)."""
     Ad = np.asarray(cTl.AdjointMap())
-    return TwistSample(Ad @ sample.twist, Ad @ sample.acceleration, Ad @ sample.covariance @ Ad.T)
+    covariance = Ad @ sample.covariance @ Ad.T
+    return TwistSample(Ad @ sample.twist, Ad @ sample.acceleration, 0.5 * (covariance + covariance.T))

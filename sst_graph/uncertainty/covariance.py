@@ -20,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.alignment import weighted_residuals
-from sst_graph.problem.graph import PairMatches
+from sst_graph.problem.graph import PairMatches, bias_groups, tracked_objects
 from sst_graph.problem.objects import ObjectId
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key
+from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key
+from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -65,8 +66,9 @@ class Unknowns:
     @classmethod
     def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
         delays = [delay_key(clock) for clock in range(len(state.offsets_s))]
-        biases = sorted({bias_key(pair.drive, c) for pair in pairs for c in pair.matches})
-        return cls((EXTRINSIC, *delays, *biases))
+        biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
+        objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
+        return cls((EXTRINSIC, *delays, *sorted(biases), *sorted(objects)))
 
     @property
     def size(self) -> int:
@@ -87,18 +89,11 @@ def match_table(
     """All matches of the frozen graph at a state, with the clusters they belong to."""
     blocks, weights, residuals, sides, frames = [], [], [], [], []
     for number, pair in enumerate(pairs):
-        offset_s, biases = state.offset_s(pair.drive), state.biases_of(pair.drive)
         for c, matches in pair.matches.items():
-            bias = biases.get(c, 0.0)
-            r, J, _ = weighted_residuals(matches.alignment, state.cTl, offset_s, pair.motion.c_twist, bias)
-            block = np.zeros((len(r), unknowns.size))
-            block[:, :6] = J[:, :6]
-            block[:, unknowns.column(delay_key(state.clock(pair.drive)))] = J[:, 6]
-            block[:, unknowns.column(bias_key(pair.drive, c))] = J[:, 13]
-            root = np.abs(J[:, 13]) * matches.alignment.sigmas_px
+            block, root, r = _rows(pair, c, state, unknowns)
             blocks.append(block)
             weights.append(root)
-            residuals.append(np.where(root > 1e-6, r / np.maximum(root, 1e-6), 0.0))
+            residuals.append(r)
             track = [tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects]
             side = (np.array(track) * 3 + matches.sides) * 64 + pair.drive
             sides.append(side)
@@ -110,6 +105,30 @@ def match_table(
         _numbered(np.concatenate(sides)),
         _numbered(np.concatenate(frames)),
     )
+
+
+def _rows(
+    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weighted Jacobian rows, roots of the weights, and whitened residuals of one class in one pair."""
+    alignment = pair.matches[c].alignment
+    block = np.zeros((len(alignment), unknowns.size))
+    roots, residuals = np.zeros(len(alignment)), np.zeros(len(alignment))
+    clock = unknowns.column(delay_key(state.clock(pair.drive)))
+    for key, some in bias_groups(pair, c):
+        index = np.arange(len(alignment)) if some is None else some
+        bias = state.biases_px.get((pair.drive, c), 0.0)
+        if some is not None:
+            bias = state.object_bias_px(pair.drive, int(pair.tracks[c][index[0]]), c)
+        r, J, _ = weighted_residuals(
+            alignment.take(index), state.cTl, state.offset_s(pair.drive), pair.motion.c_twist, bias
+        )
+        root = np.abs(J[:, 13]) * alignment.sigmas_px[index]
+        block[index, :6], block[index, clock] = J[:, :6], J[:, 6]
+        block[index, unknowns.column(key)] = J[:, 13]
+        roots[index] = root
+        residuals[index] = np.where(root > 1e-6, r / np.maximum(root, 1e-6), 0.0)
+    return block, roots, residuals
 
 
 def _numbered(labels: IntArray) -> IntArray:
@@ -141,7 +160,9 @@ def _means(values: FloatArray, w: FloatArray, groups: IntArray) -> tuple[FloatAr
     return mean, np.asarray(total, np.float64), np.asarray(np.bincount(groups, w * w), np.float64)
 
 
-def spread_beyond(means: FloatArray, variances: FloatArray, groups: IntArray, centre: float | None = None) -> float:
+def spread_beyond(
+    means: FloatArray, variances: FloatArray, groups: IntArray, centre: float | None = None
+) -> float:
     """Variance of ``means`` around their group's mean beyond what their own variances explain."""
     v = 1.0 / np.maximum(variances, 1e-9)
     group_mean, group_v, group_v2 = _means(means, v, groups)

@@ -1,0 +1,100 @@
+"""Which start is right: candidates of the global search are solved on a few frames and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from sst_graph.association.search import Candidate
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint, support
+from sst_graph.estimators.start import StartConfig
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import Tracks
+from sst_graph.problem.state import State
+
+_SAME_DEG = 2.0
+"""Solutions closer than this are one [deg]."""
+
+
+@dataclass(frozen=True)
+class Contest:
+    """The winner, and why it may be the wrong one (None where nothing speaks for another)."""
+
+    cTl: gtsam.Pose3
+    offset_s: float
+    doubt: str | None
+
+
+def hold_contest(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    candidates: Sequence[Candidate],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    joint: JointConfig,
+    config: StartConfig,
+) -> Contest:
+    """Solve the best candidates on a few scans; the solution that most matches agree with wins.
+
+    Raises:
+        EstimationError: no candidate leads anywhere.
+    """
+    if not config.enabled:
+        return Contest(candidates[0].cTl, candidates[0].offset_s, None)
+    few = [_thinned(drive, config.contest_scans) for drive in drives]
+    simple = replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
+    solutions, failures = [], []
+    contenders = config.free_contenders if guess_cTl is None else config.contenders
+    for candidate in candidates[:contenders]:
+        start = State(candidate.cTl, (candidate.offset_s,))
+        centre = prior_centre(start, guess_cTl, guess_offset_s)
+        try:
+            solution = solve_joint(few, start, simple, None, centre, tracks)
+        except EstimationError as error:
+            failures.append(error)
+            continue
+        if _is_within(solution, guess_cTl, config):
+            solutions.append(solution)
+    if not solutions:
+        raise failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
+    solutions.sort(key=support, reverse=True)
+    best = solutions[0]
+    return Contest(best.state.cTl, best.state.offsets_s[0], _doubt(solutions, config))
+
+
+def _thinned(drive: Drive, most: int) -> Drive:
+    """The drive with at most so many scans, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(drive.scans) - 1, most).round().astype(int))
+    return replace(drive, scans=tuple(drive.scans[i] for i in chosen))
+
+
+def prior_centre(start: State, guess_cTl: gtsam.Pose3 | None, guess_offset_s: float) -> State:
+    """What the weak priors are centred on: the guess, or the start's rotation without a translation."""
+    rotation = start.cTl.rotation()
+    cTl = guess_cTl if guess_cTl is not None else gtsam.Pose3(rotation, np.zeros(3))
+    return State(cTl, (guess_offset_s,) * len(start.offsets_s))
+
+
+def _is_within(solution: JointSolution, guess: gtsam.Pose3 | None, config: StartConfig) -> bool:
+    """Whether the translation stayed where it was searched, and did not run away with the points."""
+    search = config.search
+    limit = search.free_translation_m if guess is None else 2.0 * search.translation_m
+    centre = np.zeros(3) if guess is None else np.asarray(guess.translation())
+    return float(np.linalg.norm(solution.state.cTl.translation() - centre)) < 1.25 * limit
+
+
+def _doubt(solutions: Sequence[JointSolution], config: StartConfig) -> str | None:
+    best, *others = solutions
+    for other in others:
+        turn = best.state.cTl.between(other.state.cTl).rotation()
+        degrees = float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turn))))
+        if degrees > _SAME_DEG and support(other) > config.rival_ratio * support(best):
+            return (
+                f"a pose {degrees:.0f} deg away explains the labels almost as well ({support(other):.0f} "
+                f"against {support(best):.0f} matches): record more varied scenes or give a closer guess"
+            )
+    return None
