@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import gtsam
 import numpy as np
@@ -95,7 +96,7 @@ def load_checkpoint(path: str | Path) -> Tracker:
         head = json.loads(bytes(arrays["head"]))
     except FileNotFoundError:
         raise DataError(path, "no such file", "a checkpoint of the tracker") from None
-    except (OSError, ValueError, KeyError, EOFError, zlib.error) as error:
+    except (OSError, ValueError, KeyError, EOFError, zlib.error, BadZipFile) as error:
         raise DataError(path, f"no readable checkpoint ({error})", "a checkpoint of the tracker") from error
     found = (head.get("format"), head.get("version"))
     if found != (FORMAT, VERSION):

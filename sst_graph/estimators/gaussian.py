@@ -96,8 +96,11 @@ class Gaussian:
         """As a factor on [extrinsic, offset, biases...]; it can be pickled and serialized."""
         linear, starts = gtsam.GaussianFactorGraph(), [0, 6, *range(7, self.point.size + 1)]
         blocks = [slice(a, b) for a, b in pairwise(starts)]
+        # The constant makes the least cost 0: optimizers stop where a cost is not positive.
+        constant = float(self.vector @ (scaled_inverse(self.information) @ self.vector))
         for i, (key, a) in enumerate(zip(keys, blocks, strict=True)):
-            linear.add(gtsam.HessianFactor(key, self.information[a, a], self.vector[a], 0.0))
+            f = constant if i == 0 else 0.0
+            linear.add(gtsam.HessianFactor(key, self.information[a, a], self.vector[a], f))
             for other, b in zip(keys[i + 1 :], blocks[i + 1 :], strict=True):
                 m, k = a.stop - a.start, b.stop - b.start
                 zero_a, zero_b = np.zeros((m, m)), np.zeros((k, k))

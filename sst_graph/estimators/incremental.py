@@ -208,7 +208,7 @@ class Tracker:
             return self._answer(stamp_ns, f"no start yet: {error}")
         calibration = config.calibration
         start_ns = drive.scans[0].stamp_ns
-        prior = prior_belief(point, self.classes, calibration.joint.graph)
+        prior = prior_belief(point, self.guess, self.classes, calibration.joint.graph)
         smoother = WindowSmoother(prior, start_ns, self.classes, calibration.joint.graph, config.drift)
         found, _ = self.match(point, drive=None)
         smoother.update(found, set(), self.window.first_scan)
@@ -265,7 +265,10 @@ class Tracker:
         return float(np.sqrt(np.maximum(0.0, step @ np.linalg.solve(self.covariance, step))))
 
     def settle(self, most: int = 20) -> bool:
-        """Match the whole window again until the estimate rests, as at the end of a drive.
+        """Solve the whole window again as the batch does, as at the end of a drive.
+
+        The kernel begins wide and narrows: matches made frame by frame hold the estimate within a standard
+        deviation or two of where the batch would end.
 
         Returns:
             Whether it rests: the last step was below 0.02 standard deviations.
@@ -273,26 +276,31 @@ class Tracker:
         smoother = self.smoother
         if smoother is None:
             return False
-        for _ in range(most):
+        scales = self.config.calibration.joint.kernel_px
+        for scale in (*scales, *[scales[-1]] * most):
             before = smoother.point
-            found, missing = self.match(before, drive=None)
+            found, missing = self.match(before, None, scale)
+            found = {scan: pair for scan, pair in found.items() if scan in smoother.entries}
             try:
-                smoother.update({k: v for k, v in found.items() if k in smoother.entries}, missing, 0)
+                smoother.update(found, missing, 0)
                 smoother.polish()
                 self.covariance = smoother.covariance()[0]
             except EstimationError as error:
                 _LOG.warning("tracker: not settled: %s", error)
                 return False
             step = before.local(smoother.point)
-            if step @ np.linalg.solve(self.covariance, step) < 0.02**2:
+            if scale == scales[-1] and step @ np.linalg.solve(self.covariance, step) < 0.02**2:
                 return True
         return False
 
-    def match(self, point: Point, drive: set[int] | None) -> tuple[Found, set[int]]:
+    def match(
+        self, point: Point, drive: set[int] | None, kernel_px: float | None = None
+    ) -> tuple[Found, set[int]]:
         """Matches of some scans of the window (None: all) at a point, and the scans that have none."""
+        kernel = self.kernel if kernel_px is None else RobustKernel("geman_mcclure", kernel_px)
         part, numbers = self.window.drive(None if drive is None else drive.__contains__)
         config = self.config.calibration.joint.graph
-        pairs = associate([part], Tracks([part]), point.state(self.classes), self.kernel, config)
+        pairs = associate([part], Tracks([part]), point.state(self.classes), kernel, config)
         found: Found = {}
         for pair in pairs:
             if len(pair) < self.config.min_frame_matches:

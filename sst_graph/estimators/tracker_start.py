@@ -10,11 +10,12 @@ import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
+from sst_graph.association.search import Candidate
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.joint import solve_joint
-from sst_graph.estimators.start import find_start, rivals
+from sst_graph.estimators.start import find_start
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
@@ -37,6 +38,14 @@ class Guess:
     search: bool = True
 
 
+@dataclass(frozen=True)
+class _Solved:
+    """A solution and the mean cost of all boundary points under it."""
+
+    cost: float
+    point: Point
+
+
 def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     """The batch solution of the window.
 
@@ -48,47 +57,64 @@ def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
         EstimationError: too little to see, an ambiguous start, or a solution that did not settle.
     """
     reach = config.calibration.start.search.delay_s
-    solved: list[tuple[float, Point]] = []
-    reasons = []
-    for delay_s in (0.0, reach) if guess.search and reach > 0.0 else (0.0,):
+    free = guess.search and reach > 0.0
+    solved, reasons = [], []
+    for delay_s in (0.0, reach) if free else (0.0,):
         try:
-            point = _solution(drive, guess, config, delay_s)
+            solved.append(_best(drive, guess, config, delay_s))
         except EstimationError as error:
             reasons.append(str(error))
-            continue
-        solved.append((_cost(drive, point, config), point))
     if not solved:
         raise EstimationError(reasons[-1])
-    (best, point), *others = solved
-    for cost, other in others:
-        if cost < (1.0 - config.start_gain) * best:
-            best, point = cost, other
-    return point
+    best, *others = solved
+    for other in others:
+        if other.cost < (1.0 - config.start_gain) * best.cost:
+            best = other
+    return best.point
 
 
-def _solution(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Point:
-    """Search with offsets within ``delay_s`` of the guess's, then the joint method with a damped offset."""
+def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> _Solved:
+    """The best of the solutions from all candidates with offsets within ``delay_s`` of the guess's.
+
+    Raises:
+        EstimationError: no solution, or two that differ and explain the labels alike.
+    """
     calibration = config.calibration
     search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
     enabled = guess.search or guess.cTl is None
     start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
     candidates = find_start([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, start)
-    others = rivals(candidates, start)
-    if others:
-        raise EstimationError(
-            f"another pose explains the labels almost as well (score {others[0].score:.3f} "
-            f"against {candidates[0].score:.3f})"
-        )
-    best = candidates[0]
+    solved, reasons = [], []
+    for candidate in candidates[: config.start_candidates]:
+        try:
+            solved.append(_solution(drive, candidate, config))
+        except EstimationError as error:
+            reasons.append(str(error))
+    if not solved:
+        raise EstimationError(reasons[0])
+    best, *others = sorted(solved, key=lambda solution: solution.cost)
+    for other in others:
+        turn = gtsam.Rot3.Logmap(best.point.cTl.between(other.point.cTl).rotation())
+        if np.linalg.norm(turn) > np.radians(2.0) and best.cost > (1.0 - config.start_gain) * other.cost:
+            raise EstimationError(
+                f"two poses explain the labels alike (cost {best.cost:.3f} and {other.cost:.3f} a point)"
+            )
+    return best
+
+
+def _solution(drive: Drive, candidate: Candidate, config: TrackerConfig) -> _Solved:
+    """The joint method from a candidate, its offset damped."""
+    calibration = config.calibration
     graph = dataclasses.replace(calibration.joint.graph, delay_sigma_s=config.start_offset_step_s)
     joint = dataclasses.replace(calibration.joint, graph=graph)
-    solution = solve_joint([drive], State(best.cTl, (best.offset_s,)), joint)
+    solution = solve_joint([drive], State(candidate.cTl, (candidate.offset_s,)), joint)
     if not solution.converged:
         raise EstimationError(f"the first solution still moved after {solution.outer_iterations} iterations")
-    _check_pairs(drive, best.offset_s, len(solution.pairs), solution.state.offset_s(0), config)
     state = solution.state
+    _check_pairs(drive, candidate.offset_s, len(solution.pairs), state.offset_s(0), config)
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    return Point(state.cTl, state.offset_s(0), np.array(biases))
+    point = Point(state.cTl, state.offset_s(0), np.array(biases))
+    return _Solved(_cost(drive, point, config), point)
 
 
 def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
@@ -116,9 +142,11 @@ def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, conf
         raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
 
 
-def prior_belief(point: Point, classes: tuple[SemanticClass, ...], config: GraphConfig) -> Gaussian:
-    """The batch's own priors, at a point: wide on the calibration, biases around 0."""
+def prior_belief(
+    point: Point, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
+) -> Gaussian:
+    """The batch's own weak priors around the guess, linearized at a point: biases around 0."""
     sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
     information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * len(classes)]))
-    toward = np.concatenate([np.zeros(7), -point.biases_px])
-    return Gaussian(point, information, information @ toward)
+    centre = Point(guess.cTl or point.cTl, guess.offset_s, np.zeros(len(classes)))
+    return Gaussian(point, information, information @ point.local(centre))

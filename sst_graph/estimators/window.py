@@ -85,8 +85,12 @@ class Window:
         return {number: scan.stamp_ns for number, scan in self.scans}
 
     def drive(self, chosen: Callable[[int], bool] | None = None) -> tuple[Drive, list[int]]:
-        """The window, or some of its scans, as a drive; and the numbers of its scans."""
+        """The window as a drive, and the numbers of its scans; or some of its scans, under all motions."""
         numbers = [number for number, _ in self.scans if chosen is None or chosen(number)]
         scans = [scan for number, scan in self.scans if chosen is None or chosen(number)]
-        drive = Drive("window", self.camera, tuple(scans), tuple(self.images), tuple(self.motions), ())
+        motions = tuple(self.motions)
+        if chosen is None and scans:
+            # As in a drive: the k-th motion leads from the k-th scan to the next.
+            motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
+        drive = Drive("window", self.camera, tuple(scans), tuple(self.images), motions, ())
         return drive, numbers

@@ -1,0 +1,109 @@
+"""``sst-graph track`` as a user calls it: lines of JSON, exit codes, kill and resume."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.result import read_result
+
+OPTIONS = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short drive on disk whose nominal calibration is the true one, in small pictures."""
+    folder = tmp_path_factory.mktemp("data") / "street"
+    config = SimulationConfig(
+        seed=4,
+        frames=20,
+        width=414,
+        height=125,
+        azimuth_limit_deg=50.0,
+        azimuth_step_deg=0.35,
+        vehicle_density=0.3,
+        time_offset_s=0.0,
+        rotation_error_deg=0.3,
+        translation_error_m=0.02,
+        motion="no_stop",
+        speed_mps=6.0,
+    )
+    write_drive(simulate(config), folder)
+    return folder
+
+
+def _lines(text: str) -> list[dict[str, Any]]:
+    refuse = lambda name: pytest.fail(f"{name} in the output")  # noqa: E731
+    return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
+
+
+def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "calibration.json"
+    code = main(["track", str(street), *OPTIONS, "--out", str(out)])
+    captured = capsys.readouterr()
+    lines = _lines(captured.out)
+    assert [line["frame"] for line in lines] == list(range(20))
+    assert lines[0]["status"] == "starting" and not lines[0]["accepted"]
+    assert lines[-1]["accepted"] and lines[-1]["matches"] > 100
+    assert lines[-1]["sigma_time_offset_s"] < lines[0]["sigma_time_offset_s"]
+    result = read_result(out)
+    assert result.method == "track" and result.frames_used
+    assert code == {"ok": 0}.get(result.status, 3)
+    assert (captured.err == "") == (code == 0)
+    assert main(["track", str(street), "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SIGKILL at some frame after a checkpoint; what is resumed ends where an unbroken run does."""
+    main(["track", str(street), *OPTIONS])
+    unbroken = _lines(capsys.readouterr().out)
+    checkpoint = tmp_path / "tracker.npz"
+    command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *OPTIONS]
+    command += ["--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ})
+    assert process.stdout is not None
+    for line in process.stdout:
+        if json.loads(line)["frame"] >= 13:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists()
+    time.sleep(0.01)
+    main(["track", str(street), *OPTIONS, "--checkpoint", str(checkpoint), "--resume"])
+    resumed = _lines(capsys.readouterr().out)
+    assert resumed[0]["frame"] in (9, 12, 15) and resumed[-1]["frame"] == 19
+    a, b = unbroken[-1], resumed[-1]
+    sigma = a["sigma_time_offset_s"]
+    assert abs(a["time_offset_s"] - b["time_offset_s"]) < 0.3 * sigma
+    off = np.array(a["T_camera_lidar"])[:3, 3] - np.array(b["T_camera_lidar"])[:3, 3]
+    assert np.abs(off).max() < 0.3 * max(a["sigma_translation_m"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume"], "--resume needs --checkpoint"),
+        (["--checkpoint", "x.npz", "--checkpoint-every", "0"], "expected 1 or more"),
+        (["--set", "windw=3"], "unknown setting 'windw'; did you mean 'window'?"),
+        (["--set", "drift.epoch_s=-1"], "epoch_s"),
+        (["--init", "none.json"], "none.json: found no such file"),
+    ],
+)
+def test_bad_options(
+    street: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(["track", str(street), *options]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err

@@ -1,0 +1,126 @@
+"""The parts of the tracker, each against an independent answer."""
+
+from __future__ import annotations
+
+import pickle
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.estimators.alarm import StepAlarm, chi_square
+from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
+from sst_graph.estimators.scores import PairScore, SideSums, fit_sides
+from sst_graph.estimators.tracker_config import AlarmConfig, TrackerConfig
+from sst_graph.uncertainty.covariance import ErrorModel
+
+FloatArray = NDArray[np.float64]
+N = 9
+
+
+def _belief(seed: int) -> Gaussian:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((20, N))
+    point = Point(gtsam.Pose3.Expmap(0.3 * rng.standard_normal(6)), 0.1, rng.standard_normal(2))
+    return Gaussian(point, A.T @ A, rng.standard_normal(N))
+
+
+def test_local_and_moved_are_inverse() -> None:
+    a, step = _belief(1).point, np.linspace(-0.2, 0.3, N)
+    np.testing.assert_allclose(a.local(a.moved(step)), step, atol=1e-12)
+
+
+def test_the_factor_is_the_belief() -> None:
+    belief, keys = _belief(2), [7, 3, 5, 11]
+    factor = pickle.loads(pickle.dumps(belief.factor(keys)))
+    graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
+    graph.add(factor)
+    insert_point(values, keys, belief.point)
+    for key in keys:
+        ordering.push_back(key)
+    H, g = graph.linearize(values).hessian(ordering)
+    np.testing.assert_allclose(H, belief.information, atol=1e-9)
+    np.testing.assert_allclose(g, belief.vector, atol=1e-9)
+    optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+    assert optimum.atVector(3)[0] == pytest.approx(belief.mean().offset_s, abs=1e-6)
+
+
+def test_a_random_walk_adds_its_variance() -> None:
+    belief, variances = _belief(3), np.linspace(0.0, 0.4, N)
+    after = belief.drifted(variances)
+    expected = np.linalg.inv(belief.information) + np.diag(variances)
+    np.testing.assert_allclose(np.linalg.inv(after.information), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.solve(after.information, after.vector), np.linalg.solve(belief.information, belief.vector)
+    )
+
+
+def test_beliefs_add_at_one_point() -> None:
+    a, b = _belief(4), _belief(5)
+    b = Gaussian(a.point.moved(np.full(N, 1e-3)), b.information, b.vector)
+    both = a.plus(b)
+    H = a.information + b.information
+    expected = np.linalg.solve(H, a.vector + b.vector + b.information @ np.full(N, 1e-3))
+    np.testing.assert_allclose(np.linalg.solve(both.information, both.vector), expected, atol=1e-9)
+
+
+def test_error_model_of_simulated_sides() -> None:
+    """Known variances of side, side in a frame, and match come back."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for side in range(400):
+        shared = rng.normal(0.0, 0.6)
+        for _ in range(8):
+            r = shared + rng.normal(0.0, 0.4) + rng.normal(0.0, 0.9, 12)
+            rows.append([side, r.mean(), 12.0, 12.0, ((r - r.mean()) ** 2).sum()])
+    model = fit_sides(np.array(rows))
+    found = np.sqrt([model.side, model.side_frame, model.match])
+    np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)
+
+
+def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
+    """A pair of 200 matches on four sides whose residuals follow the error model (0.25, 0, 1)."""
+    J = rng.standard_normal((200, N))
+    which = np.repeat(np.arange(4), 50)
+    r = -J @ truth + rng.standard_normal(200) + 0.5 * rng.standard_normal(4)[which]
+    scores = np.zeros((4, N))
+    np.add.at(scores, which, J)
+    ones, fifty = np.ones(4), np.full(4, 50.0)
+    sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
+    point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
+    return PairScore(Gaussian(point, J.T @ J, -J.T @ r), J.T @ J, sides, 200)
+
+
+def _model() -> ErrorModel:
+    return ErrorModel(0.25, 0.0, 1.0)
+
+
+def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
+    rng, P = np.random.default_rng(1), 1e-3 * np.eye(N)
+    values = [
+        chi_square([_score(rng, x, 4 * k) for k in range(3)], P, _model())
+        for x in rng.multivariate_normal(np.zeros(N), P, 300)
+    ]
+    assert np.mean(values) == pytest.approx(N, rel=0.12)
+    assert np.quantile(values, 0.95) == pytest.approx(16.9, rel=0.15)  # chi-square with 9 degrees
+
+
+def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
+    rng, P = np.random.default_rng(2), 1e-4 * np.eye(N)
+    alarm = StepAlarm(AlarmConfig(warm_up=5))
+    for k in range(200):
+        alarm.check([_score(rng, np.zeros(N), 4 * k)], P, _model())
+        assert not alarm.alarm
+    step = np.full(N, 0.3)
+    raised = [
+        k for k in range(10) if alarm.check([_score(rng, step, 9000 + 4 * k)], P, _model()) and alarm.alarm
+    ]
+    assert raised and raised[0] < 8
+
+
+def test_settings_out_of_range() -> None:
+    with pytest.raises(ValueError, match="window"):
+        TrackerConfig(window=5)
+    with pytest.raises(ValueError, match="chi2"):
+        AlarmConfig(chi2=0.0)

@@ -1,0 +1,242 @@
+"""The tracker on a short simulated drive: start, refusals, retirement, checkpoint, alarm."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph import Tracker, TrackerConfig
+from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.errors import DataError, EstimationError
+from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
+from sst_graph.problem.graph import Tracks, associate, joint_graph
+from sst_graph.problem.objects import object_tracks
+from sst_graph.types import CameraImage, Frame
+from sst_graph.uncertainty.covariance import robust_covariance
+
+CONFIG = TrackerConfig(start_scans=8)
+STREET = SimulationConfig(
+    seed=3,
+    frames=36,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.3,
+    time_offset_s=0.03,
+    motion="no_stop",
+    speed_mps=6.0,
+    moving_fraction=0.0,
+)
+
+STEP = 20
+"""Frame from which on the calibration has changed, in the tests of that."""
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedDrive:
+    return simulate(STREET)
+
+
+@pytest.fixture(scope="module")
+def frames(street: SimulatedDrive) -> list[Frame]:
+    return [street[i] for i in range(len(street))]
+
+
+def _tracker(street: SimulatedDrive, config: TrackerConfig = CONFIG) -> Tracker:
+    """A tracker that starts from the truth, so that no search is needed."""
+    calibration = config.calibration
+    start = dataclasses.replace(calibration.start, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    return Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+
+
+@pytest.fixture(scope="module")
+def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoint of a tracker after 20 frames."""
+    tracker = _tracker(street)
+    for frame in frames[:20]:
+        tracker.add(frame)
+    assert tracker.started
+    path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
+    save_checkpoint(tracker, path)
+    return path
+
+
+def _distance(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
+    """Mahalanobis distance of the estimate from a calibration."""
+    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+
+
+def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[Frame]) -> None:
+    tracker = Tracker(street.camera, CONFIG, street.nominal)
+    updates = [tracker.add(frame) for frame in frames]
+    assert updates[0].status == "starting" and not updates[0].accepted
+    assert updates[0].sigmas[6] == 1.0
+    assert updates[-1].accepted and updates[-1].status in ("ok", "unobservable")
+    assert updates[-1].sigmas[6] < 0.02
+    assert not any(update.alarm for update in updates)
+    assert (
+        _distance(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+    )  # chi-square of 7: 24
+
+
+def test_the_covariance_is_the_batch_s(running: Path) -> None:
+    tracker = load_checkpoint(running)
+    tracker.settle()
+    drive, _ = tracker.window.drive()
+    state, config = tracker.point.state(tracker.classes), tracker.config.calibration.joint.graph
+    pairs = associate([drive], Tracks([drive]), state, tracker.kernel, config)
+    graph, values = joint_graph(pairs, state, config)
+    expected, _, _ = robust_covariance(graph, values, pairs, state, [object_tracks(drive)])
+    ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+
+
+def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
+    whole, short = _tracker(street), _tracker(street, dataclasses.replace(CONFIG, window=10))
+    for frame in frames:
+        whole.add(frame)
+        short.add(frame)
+    assert short.smoother is not None and whole.smoother is not None
+    assert len(short.smoother.entries) <= 10 < len(whole.smoother.entries)
+    assert _distance(whole, short.point.cTl, short.point.offset_s) < 2.5
+    ratio = np.sqrt(np.diag(short.covariance) / np.diag(whole.covariance))
+    assert ratio.min() > 0.7 and ratio.max() < 1.5
+
+
+def test_bad_frames_leave_the_estimate(running: Path, frames: list[Frame]) -> None:
+    tracker, good = load_checkpoint(running), frames[20]
+    before = tracker.point
+    assert good.scan is not None and good.image is not None
+    points = good.scan.points.copy()
+    points[3, 1] = np.nan
+    wrong = [
+        (Frame(20, None, None), "without scan and without image"),
+        (Frame(20, dataclasses.replace(good.scan, stamp_ns=frames[3].scan.stamp_ns), None), "one after"),
+        (Frame(20, dataclasses.replace(good.scan, points=points), None), "NaN"),
+        (Frame(20, None, dataclasses.replace(good.image, mask=good.image.mask[:9])), "camera's size"),
+        (Frame(20, None, frames[19].image), "second image"),
+    ]
+    for frame, message in wrong:
+        update = tracker.add(frame)
+        assert not update.accepted and message in update.reason
+        assert tracker.point is before
+    assert tracker.add(good).accepted
+
+
+def test_images_and_scans_at_their_own_rates(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Every other image missing, and one late: all scans are used or say why."""
+    tracker = _tracker(street)
+    late = frames[10].image
+    for frame in frames:
+        if frame.index % 2 == 0 and frame.index != 10:
+            assert tracker.add_image(frame.image).accepted
+        update = tracker.add_scan(frame.scan)
+        if frame.index == 12:
+            assert tracker.add_image(late).accepted
+    assert update.accepted
+    assert _distance(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+
+
+def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]) -> None:
+    tracker = load_checkpoint(running)
+    smoother = tracker.smoother
+    assert smoother is not None
+    scan, entry = next(iter(smoother.entries.items()))
+    assert entry.pair.l_twist is not None
+    broken = dataclasses.replace(entry.pair.l_twist, covariance=-np.eye(6))
+    pair = dataclasses.replace(entry.pair, l_twist=broken)
+    before, entries = smoother.point, dict(smoother.entries)
+    with pytest.raises(EstimationError, match="covariance"):
+        smoother.update({scan: (pair, entry.score, 0)}, set(), 0)
+    assert smoother.point is before and smoother.entries == entries
+    assert tracker.add(frames[20]).accepted
+
+
+def test_a_checkpoint_resumes_to_the_same_estimates(
+    street: SimulatedDrive, frames: list[Frame], running: Path
+) -> None:
+    kept = _tracker(street)
+    for frame in frames[:20]:
+        kept.add(frame)
+    resumed = load_checkpoint(running)
+    assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
+    assert resumed.point.offset_s == kept.point.offset_s
+    np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)
+    for frame in frames[20:]:
+        kept.add(frame)
+        resumed.add(frame)
+    assert _distance(kept, resumed.point.cTl, resumed.point.offset_s) < 0.2
+
+
+def test_a_broken_checkpoint_is_named(tmp_path: Path, running: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        load_checkpoint(tmp_path / "none.npz")
+    half = tmp_path / "half.npz"
+    half.write_bytes(running.read_bytes()[:5000])
+    with pytest.raises(DataError, match=r"half\.npz: found no readable checkpoint"):
+        load_checkpoint(half)
+
+
+def _knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
+    """The image of a camera turned about its vertical axis."""
+    K = street.camera.matrix
+    R = gtsam.Rot3.Ry(np.radians(degrees)).matrix()
+    H = K @ R @ np.linalg.inv(K)
+    size = (street.camera.width, street.camera.height)
+    mask = cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return dataclasses.replace(image, mask=mask)
+
+
+@pytest.mark.parametrize("kind", ["knock", "clock"])
+def test_a_step_raises_the_alarm_and_is_learnt(
+    street: SimulatedDrive, frames: list[Frame], kind: str
+) -> None:
+    """The camera is knocked, or its clock jumps; ten frames are enough to notice and to begin again."""
+    tracker = _tracker(street, dataclasses.replace(CONFIG, alarm=AlarmConfig(warm_up=4)))
+    alarms = []
+    for frame in frames:
+        image = frame.image
+        assert image is not None
+        if frame.index >= STEP and kind == "knock":
+            image = _knocked(image, street, 1.5)
+        elif frame.index >= STEP:
+            image = dataclasses.replace(image, stamp_ns=image.stamp_ns + 60_000_000)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        if update.alarm:
+            alarms.append(frame.index)
+            assert update.status == "alarm" and not update.accepted
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
+    assert update.accepted and update.status != "alarm"
+    if kind == "clock":
+        assert tracker.point.offset_s < 0.015
+        assert _distance(tracker, street.truth.cTl, 0.03 - 0.06) < 5.0
+    else:
+        turned = gtsam.Rot3.Ry(np.radians(1.5)) * street.truth.cTl.rotation()
+        off = gtsam.Rot3.Logmap(turned.between(tracker.point.cTl.rotation()))
+        assert np.degrees(np.linalg.norm(off)) < 0.6
+
+
+def test_drift_mode_tells_the_history(street: SimulatedDrive, frames: list[Frame]) -> None:
+    drift = DriftConfig(enabled=True, epoch_s=0.5)
+    tracker = _tracker(street, dataclasses.replace(CONFIG, window=10, drift=drift))
+    for frame in frames:
+        tracker.add(frame)
+    history = tracker.history()
+    assert len(history) >= 5
+    assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(history))
+    last = history[-1]
+    assert _distance(tracker, last.cTl, last.time_offset_s) < 1.5
+    steady = _tracker(street, dataclasses.replace(CONFIG, window=10))
+    for frame in frames:
+        steady.add(frame)
+    assert np.diag(tracker.covariance)[:7].sum() > np.diag(steady.covariance)[:7].sum()
