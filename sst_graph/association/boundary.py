@@ -10,7 +10,7 @@ beside the LiDAR sees that metre.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import cv2
@@ -80,6 +80,11 @@ class Boundaries:
 
     def __len__(self) -> int:
         return len(self.lPs)
+
+    def take(self, index: IntArray) -> Boundaries:
+        """Some of the points, by position."""
+        parts = {field.name: getattr(self, field.name)[index] for field in fields(self)}
+        return Boundaries(**parts)
 
 
 def find_boundaries(

@@ -57,13 +57,13 @@ class SearchConfig:
     box_deg: float = 30.0
     box_step_deg: float = 5.0
     reach_deg: float = 42.0
-    apart_deg: float = 4.0
+    apart_deg: float = 3.0
     held_translation_m: float = 0.1
     translation_m: float = 0.6
     free_translation_m: float = 2.0
     delay_s: float = 0.5
     blurs_px: tuple[float, ...] = (45.0, 22.0, 10.0, 4.0)
-    candidates: tuple[int, ...] = (32, 12, 5, 3)
+    candidates: tuple[int, ...] = (40, 20, 10, 5)
     free_breadth: int = 4
     shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
     population: int = 64

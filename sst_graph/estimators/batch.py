@@ -58,7 +58,10 @@ def calibrate(
     sources = as_sources(frames)
     _check(sources, config)
     began = time.perf_counter()
-    drives = [prepare_drive(source, config.classes, config.prepare, progress) for source in sources]
+    prepare = config.prepare
+    if config.method not in _NEED_IMAGE_TRACKS:
+        prepare = dataclasses.replace(prepare, use_visual_odometry=False)
+    drives = [prepare_drive(source, config.classes, prepare, progress) for source in sources]
     seconds = time.perf_counter() - began
     result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
     timing = {"prepare": seconds, **result.diagnostics["seconds"]}
@@ -169,3 +172,5 @@ _METHODS: dict[Method, _Method] = {
     "static": answer_static,
     "semalign": answer_semalign,
 }
+_NEED_IMAGE_TRACKS = ("paper", "static")
+"""Methods whose velocity comes from visual odometry."""

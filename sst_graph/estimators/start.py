@@ -37,7 +37,7 @@ class StartConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     enabled: bool = True
-    contenders: int = 6
+    contenders: int = 8
     free_contenders: int = 12
     contest_scans: int = 10
     rival_ratio: float = 0.9

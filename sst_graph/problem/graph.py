@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from factors import delay_prior, frame_factor, twist_transfer_factor, velocity_factor
 from factors.robust import RobustKernel
+from sst_graph.association.boundary import Boundaries
 from sst_graph.association.pairing import Pair, pair_by_time
 from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.objects import ObjectId
+from sst_graph.problem.objects import ObjectId, moving_objects
 from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
 from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
@@ -41,7 +42,7 @@ class GraphConfig:
     match: MatchConfig = field(default_factory=MatchConfig)
     max_interval_periods: float = 1.0
     bias_sigma_px: float = 3.0
-    object_bias_sigma_px: float = 1.0
+    object_bias_sigma_px: float = 0.5
     delay_sigma_s: float = 0.5
     rest_sigma_rad: float = 1.0
     rest_sigma_m: float = 1.0
@@ -81,6 +82,20 @@ class Tracks:
     ) -> None:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track() for drive in drives]
         self.objects = objects
+        found = zip(drives, objects, strict=True) if objects is not None else ()
+        self._moving = [moving_objects(drive, tracks) for drive, tracks in found]
+
+    def standing(
+        self, drive: int, scan: int, boundaries: Mapping[SemanticClass, Boundaries]
+    ) -> dict[SemanticClass, Boundaries]:
+        """A scan's boundaries without those of objects that move by themselves."""
+        if not self._moving:
+            return dict(boundaries)
+        still = {}
+        for c, points in boundaries.items():
+            numbers = [n for n in np.unique(points.objects) if (scan, c, int(n)) not in self._moving[drive]]
+            still[c] = points.take(np.flatnonzero(np.isin(points.objects, numbers)))
+        return {c: points for c, points in still.items() if len(points)}
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -102,7 +117,7 @@ def associate(
             l_twist = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
             motion = _camera_motion(l_twist, state.cTl)
             matches = match_silhouettes(
-                drive.scans[pair.scan].boundaries,
+                tracks.standing(number, pair.scan, drive.scans[pair.scan].boundaries),
                 image.contours,
                 drive.camera,
                 state.cTl,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -18,6 +19,25 @@ ObjectId = tuple[int, SemanticClass, int]
 
 _REACH_M = 2.0
 """Farthest an object's centre may seem to jump between scans [m]."""
+
+
+@dataclass(frozen=True)
+class MovingConfig:
+    """What counts as an object that moves by itself.
+
+    Attributes:
+        window_s: half width of the time around a scan that is looked at [s].
+        min_sightings: fewest scans within it.
+        min_speed_mps: least speed [m/s].
+        min_travel_m: least way within the window [m].
+        max_scatter: largest rms distance from a steady motion, as a share of the way.
+    """
+
+    window_s: float = 0.8
+    min_sightings: int = 4
+    min_speed_mps: float = 1.0
+    min_travel_m: float = 0.8
+    max_scatter: float = 0.1
 
 
 class ObjectTracker:
@@ -74,6 +94,49 @@ def object_tracks(drive: Drive) -> dict[ObjectId, int]:
         for (c, number), track in tracker.add(drive.scans[position].boundaries, wTl).items():
             tracks[position, c, number] = track
     return tracks
+
+
+def moving_objects(
+    drive: Drive, tracks: Mapping[ObjectId, int], config: MovingConfig | None = None
+) -> set[ObjectId]:
+    """The objects that move in the world by themselves, scan by scan.
+
+    Around every scan an object's centres within ``window_s`` are fitted by a straight, steady motion. A
+    parked object's centre wanders too, as other sides of it come into view, but neither far nor straight.
+    """
+    config = config or MovingConfig()
+    places: dict[int, list[tuple[ObjectId, float, FloatArray]]] = {}
+    poses = _scan_poses(drive)
+    for (position, c, number), track in tracks.items():
+        boundaries = drive.scans[position].boundaries[c]
+        centre = poses[position].transformFrom(boundaries.lPs[boundaries.objects == number].mean(axis=0))
+        seconds = (drive.scans[position].stamp_ns - drive.scans[0].stamp_ns) * 1e-9
+        places.setdefault(track, []).append(((position, c, number), seconds, centre[:2]))
+    found: set[ObjectId] = set()
+    for sightings in places.values():
+        times = np.array([seconds for _, seconds, _ in sightings])
+        centres = np.stack([centre for _, _, centre in sightings])
+        for object_id, seconds, _ in sightings:
+            near = np.abs(times - seconds) <= config.window_s
+            if _moves(times[near], centres[near], config):
+                found.add(object_id)
+    return found
+
+
+def _moves(times: FloatArray, centres: FloatArray, config: MovingConfig) -> bool:
+    """Whether centres (n, 2) [m] at times (n,) [s] follow a steady motion, unlike a parked object's."""
+    span = float(np.ptp(times)) if len(times) else 0.0
+    if len(times) < config.min_sightings or span <= 0.0:
+        return False
+    design = np.stack([np.ones_like(times), times - times.mean()], axis=1)
+    line = np.linalg.lstsq(design, centres, rcond=None)[0]
+    scatter = float(np.sqrt(np.mean((centres - design @ line) ** 2)))
+    travelled = float(np.linalg.norm(line[1])) * span
+    return (
+        travelled > config.min_travel_m
+        and travelled / span > config.min_speed_mps
+        and scatter < config.max_scatter * travelled
+    )
 
 
 def _scan_poses(drive: Drive) -> Sequence[gtsam.Pose3]:
