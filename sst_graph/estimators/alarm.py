@@ -14,6 +14,10 @@ from sst_graph.uncertainty.covariance import ErrorModel
 
 FloatArray = NDArray[np.float64]
 
+_LEAST_INFORMATION = 1.0
+"""Frames that tell a direction worse than 1 rad, m, s or px tell nothing: at standstill the offset's score is
+rounding over rounding."""
+
 
 class StepAlarm:
     """The score of the last few new frames at the estimate made before them.
@@ -86,7 +90,7 @@ def chi_square(scores: Sequence[PairScore], covariance: FloatArray, model: Error
     if by_side:
         rows = np.stack(list(by_side.values()))
         M += model.side * (rows.T @ rows)
-    variance = M + H @ covariance @ H
+    variance = M + H @ covariance @ H + _LEAST_INFORMATION * np.eye(n)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(variance), 1e-30))
     scaled = variance * np.outer(scale, scale) + 1e-9 * np.eye(n)
     return float((scale * g) @ np.linalg.solve(scaled, scale * g))

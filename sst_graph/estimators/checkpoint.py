@@ -171,10 +171,9 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
             SemanticClass(c): Boundaries(**{name: arrays[f"{place}/{c}/{name}"] for name in _BOUNDARY})
             for c in classes
         }
-        parts = (arrays[f"{place}/{name}"] for name in ("lPs", "classes", "offsets_s"))
-        window.scans.append(
-            (number, ScanFeatures(index, stamp_ns, boundaries, *parts, nothing, nothing[:, 0]))
-        )
+        lPs, labels, offsets_s = (arrays[f"{place}/{name}"] for name in ("lPs", "classes", "offsets_s"))
+        features = ScanFeatures(index, stamp_ns, boundaries, lPs, labels, offsets_s, nothing, nothing[:, 0])
+        window.scans.append((number, features))
         window.tracks[number] = {(SemanticClass(c), n): track for c, n, track in tracks}
     for i, (index, stamp_ns) in enumerate(head["images"]):
         mask = np.frombuffer(zlib.decompress(arrays[f"image/{i}"].tobytes()), np.uint8)

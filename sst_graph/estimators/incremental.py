@@ -26,7 +26,7 @@ from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
 from sst_graph.estimators.window import Window
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
+from sst_graph.problem.drive import Drive, ScanFeatures, image_features, scan_features
 from sst_graph.problem.graph import PairMatches, Tracks, associate
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
@@ -76,6 +76,7 @@ class Tracker:
         self.attempts = 0
         self.waited = 0
         self.inflation = 1.0
+        self._tracks: tuple[int, Tracks] | None = None
 
     @property
     def started(self) -> bool:
@@ -139,9 +140,7 @@ class Tracker:
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
-        if self.smoother is None:
-            return []
-        return self.history_store.smoothed(self.smoother)
+        return [] if self.smoother is None else self.history_store.smoothed(self.smoother)
 
     def resume(self, smoother: WindowSmoother, scans: set[int], point: Point) -> None:
         """Go on with a smoother that an earlier run left behind, some of the window's scans in it."""
@@ -156,8 +155,7 @@ class Tracker:
             raise DataError("tracker", f"a mask of {image.mask.shape}", f"{expected}, the camera's size")
         newest = self.window.last_stamp_ns
         if newest is not None and self.window.images:
-            true_ns = image.stamp_ns + round(self.point.offset_s * 1e9)
-            late = (newest - true_ns) * 1e-9
+            late = (newest - image.stamp_ns) * 1e-9 - self.point.offset_s
             if late > self.config.late_s and image.stamp_ns < self.window.images[-1].stamp_ns:
                 raise DataError(
                     "tracker",
@@ -293,6 +291,12 @@ class Tracker:
                 return True
         return False
 
+    def tracks(self, part: Drive) -> Tracks:
+        """Twists over the window's motions, made once a scan."""
+        if self._tracks is None or self._tracks[0] != self.window.next_scan:
+            self._tracks = (self.window.next_scan, Tracks([part]))
+        return self._tracks[1]
+
     def match(
         self, point: Point, drive: set[int] | None, kernel_px: float | None = None
     ) -> tuple[Found, set[int]]:
@@ -300,7 +304,7 @@ class Tracker:
         kernel = self.kernel if kernel_px is None else RobustKernel("geman_mcclure", kernel_px)
         part, numbers = self.window.drive(None if drive is None else drive.__contains__)
         config = self.config.calibration.joint.graph
-        pairs = associate([part], Tracks([part]), point.state(self.classes), kernel, config)
+        pairs = associate([part], self.tracks(part), point.state(self.classes), kernel, config)
         found: Found = {}
         for pair in pairs:
             if len(pair) < self.config.min_frame_matches:
@@ -325,7 +329,7 @@ class Tracker:
         part, numbers = self.window.drive(set(new).__contains__)
         kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
         config = self.config.calibration.joint.graph
-        pairs = associate([part], Tracks([part]), before.state(self.classes), kernel, config)
+        pairs = associate([part], self.tracks(part), before.state(self.classes), kernel, config)
         tracks = self.window.tracks
         scores = [
             score_pair(pair, before, self.classes, tracks[numbers[pair.pair.scan]], config) for pair in pairs
@@ -339,7 +343,7 @@ class Tracker:
         part, _ = self.window.drive(set(new).__contains__)
         config = self.config.calibration.joint.graph
         in_use = self.adoption.adopted or self._guess_point()
-        tracks = Tracks([part])
+        tracks = self.tracks(part)
         candidate = held_out_cost(part, tracks, before, self.classes, self.kernel, config)
         other = candidate
         if in_use is not None and float(np.abs(before.local(in_use)).max()) > 0.0:

@@ -21,7 +21,7 @@ from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
 from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import ErrorModel, spread_beyond
+from sst_graph.uncertainty.covariance import SIDE_FLOOR, SIDE_FRAME_FLOOR, ErrorModel, spread_beyond
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -251,4 +251,4 @@ def fit_sides(rows: FloatArray) -> ErrorModel:
     total = np.bincount(sides, v)
     side_means = np.bincount(sides, v * means) / np.maximum(total, 1e-12)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(total), dtype=np.intp), centre=0.0)
-    return ErrorModel(side, side_frame, match)
+    return ErrorModel(max(side, SIDE_FLOOR), max(side_frame, SIDE_FRAME_FLOOR), match)

@@ -102,8 +102,8 @@ class TrackerConfig:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     window: int = 60
     renew: int = 2
-    renew_most: int = 12
-    stale_sigmas: float = 0.1
+    renew_most: int = 6
+    stale_sigmas: float = 0.2
     start_scans: int = 12
     restart_scans: int = 8
     start_attempts: int = 4
