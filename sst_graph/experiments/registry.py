@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import paper_table
+from sst_graph.experiments import accuracy, paper_table
 from sst_graph.problem.drive import Progress
 
 
@@ -27,6 +27,11 @@ class Experiment:
 
 
 EXPERIMENTS: Mapping[str, Experiment] = {
+    "accuracy": Experiment(
+        "accuracy, failures and consistency of the joint method, scenario by scenario",
+        accuracy.AccuracyConfig(),
+        accuracy.run,
+    ),
     "paper-table": Experiment(
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
         paper_table.PaperTableConfig(),

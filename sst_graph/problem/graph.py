@@ -36,6 +36,8 @@ class GraphConfig:
         delay_sigma_s: prior deviation of the time offset from the guess [s].
         rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
         rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
+        mover_reach_m: an object that moves farther than this by itself between its scan and its image is
+            left out [m].
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
     """
 
@@ -46,6 +48,7 @@ class GraphConfig:
     delay_sigma_s: float = 0.5
     rest_sigma_rad: float = 1.0
     rest_sigma_m: float = 1.0
+    mover_reach_m: float = 0.003
     still_sigma: tuple[float, float] = (0.05, 0.5)
 
 
@@ -86,14 +89,20 @@ class Tracks:
         self._moving = [moving_objects(drive, tracks) for drive, tracks in found]
 
     def standing(
-        self, drive: int, scan: int, boundaries: Mapping[SemanticClass, Boundaries]
+        self,
+        drive: int,
+        scan: int,
+        boundaries: Mapping[SemanticClass, Boundaries],
+        reach_m: float,
+        tau_s: float,
     ) -> dict[SemanticClass, Boundaries]:
-        """A scan's boundaries without those of objects that move by themselves."""
+        """A scan's boundaries without objects that move by more than ``reach_m`` in an interval."""
         if not self._moving:
             return dict(boundaries)
-        still = {}
+        speeds, still = self._moving[drive], {}
         for c, points in boundaries.items():
-            numbers = [n for n in np.unique(points.objects) if (scan, c, int(n)) not in self._moving[drive]]
+            steps = {n: speeds.get((scan, c, int(n)), 0.0) * abs(tau_s) for n in np.unique(points.objects)}
+            numbers = [n for n, step in steps.items() if step <= reach_m]
             still[c] = points.take(np.flatnonzero(np.isin(points.objects, numbers)))
         return {c: points for c, points in still.items() if len(points)}
 
@@ -117,7 +126,13 @@ def associate(
             l_twist = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
             motion = _camera_motion(l_twist, state.cTl)
             matches = match_silhouettes(
-                tracks.standing(number, pair.scan, drive.scans[pair.scan].boundaries),
+                tracks.standing(
+                    number,
+                    pair.scan,
+                    drive.scans[pair.scan].boundaries,
+                    config.mover_reach_m,
+                    offset_s + pair.base_tau_s,
+                ),
                 image.contours,
                 drive.camera,
                 state.cTl,

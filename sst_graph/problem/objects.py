@@ -98,8 +98,8 @@ def object_tracks(drive: Drive) -> dict[ObjectId, int]:
 
 def moving_objects(
     drive: Drive, tracks: Mapping[ObjectId, int], config: MovingConfig | None = None
-) -> set[ObjectId]:
-    """The objects that move in the world by themselves, scan by scan.
+) -> dict[ObjectId, float]:
+    """Speed [m/s] of the objects that move in the world by themselves, scan by scan.
 
     Around every scan an object's centres within ``window_s`` are fitted by a straight, steady motion. A
     parked object's centre wanders too, as other sides of it come into view, but neither far nor straight.
@@ -112,31 +112,30 @@ def moving_objects(
         centre = poses[position].transformFrom(boundaries.lPs[boundaries.objects == number].mean(axis=0))
         seconds = (drive.scans[position].stamp_ns - drive.scans[0].stamp_ns) * 1e-9
         places.setdefault(track, []).append(((position, c, number), seconds, centre[:2]))
-    found: set[ObjectId] = set()
+    found: dict[ObjectId, float] = {}
     for sightings in places.values():
         times = np.array([seconds for _, seconds, _ in sightings])
         centres = np.stack([centre for _, _, centre in sightings])
         for object_id, seconds, _ in sightings:
             near = np.abs(times - seconds) <= config.window_s
-            if _moves(times[near], centres[near], config):
-                found.add(object_id)
+            speed = _speed(times[near], centres[near], config)
+            if speed > 0.0:
+                found[object_id] = speed
     return found
 
 
-def _moves(times: FloatArray, centres: FloatArray, config: MovingConfig) -> bool:
-    """Whether centres (n, 2) [m] at times (n,) [s] follow a steady motion, unlike a parked object's."""
+def _speed(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:
+    """Speed of centres (n, 2) [m] at times (n,) [s]; 0 where they wander like a parked object's."""
     span = float(np.ptp(times)) if len(times) else 0.0
     if len(times) < config.min_sightings or span <= 0.0:
-        return False
+        return 0.0
     design = np.stack([np.ones_like(times), times - times.mean()], axis=1)
     line = np.linalg.lstsq(design, centres, rcond=None)[0]
     scatter = float(np.sqrt(np.mean((centres - design @ line) ** 2)))
     travelled = float(np.linalg.norm(line[1])) * span
-    return (
-        travelled > config.min_travel_m
-        and travelled / span > config.min_speed_mps
-        and scatter < config.max_scatter * travelled
-    )
+    moves = travelled > config.min_travel_m and scatter < config.max_scatter * travelled
+    speed = travelled / span
+    return speed if moves and speed > config.min_speed_mps else 0.0
 
 
 def _scan_poses(drive: Drive) -> Sequence[gtsam.Pose3]:

@@ -1,0 +1,182 @@
+"""Accuracy and consistency of the joint method on simulated streets, scenario by scenario."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.errors import ConfigError
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.result import Status
+from sst_graph.types import SemanticClass
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One kind of drive and of start.
+
+    Attributes:
+        title: its row in the table.
+        drive: changes to the simulator's settings.
+        classes: that are aligned.
+        guess: False starts from nothing at all.
+        starts: starts tried on every street.
+    """
+
+    title: str
+    drive: Mapping[str, Any]
+    classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
+    guess: bool = True
+    starts: int = 1
+
+
+_MANY = (
+    SemanticClass.VEHICLE,
+    SemanticClass.BUILDING,
+    SemanticClass.VEGETATION,
+    SemanticClass.POLE,
+    SemanticClass.PERSON,
+    SemanticClass.FENCE,
+    SemanticClass.SIGN,
+)
+_STANDING = {"motion": "standing", "frames": 3, "time_offset_s": 0.0}
+_STOP = {"motion": "mixed", "frames": 40, "time_offset_s": 0.1}
+
+SCENARIOS: Mapping[str, Scenario] = {
+    "standing": Scenario("standing, 3 frames", _STANDING, starts=5),
+    "standing-none": Scenario("standing, 3 frames, no guess", _STANDING, guess=False),
+    "stop-100": Scenario("moving with a stop, 40 frames, 100 ms", _STOP),
+    "stop-200": Scenario("the same, 200 ms", {**_STOP, "time_offset_s": 0.2}),
+    "stop-300": Scenario("the same, 300 ms", {**_STOP, "time_offset_s": 0.3}),
+    "classes": Scenario("the same, 100 ms, all classes", _STOP, _MANY),
+    "no-stop": Scenario("no standing frame, varied speed", {**_STOP, "motion": "no_stop"}),
+    "constant": Scenario("constant speed, straight", {**_STOP, "motion": "constant"}),
+    "half-moving": Scenario("half of the vehicles moving", {**_STOP, "moving_fraction": 0.5}),
+    "rolling": Scenario("rolling sweep with times", {**_STOP, "rolling": True}),
+}
+
+
+@dataclass(frozen=True)
+class AccuracyConfig:
+    """Streets, starts and scenarios.
+
+    Attributes:
+        streets: number of simulated streets of every scenario.
+        seed: of the first street; the next ones follow.
+        scenarios: names; all of them by default.
+        start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
+        failed_deg: rotation error (QAD) beyond which a run has failed [deg].
+        label_noise: of the simulator.
+        calibration: settings of the method.
+    """
+
+    streets: int = 10
+    seed: int = 100
+    scenarios: tuple[str, ...] = tuple(SCENARIOS)
+    start_deg: float = 20.0
+    start_m: float = 0.1
+    failed_deg: float = 1.0
+    label_noise: float = 1.0
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.scenarios if name not in SCENARIOS]
+        if unknown or not self.scenarios or self.streets < 1:
+            raise ValueError(f"scenarios: found {unknown or 'none'}, expected some of {', '.join(SCENARIOS)}")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run: its errors against the truth, its status, whether it failed."""
+
+    errors: CalibrationErrors
+    status: Status
+    failed: bool
+
+
+def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
+    """All scenarios on all streets, as a Markdown table.
+
+    Raises:
+        ConfigError: the method aligns no time offset and no covariance can be judged.
+    """
+    if config.calibration.method != "joint":
+        raise ConfigError(f"accuracy is about the joint method, found {config.calibration.method}")
+    rows = [_HEADER, _RULE]
+    for name in config.scenarios:
+        outcomes: list[Outcome] = []
+        for street in range(config.streets):
+            outcomes += _street(SCENARIOS[name], config, config.seed + street)
+            if progress is not None:
+                progress(name, street + 1, config.streets)
+        rows.append(_row(SCENARIOS[name], outcomes))
+    return "\n".join(rows) + "\n"
+
+
+def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outcome]:
+    """Every start on one street; the data are prepared once."""
+    settings: dict[str, Any] = {"label_noise": config.label_noise, **scenario.drive}
+    drive = simulate(SimulationConfig(seed=seed, **settings))
+    prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
+    prepared = prepare_drive(drive, scenario.classes, prepare)
+    calibration = dataclasses.replace(config.calibration, classes=scenario.classes)
+    rng = np.random.default_rng([seed, 7])
+    outcomes = []
+    for _ in range(scenario.starts):
+        start = _start(drive.truth.cTl, config, rng) if scenario.guess else None
+        result = calibrate_prepared([prepared], start, calibration)
+        errors = calibration_errors(
+            result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
+        )
+        outcomes.append(Outcome(errors, result.status, errors.qad_deg > config.failed_deg))
+    return outcomes
+
+
+def _start(cTl: gtsam.Pose3, config: AccuracyConfig, rng: np.random.Generator) -> gtsam.Pose3:
+    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
+    return cTl.retract(np.concatenate([turn, config.start_m * rng.uniform(-1.0, 1.0, 3)]))
+
+
+_HEADER = (
+    "| scenario | runs | failed (silent) | rotation [deg] median / p95 | ATD [cm] median / p95 "
+    "| delay [ms] median / p95 | NEES rotation, translation (of 3), all (of 7) "
+    "| ok / unobservable / not converged |"
+)
+_RULE = "|---|---|---|---|---|---|---|---|"
+
+
+def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
+    """A row; medians and percentiles are over all runs, failed ones included."""
+    failed = [outcome for outcome in outcomes if outcome.failed]
+    silent = sum(outcome.status == "ok" for outcome in failed)
+    errors = [outcome.errors for outcome in outcomes]
+    rotation = _spread([e.qad_deg for e in errors], 3)
+    translation = _spread([100.0 * e.atd_m for e in errors], 2)
+    standing = scenario.drive.get("motion") == "standing"
+    delay = "–" if standing else _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2)
+    nees = [e.nees for e in errors if e.nees is not None]
+    means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
+    counts = [sum(o.status == s for o in outcomes) for s in ("ok", "unobservable", "not_converged")]
+    cells = [
+        scenario.title,
+        str(len(outcomes)),
+        f"{len(failed)} ({silent})",
+        rotation,
+        translation,
+        delay,
+        ", ".join(f"{mean:.1f}" for mean in means),
+        " / ".join(map(str, counts)),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _spread(values: Sequence[float], digits: int) -> str:
+    return f"{np.median(values):.{digits}f} / {np.percentile(values, 95):.{digits}f}"
