@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, paper_table
+from sst_graph.experiments import accuracy, drives, paper_table
 from sst_graph.problem.drive import Progress
 
 
@@ -31,6 +31,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "accuracy, failures and consistency of the joint method, scenario by scenario",
         accuracy.AccuracyConfig(),
         accuracy.run,
+    ),
+    "drives": Experiment(
+        "real drives from many wrong starts: one answer, and its distance from the reference",
+        drives.DrivesConfig(),
+        drives.run,
     ),
     "paper-table": Experiment(
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",

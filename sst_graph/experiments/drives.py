@@ -1,0 +1,124 @@
+"""Real drives from many wrong starts: do all lead to one answer, and how far is it from the reference?"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from sst_graph.data import open_source
+from sst_graph.errors import ConfigError
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.problem.drive import Drive, Progress, prepare_drive
+from sst_graph.problem.graph import Tracks
+from sst_graph.problem.trajectory import camera_twist
+from sst_graph.result import CalibrationResult
+from sst_graph.types import GroundTruth, Source
+
+
+@dataclass(frozen=True)
+class DrivesConfig:
+    """Drives, image shifts and starts.
+
+    Attributes:
+        data: folders of drives that bring a reference calibration.
+        together: also all drives in one graph.
+        shifts: image shifts that are tried.
+        starts: starts of every drive and shift.
+        seed: of the starts.
+        start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
+        calibration: settings of the method.
+    """
+
+    data: tuple[str, ...] = ()
+    together: bool = True
+    shifts: tuple[int, ...] = (0, 1, 2, 3)
+    starts: int = 5
+    seed: int = 0
+    start_deg: float = 10.0
+    start_m: float = 0.1
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+
+def run(config: DrivesConfig, progress: Progress | None = None) -> str:
+    """A Markdown table: one row for every drive and shift.
+
+    Raises:
+        ConfigError: no data.
+        DataError: a drive cannot be used, or brings no reference.
+    """
+    if not config.data:
+        raise ConfigError("data: found none, expected folders, such as --set 'data=[\"DRIVE\"]'")
+    rows = [_HEADER, "|---|---|---|---|---|---|---|---|---|"]
+    for done, shift in enumerate(config.shifts):
+        sources = [open_source(path, image_shift=shift) for path in config.data]
+        prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
+        drives = [prepare_drive(source, config.calibration.classes, prepare) for source in sources]
+        groups = [([source], [drive]) for source, drive in zip(sources, drives, strict=True)]
+        if config.together and len(drives) > 1:
+            groups.append((sources, drives))
+        rows += [_row(some, prepared, shift, config) for some, prepared in groups]
+        if progress is not None:
+            progress("drives", done + 1, len(config.shifts))
+    return "\n".join(rows) + "\n"
+
+
+_HEADER = (
+    "| drive | shift | starts | spread of answers [deg] | rotation [deg] | ATD [cm] | delay error [ms] "
+    "| forward - speed x delay [cm] | status |"
+)
+
+
+def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config: DrivesConfig) -> str:
+    """One drive, or several in one graph, from all starts."""
+    truth = sources[0].truth
+    if truth is None:
+        raise ConfigError(f"{sources[0].name}: found no reference calibration, expected one")
+    rng = np.random.default_rng([config.seed, shift])
+    results = []
+    for _ in range(config.starts):
+        turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
+        shift_m = config.start_m * rng.uniform(-1.0, 1.0, 3)
+        start = truth.cTl.retract(np.concatenate([turn, shift_m]))
+        results.append(calibrate_prepared(drives, start, config.calibration))
+    errors = [calibration_errors(r.T_camera_lidar, r.time_offset_s, truth, None) for r in results]
+    cells = [
+        " + ".join(source.name for source in sources),
+        str(shift),
+        str(len(results)),
+        f"{_spread_deg(results):.3f}",
+        _median([e.qad_deg for e in errors], 3),
+        _median([100.0 * e.atd_m for e in errors], 2),
+        _median([1e3 * (e.time_offset_s or 0.0) for e in errors], 1),
+        _median([100.0 * _along(r, e, truth, drives[0]) for r, e in zip(results, errors, strict=True)], 1),
+        ", ".join(sorted({result.status for result in results})),
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _spread_deg(results: Sequence[CalibrationResult]) -> float:
+    """Largest angle between two of the answers [deg]."""
+    angles = [
+        np.linalg.norm(gtsam.Rot3.Logmap(a.T_camera_lidar.between(b.T_camera_lidar).rotation()))
+        for a, b in itertools.combinations(results, 2)
+    ]
+    return float(np.degrees(max(angles, default=0.0)))
+
+
+def _along(result: CalibrationResult, errors: CalibrationErrors, truth: GroundTruth, drive: Drive) -> float:
+    """Error of the shift along the road that a steady drive does tell: forward - speed x delay [m]."""
+    tracks = Tracks([drive])
+    samples = [tracks.at(0, scan.stamp_ns) for scan in drive.scans]
+    forward = [camera_twist(sample, truth.cTl).twist[5] for sample in samples if sample is not None]
+    speed = float(np.mean(forward)) if forward else 0.0
+    shift = result.T_camera_lidar.translation() - truth.cTl.translation()
+    return float(shift[2] - speed * (errors.time_offset_s or 0.0))
+
+
+def _median(values: Sequence[float], digits: int) -> str:
+    return f"{float(np.median(values)):.{digits}f}"
