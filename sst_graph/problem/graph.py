@@ -45,9 +45,9 @@ class GraphConfig:
     max_interval_periods: float = 1.0
     bias_sigma_px: float = 3.0
     object_bias_sigma_px: float = 0.5
-    delay_sigma_s: float = 0.5
+    delay_sigma_s: float = 0.3
     rest_sigma_rad: float = 1.0
-    rest_sigma_m: float = 1.0
+    rest_sigma_m: float = 0.5
     mover_reach_m: float = 0.003
     still_sigma: tuple[float, float] = (0.05, 0.5)
 
