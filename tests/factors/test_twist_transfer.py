@@ -1,0 +1,91 @@
+"""The twist transfer: sign by hand, derivatives, and gtsam's conjugation as an oracle."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import FactorError, check_jacobians, twist_transfer_factor
+
+V, E, D = gtsam.symbol("V", 0), gtsam.symbol("E", 0), gtsam.symbol("D", 0)
+
+
+def values_at(twist: np.ndarray, cTl: gtsam.Pose3, offset_s: float) -> gtsam.Values:
+    values = gtsam.Values()
+    values.insert(V, twist)
+    values.insert(E, cTl)
+    values.insert(D, np.array([offset_s]))
+    return values
+
+
+def random_pose(rng: np.random.Generator) -> gtsam.Pose3:
+    return gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(0.0, 1.2, 3)), rng.normal(0.0, 2.0, 3))
+
+
+def random_covariance(rng: np.random.Generator) -> np.ndarray:
+    A = rng.normal(0.0, 1.0, (6, 6))
+    return A @ A.T + 0.5 * np.eye(6)
+
+
+def test_signs_by_hand() -> None:
+    # LiDAR x forward, y left, z up; the camera looks along x, and its z axis is the LiDAR's x.
+    cRl = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+    # The camera sits 2 m before the LiDAR: the LiDAR's origin is 2 m behind it.
+    cTl = gtsam.Pose3(cRl, np.array([0.0, 0.0, -2.0]))
+    forward_and_left_turn = np.array([0.0, 0.0, 0.5, 10.0, 0.0, 0.0])
+    braking = np.array([0.0, 0.0, 0.0, -3.0, 0.0, 0.0])
+    factor = twist_transfer_factor(V, E, D, forward_and_left_turn, braking, 0.1, np.eye(6))
+    # 0.3 s later it drives 9.1 m/s; a left turn of 0.5 rad/s swings the camera leftward by 1 m/s.
+    expected = np.array([0.0, -0.5, 0.0, -1.0, 0.0, 9.1])
+    error = factor.unwhitenedError(values_at(expected, cTl, 0.4))
+    np.testing.assert_allclose(error, 0.0, atol=1e-12)
+    faster = expected + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2.0])
+    assert factor.unwhitenedError(values_at(faster, cTl, 0.4))[5] == pytest.approx(2.0)
+    # A later instant is a slower one, so the same V is then too fast.
+    assert factor.unwhitenedError(values_at(expected, cTl, 0.5))[5] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("seed", range(100))
+def test_jacobians(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    twist, rate = rng.normal(0.0, 3.0, (2, 6))
+    factor = twist_transfer_factor(V, E, D, twist, rate, rng.normal(0.0, 0.1), random_covariance(rng))
+    values = values_at(rng.normal(0.0, 3.0, 6), random_pose(rng), rng.normal(0.0, 0.3))
+    assert check_jacobians(factor, values).error < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_conjugated_motion(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cTl, seconds = random_pose(rng), 0.05
+    l_twist = rng.normal(0.0, 2.0, 6)
+    aTb = gtsam.Pose3.Expmap(seconds * l_twist)
+    c_motion = cTl.compose(aTb).compose(cTl.inverse())
+    c_twist = np.asarray(gtsam.Pose3.Logmap(c_motion)) / seconds
+    factor = twist_transfer_factor(V, E, D, l_twist, np.zeros(6), 0.2, np.eye(6))
+    values = values_at(c_twist, cTl, rng.normal())
+    np.testing.assert_allclose(factor.unwhitenedError(values), 0.0, atol=1e-10)
+
+
+def test_whitened_by_the_covariance() -> None:
+    rng = np.random.default_rng(3)
+    covariance, l_twist, twist = random_covariance(rng), rng.normal(size=6), rng.normal(size=6)
+    factor = twist_transfer_factor(V, E, D, l_twist, np.zeros(6), 0.0, covariance)
+    error = twist - l_twist
+    cost = factor.error(values_at(twist, gtsam.Pose3(), 0.0))
+    assert cost == pytest.approx(0.5 * error @ np.linalg.solve(covariance, error))
+
+
+@pytest.mark.parametrize(
+    ("twist", "rate", "covariance"),
+    [
+        (np.zeros(5), np.zeros(6), np.eye(6)),
+        (np.zeros(6), np.full(6, np.nan), np.eye(6)),
+        (np.zeros(6), np.zeros(6), -np.eye(6)),
+        (np.zeros(6), np.zeros(6), np.eye(3)),
+    ],
+)
+def test_bad_arguments(twist: np.ndarray, rate: np.ndarray, covariance: np.ndarray) -> None:
+    with pytest.raises(FactorError):
+        twist_transfer_factor(V, E, D, twist, rate, 0.0, covariance)
