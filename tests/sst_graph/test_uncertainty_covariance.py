@@ -1,0 +1,155 @@
+"""The sandwich's filling by brute force, the error model from its own draws, and gtsam's marginals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.problem.state import EXTRINSIC, bias_key, delay_key, twist_key
+from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.covariance import (
+    SIDE_FLOOR,
+    SIDE_FRAME_FLOOR,
+    ErrorModel,
+    MatchTable,
+    Unknowns,
+    fit_error_model,
+    marginal_covariance,
+    score_variance,
+    spread_beyond,
+)
+
+VEHICLE = SemanticClass.VEHICLE
+
+
+def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
+    """Matches on 4 sides, each seen in 3 frames."""
+    rng = np.random.default_rng(seed)
+    sides = rng.integers(0, 4, m)
+    frames = sides * 3 + rng.integers(0, 3, m)
+    roots = rng.uniform(0.1, 1.0, m)
+    J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
+    return MatchTable(J, roots, rng.normal(size=m), sides, np.unique(frames, return_inverse=True)[1])
+
+
+def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
+    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model."""
+    rng = np.random.default_rng(seed)
+    frames = np.repeat(np.arange(1800), 12)
+    sides = frames // 6
+    r = (
+        rng.normal(0.0, np.sqrt(model.side), 300)[sides]
+        + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
+        + rng.normal(0.0, np.sqrt(model.match), len(frames))
+    )
+    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames)
+
+
+def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
+    """J^T Z R Z J with the residuals' covariance R (m, m) written out."""
+    R = model.side * (table.sides[:, None] == table.sides)
+    R = R + model.side_frame * (table.side_frames[:, None] == table.side_frames)
+    R = R + model.match * np.eye(len(table.r))
+    rows = table.root_weights[:, None] * table.J
+    return rows.T @ R @ rows
+
+
+MODELS = [ErrorModel(0.7, 0.3, 1.4), ErrorModel(0.0, 0.5, 0.9), ErrorModel(0.6, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("model", MODELS)
+def test_score_variance_by_brute_force(seed: int, model: ErrorModel) -> None:
+    table = replace(random_table(seed), root_weights=np.ones(40))
+    np.testing.assert_allclose(score_variance(table, model), brute_force(table, model), atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("model", MODELS)
+def test_score_variance_of_weighted_matches(seed: int, model: ErrorModel) -> None:
+    table = random_table(seed)
+    # What the clusters share is exact; all in all the variance is never below that of the model.
+    shared = replace(model, match=0.0)
+    np.testing.assert_allclose(score_variance(table, shared), brute_force(table, shared), atol=1e-10)
+    surplus = score_variance(table, model) - brute_force(table, model)
+    assert np.linalg.eigvalsh(surplus)[0] > -1e-9
+
+
+def test_independent_matches_keep_their_information() -> None:
+    table = random_table(0)
+    np.testing.assert_allclose(score_variance(table, ErrorModel(0.0, 0.0, 1.0)), table.J.T @ table.J)
+
+
+def test_fitted_variances_are_those_drawn() -> None:
+    model = ErrorModel(1.5, 0.6, 0.9)
+    fitted = [fit_error_model(drawn_table(model, seed)) for seed in range(4)]
+    assert np.mean([f.match for f in fitted]) == pytest.approx(model.match, rel=0.03)
+    assert np.mean([f.side_frame for f in fitted]) == pytest.approx(model.side_frame, rel=0.08)
+    assert np.mean([f.side for f in fitted]) == pytest.approx(model.side, rel=0.12)
+
+
+def test_floors() -> None:
+    fitted = fit_error_model(drawn_table(ErrorModel(0.0, 0.0, 1.0), 0))
+    assert (fitted.side, fitted.side_frame) == (SIDE_FLOOR, SIDE_FRAME_FLOOR)
+    assert fitted.match == pytest.approx(1.0, rel=0.03)
+
+
+def test_spread_beyond() -> None:
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(500), 8)
+    variances = rng.uniform(0.2, 1.0, 4000)
+    means = rng.normal(0.0, 5.0, 500)[groups] + rng.normal(0.0, np.sqrt(variances + 0.8))
+    assert spread_beyond(means, variances, groups) == pytest.approx(0.8, rel=0.1)
+    quiet = rng.normal(0.0, np.sqrt(variances))
+    assert spread_beyond(quiet, variances, groups) == pytest.approx(0.0, abs=0.04)
+    one = np.zeros(4000, dtype=int)
+    assert spread_beyond(quiet + 2.0, variances, np.zeros(4000, int), centre=0.0) == pytest.approx(
+        4.0, rel=0.1
+    )
+    # One mean in each group tells nothing of a spread.
+    assert spread_beyond(means[:5], variances[:5], np.arange(5)) == 0.0
+
+
+def small_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Unknowns]:
+    """Linear ties between extrinsic, offset, a bias and two twists, with correlated noise."""
+    rng = np.random.default_rng(5)
+    keys = {EXTRINSIC: 6, delay_key(): 1, bias_key(0, VEHICLE): 1, twist_key(0, 3): 6, twist_key(0, 7): 6}
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(EXTRINSIC, gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.2, 0.1), np.array([0.1, 0.2, 0.3])))
+    for key in list(keys)[1:]:
+        values.insert(key, rng.normal(size=keys[key]))
+    for _ in range(6):
+        blocks = [(key, rng.normal(size=(4, dim))) for key, dim in keys.items()]
+        terms = [item for block in blocks for item in block]
+        # JacobianFactors take three keys at most: tie them two at a time.
+        for k in range(0, len(terms) - 2, 2):
+            noise = gtsam.noiseModel.Isotropic.Sigma(4, rng.uniform(0.5, 2.0))
+            linear = gtsam.JacobianFactor(
+                *terms[k : k + 4],
+                rng.normal(size=4),
+                gtsam.noiseModel.Isotropic.Sigma(4, rng.uniform(0.5, 2.0)),
+            )
+            graph.add(gtsam.LinearContainerFactor(linear, values))
+    for key, dim in keys.items():
+        prior = gtsam.JacobianFactor(
+            key, np.eye(dim), np.zeros(dim), gtsam.noiseModel.Isotropic.Sigma(dim, 3.0)
+        )
+        graph.add(gtsam.LinearContainerFactor(prior, values))
+    return graph, values, Unknowns((EXTRINSIC, delay_key(), bias_key(0, VEHICLE)))
+
+
+def test_marginals_are_gtsams() -> None:
+    graph, values, unknowns = small_graph()
+    found = marginal_covariance(graph, values, unknowns)
+    joint = gtsam.Marginals(graph, values).jointMarginalCovariance(list(unknowns.keys))
+    expected = np.block([[joint.at(a, b) for b in unknowns.keys] for a in unknowns.keys])
+    assert found.shape == (8, 8) == (unknowns.size, unknowns.size)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_columns_of_the_unknowns() -> None:
+    _, _, unknowns = small_graph()
+    assert [unknowns.column(key) for key in unknowns.keys] == [0, 6, 7]
