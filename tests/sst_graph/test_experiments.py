@@ -70,7 +70,7 @@ def test_the_command_writes_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["magic"], "expected one of paper-table"),
+        (["magic"], "expected one of accuracy"),
         (["paper-table", "--methods", "papre"], "papre"),
         (["paper-table", "--streets", "0"], "expected one or more"),
         (["paper-table", "--set", "strets=3"], "did you mean 'streets'"),
