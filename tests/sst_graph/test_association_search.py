@@ -99,7 +99,7 @@ def test_the_truth_scores_above_wrong_poses(blur_px: float) -> None:
 
 def test_rotation_matrices_are_gtsams() -> None:
     vectors = np.random.default_rng(1).normal(0.0, 1.5, (50, 3))
-    vectors[:2] = 0.0, 1e-9
+    vectors[0], vectors[1] = 0.0, 1e-9
     expected = [gtsam.Rot3.Expmap(vector).matrix() for vector in vectors]
     np.testing.assert_allclose(rotation_matrices(vectors), expected, atol=1e-12)
 
