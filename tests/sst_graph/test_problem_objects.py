@@ -1,0 +1,104 @@
+"""Objects followed from scan to scan; those that move by themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import PinholeCamera
+from sst_graph.association.boundary import Boundaries
+from sst_graph.problem.drive import Drive, ScanFeatures
+from sst_graph.problem.objects import MovingConfig, ObjectTracker, moving_objects, object_tracks
+from sst_graph.types import RelativeMotion, SemanticClass
+
+VEHICLE, POLE = SemanticClass.VEHICLE, SemanticClass.POLE
+PERIOD_NS = 100_000_000
+SCANS = 12
+STEP = gtsam.Pose3(gtsam.Rot3.Yaw(0.02), np.array([0.7, 0.0, 0.0]))
+"""The LiDAR's own motion between scans."""
+
+
+def boundaries(*centres: np.ndarray) -> Boundaries:
+    """Six points around each centre (in the LiDAR frame), object k the k-th."""
+    around = 0.5 * np.vstack([np.eye(3), -np.eye(3)])
+    lPs = np.concatenate([centre + around for centre in centres])
+    n = len(lPs)
+    numbers = np.repeat(np.arange(len(centres)), 6)
+    return Boundaries(lPs, lPs.copy(), np.ones(n), np.zeros(n), np.zeros(n, np.uint8), numbers)
+
+
+def drive(*paths: Callable[[float], np.ndarray]) -> Drive:
+    """Scans of a LiDAR that drives a curve past vehicles whose world places are given over time [s]."""
+    scans, wTl = [], gtsam.Pose3()
+    nothing, small = np.zeros(0), np.zeros((0, 3), np.float32)
+    for k in range(SCANS):
+        places = [wTl.transformTo(path(0.1 * k)) for path in paths]
+        found = {VEHICLE: boundaries(*places)}
+        labels = np.zeros(0, np.uint8)
+        scans.append(
+            ScanFeatures(k, k * PERIOD_NS, found, np.zeros((0, 3)), labels, nothing, small, small[:, 0])
+        )
+        wTl = wTl.compose(STEP)
+    motions = [
+        RelativeMotion(k * PERIOD_NS, (k + 1) * PERIOD_NS, STEP, np.eye(6) * 1e-6) for k in range(SCANS - 1)
+    ]
+    camera = PinholeCamera(700.0, 700.0, 320.0, 100.0, 640, 200)
+    return Drive("made by hand", camera, tuple(scans), (), tuple(motions), ())
+
+
+def parked(seconds: float) -> np.ndarray:
+    return np.array([12.0, 5.0, 0.0])
+
+
+def wandering(seconds: float) -> np.ndarray:
+    """A parked vehicle whose visible side changes: a metre along it, to and fro."""
+    return np.array([15.0 + 0.5 * np.sin(11.0 * seconds), -6.0 + 0.3 * np.cos(17.0 * seconds), 0.0])
+
+
+def creeping(seconds: float) -> np.ndarray:
+    return np.array([30.0 + 0.4 * seconds, 8.0, 0.0])
+
+
+def mover(seconds: float) -> np.ndarray:
+    return np.array([20.0, 0.0, 0.0]) + seconds * np.array([6.0, -2.0, 0.0])
+
+
+def test_one_track_for_each_object() -> None:
+    made = drive(parked, wandering, mover)
+    tracks = object_tracks(made)
+    assert len(tracks) == 3 * SCANS
+    numbers = [{tracks[k, VEHICLE, n] for k in range(SCANS)} for n in range(3)]
+    assert all(len(found) == 1 for found in numbers) and len(set.union(*numbers)) == 3
+
+
+def test_a_mover_is_found_and_parked_vehicles_are_not() -> None:
+    made = drive(parked, wandering, creeping, mover)
+    found = moving_objects(made, object_tracks(made))
+    assert set(found) == {(k, VEHICLE, 3) for k in range(SCANS)}
+    assert list(found.values()) == pytest.approx([np.hypot(6.0, 2.0)] * SCANS, rel=1e-6)
+
+
+def test_too_few_sightings_tell_nothing() -> None:
+    made = drive(mover)
+    tracks = object_tracks(made)
+    assert moving_objects(made, tracks)
+    assert not moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))
+    assert not moving_objects(made, {key: tracks[key] for key in list(tracks)[:3]})
+    assert not moving_objects(made, {})
+
+
+def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
+    tracker, here = ObjectTracker(memory=2), np.array([10.0, 0.0, 0.0])
+    first = tracker.add({VEHICLE: boundaries(here), POLE: boundaries(here)}, gtsam.Pose3())
+    assert sorted(first.values()) == [0, 1]
+    for _ in range(2):
+        tracker.add({}, gtsam.Pose3())
+    assert tracker.live == {} and tracker.last_seen == {}
+    again = tracker.add({VEHICLE: boundaries(here)}, gtsam.Pose3())
+    assert list(again.values()) == [2]
+    # One track is not given to two objects of a scan.
+    both = tracker.add({VEHICLE: boundaries(here, here + 0.5)}, gtsam.Pose3())
+    assert len(set(both.values())) == 2 and 2 in both.values()
