@@ -1,0 +1,47 @@
+"""Motions between standing frames become none at all."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from sst_graph.odometry.standing import StandingConfig, at_rest
+from sst_graph.types import RelativeMotion
+
+PERIOD_NS = 100_000_000
+COVARIANCE = np.diag(np.repeat([1e-4, 1e-3], 3) ** 2)
+
+
+def motions(*speeds_mps: float) -> list[RelativeMotion]:
+    return [
+        RelativeMotion(
+            k * PERIOD_NS,
+            (k + 1) * PERIOD_NS,
+            gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * speed, 0.0, 0.0])),
+            COVARIANCE,
+        )
+        for k, speed in enumerate(speeds_mps)
+    ]
+
+
+def test_only_the_stop_is_replaced() -> None:
+    given = motions(2.0, 1.0, 0.01, 0.03, 0.02, 0.01, 0.5, 2.0)
+    found = at_rest(given)
+    config = StandingConfig()
+    # The first and the last quiet motion touch a frame that still, or again, rolls.
+    still = [k for k, (a, b) in enumerate(zip(given, found, strict=True)) if a is not b]
+    assert still == [3, 4]
+    for k in still:
+        assert found[k].aTb.equals(gtsam.Pose3(), 0.0)
+        assert (found[k].from_ns, found[k].to_ns) == (given[k].from_ns, given[k].to_ns) and found[k].ok
+        sigmas = np.sqrt(np.diag(found[k].covariance))
+        np.testing.assert_allclose(sigmas, np.repeat([config.rest_sigma_rad, config.rest_sigma_m], 3))
+    # What was given stays as it was.
+    assert given[3].aTb.translation()[0] > 0.0 and (given[3].covariance == COVARIANCE).all()
+
+
+def test_a_standing_drive_and_a_moving_one() -> None:
+    assert all(not motion.mean_twist.any() for motion in at_rest(motions(0.01, -0.02, 0.03)))
+    driving = motions(1.0, 2.0, 3.0)
+    assert all(a is b for a, b in zip(at_rest(driving), driving, strict=True))
+    assert at_rest([]) == []
