@@ -16,7 +16,7 @@ from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, solve_joint
+from sst_graph.estimators.joint import JointSolution, solve_joint, support
 from sst_graph.estimators.start import find_start
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
@@ -108,11 +108,8 @@ def answer_joint(
     candidates = find_start(drives, tracks, config.classes, guess.cTl, guess.offset_s, config.start)
     # 2. Where the best candidates lead to on a few frames; the best supported wins.
     contest = hold_contest(drives, tracks, candidates, guess.cTl, guess.offset_s, config.joint, config.start)
-    # 3. Silhouettes over all frames.
-    clocks = len(drives) if config.delay_per_drive else 1
-    start = State(contest.cTl, (contest.offset_s,) * clocks)
-    centre = prior_centre(start, guess.cTl, guess.offset_s)
-    solution = solve_joint(drives, start, config.joint, progress, centre)
+    # 3. Silhouettes over all frames, from the winner and from a runner-up that differs from it.
+    solution = max(_finals(drives, contest, guess, config, progress), key=support)
     # 4. How sure, and in which directions not at all.
     covariance, model, _ = robust_covariance(
         solution.graph, solution.values, solution.pairs, solution.state, [object_tracks(d) for d in drives]
@@ -136,6 +133,32 @@ def answer_joint(
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
         },
     )
+
+
+def _finals(
+    drives: Sequence[Drive],
+    contest: Contest,
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None,
+) -> list[JointSolution]:
+    """Solutions of the whole problem from every finalist.
+
+    Raises:
+        EstimationError: none of them leads anywhere.
+    """
+    clocks = len(drives) if config.delay_per_drive else 1
+    found, failures = [], []
+    for cTl, offset_s in contest.finalists:
+        start = State(cTl, (offset_s,) * clocks)
+        centre = prior_centre(start, guess.cTl, guess.offset_s)
+        try:
+            found.append(solve_joint(drives, start, config.joint, progress, centre))
+        except EstimationError as error:
+            failures.append(error)
+    if not found:
+        raise failures[0]
+    return found
 
 
 def _doubts(solution: JointSolution, contest: Contest) -> tuple[str, ...]:

@@ -16,16 +16,22 @@ from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.state import State
 
+_ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
+"""Solutions on a few frames that are closer than all of these lead to one answer."""
 _SAME_DEG = 2.0
 """Solutions closer than this are one [deg]."""
 
 
 @dataclass(frozen=True)
 class Contest:
-    """The winner, and why it may be the wrong one (None where nothing speaks for another)."""
+    """Outcome of a contest.
 
-    cTl: gtsam.Pose3
-    offset_s: float
+    Attributes:
+        finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first.
+        doubt: why the winner may be the wrong one; None where nothing speaks for another.
+    """
+
+    finalists: tuple[tuple[gtsam.Pose3, float], ...]
     doubt: str | None
 
 
@@ -44,7 +50,7 @@ def hold_contest(
         EstimationError: no candidate leads anywhere.
     """
     if not config.enabled:
-        return Contest(candidates[0].cTl, candidates[0].offset_s, None)
+        return Contest(((candidates[0].cTl, candidates[0].offset_s),), None)
     few = [_thinned(drive, config.contest_scans) for drive in drives]
     simple = replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
     solutions, failures = [], []
@@ -62,8 +68,21 @@ def hold_contest(
     if not solutions:
         raise failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
     solutions.sort(key=support, reverse=True)
-    best = solutions[0]
-    return Contest(best.state.cTl, best.state.offsets_s[0], _doubt(solutions, config))
+    return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config))
+
+
+def _finalists(solutions: Sequence[JointSolution], most: int) -> tuple[tuple[gtsam.Pose3, float], ...]:
+    """The first ``most`` solutions that differ; a few frames cannot always tell near ones apart."""
+    found: list[tuple[gtsam.Pose3, float]] = []
+    for solution in solutions:
+        cTl, offset_s = solution.state.cTl, solution.state.offsets_s[0]
+        shifts = [(np.abs(gtsam.Pose3.Logmap(cTl.between(other))), abs(offset_s - s)) for other, s in found]
+        if all(
+            step[:3].max() > _ALIKE_RAD or step[3:].max() > _ALIKE_M or late > _ALIKE_S
+            for step, late in shifts
+        ):
+            found.append((cTl, offset_s))
+    return tuple(found[:most])
 
 
 def _thinned(drive: Drive, most: int) -> Drive:

@@ -29,6 +29,7 @@ class StartConfig:
         enabled: False takes the guess as it is.
         contenders, free_contenders: most candidates whose joint solutions are compared, with and without
             a guess.
+        finalists: most different solutions of the contest that are solved on all frames.
         contest_scans: scans of each drive that they are compared on.
         rival_ratio: a different solution that at least this fraction of the best one's matches supports
             makes the answer ambiguous.
@@ -39,6 +40,7 @@ class StartConfig:
     enabled: bool = True
     contenders: int = 8
     free_contenders: int = 12
+    finalists: int = 2
     contest_scans: int = 10
     rival_ratio: float = 0.9
     min_class_points: int = 30
