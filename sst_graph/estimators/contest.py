@@ -55,7 +55,7 @@ def hold_contest(
     simple = replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
     solutions, failures = [], []
     contenders = config.free_contenders if guess_cTl is None else config.contenders
-    for candidate in candidates[:contenders]:
+    for candidate in _with_offsets(candidates[:contenders], guess_offset_s):
         start = State(candidate.cTl, (candidate.offset_s,))
         centre = prior_centre(start, guess_cTl, guess_offset_s)
         try:
@@ -69,6 +69,14 @@ def hold_contest(
         raise failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
     solutions.sort(key=support, reverse=True)
     return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config))
+
+
+def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
+    """The candidates, and the first of them at other time offsets: slow frames hardly tell the offset."""
+    if all(candidate.offset_s == guess_offset_s for candidate in candidates):
+        return list(candidates)
+    others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
+    return [*candidates, *others]
 
 
 def _finalists(solutions: Sequence[JointSolution], most: int) -> tuple[tuple[gtsam.Pose3, float], ...]:
