@@ -109,10 +109,13 @@ def answer_joint(
     # 2. Where the best candidates lead to on a few frames; the best supported wins.
     contest = hold_contest(drives, tracks, candidates, guess.cTl, guess.offset_s, config.joint, config.start)
     # 3. Silhouettes over all frames, from the winner and from a runner-up that differs from it.
-    solution = max(_finals(drives, contest, guess, config, progress), key=support)
+    objects = [object_tracks(drive) for drive in drives]
+    by_object = config.joint.graph.object_bias_sigma_px > 0.0
+    tracks = Tracks(drives, objects) if by_object else tracks
+    solution = max(_finals(drives, tracks, contest, guess, config, progress), key=support)
     # 4. How sure, and in which directions not at all.
     covariance, model, _ = robust_covariance(
-        solution.graph, solution.values, solution.pairs, solution.state, [object_tracks(d) for d in drives]
+        solution.graph, solution.values, solution.pairs, solution.state, objects
     )
     return Answer(
         solution.state.cTl,
@@ -137,6 +140,7 @@ def answer_joint(
 
 def _finals(
     drives: Sequence[Drive],
+    tracks: Tracks,
     contest: Contest,
     guess: Guess,
     config: CalibrationConfig,
@@ -153,7 +157,7 @@ def _finals(
         start = State(cTl, (offset_s,) * clocks)
         centre = prior_centre(start, guess.cTl, guess.offset_s)
         try:
-            found.append(solve_joint(drives, start, config.joint, progress, centre))
+            found.append(solve_joint(drives, start, config.joint, progress, centre, tracks))
         except EstimationError as error:
             failures.append(error)
     if not found:
