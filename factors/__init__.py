@@ -38,6 +38,7 @@ Arrays
 
 from .alignment import (
     Alignment,
+    GroupedBias,
     alignment_cost,
     frame_factor,
     pixel_to_point_factor,
@@ -70,6 +71,7 @@ __all__ = [
     "MIN_DEPTH_M",
     "Alignment",
     "FactorError",
+    "GroupedBias",
     "JacobianBlock",
     "JacobianReport",
     "KernelKind",

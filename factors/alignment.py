@@ -26,6 +26,7 @@ from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, 
 
 __all__ = [
     "Alignment",
+    "GroupedBias",
     "alignment_cost",
     "frame_factor",
     "pixel_to_point_factor",
@@ -35,8 +36,21 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-_COLUMNS = {"cTl": range(0, 6), "offset_s": range(6, 7), "c_twist": range(7, 13), "bias_px": range(13, 14)}
-"""Where each quantity stands among the Jacobian's columns."""
+_COLUMNS = {"cTl": range(0, 6), "offset_s": range(6, 7), "c_twist": range(7, 13)}
+"""Where each quantity stands among the Jacobian's columns; biases follow, the residual is last."""
+
+
+@dataclass(frozen=True, eq=False)
+class GroupedBias:
+    """Mask biases of the objects that one alignment's matches lie on.
+
+    Attributes:
+        biases: key of each object's bias, or a fixed bias [px].
+        groups: (n,) position in ``biases`` for each match.
+    """
+
+    biases: tuple[int | float, ...]
+    groups: NDArray[np.intp]
 
 
 def point_to_pixel_factor(
@@ -82,7 +96,7 @@ def frame_factor(
     cTl: int | gtsam.Pose3,
     offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
-    biases_px: Sequence[int | float | None] | int | float | None = None,
+    biases_px: Sequence[int | float | GroupedBias | None] | int | float | None = None,
     *,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
@@ -94,7 +108,8 @@ def frame_factor(
         offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key).
         c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for zero.
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
-            with one entry for each alignment (None for those that are point-to-pixel).
+            with one entry for each alignment (None for those that are point-to-pixel; a
+            :class:`GroupedBias` where the objects of one alignment have a bias each).
         condensed: False gives two rows a match and one more; for tests and for looking at residuals.
 
     Returns:
@@ -128,20 +143,33 @@ class _Source:
 
 @dataclass(frozen=True)
 class _Part:
-    """One alignment, its bias, and how its columns stand among those of the factor.
+    """One alignment, its biases, and how its columns stand among those of the factor.
 
     Attributes:
+        biases: none, one for all matches, or one for each group of them.
+        groups: (n,) the bias of each match, or None where all share one.
         columns: columns of the alignment's [J r] that belong to variables, the residual last.
         targets: the same columns in the factor's [J r].
     """
 
     alignment: Alignment
-    bias: _Source | None
+    biases: list[_Source]
+    groups: NDArray[np.intp] | None
     columns: list[int]
     targets: list[int]
 
-    def bias_px(self, values: Sequence[Any]) -> float | None:
-        return None if self.bias is None else _scalar(self.bias.value(values))
+    def bias_px(self, values: Sequence[Any]) -> float | FloatArray | None:
+        if not self.biases:
+            return None
+        biases = [_scalar(bias.value(values)) for bias in self.biases]
+        return biases[0] if self.groups is None else np.array(biases)[self.groups]
+
+    def weighted(self, evaluated: Evaluated) -> tuple[Evaluated, float]:
+        """Its rows weighted, with a column for each bias, and its constant."""
+        constant = weigh(self.alignment, evaluated)
+        if self.groups is not None:
+            evaluated = evaluated.by_group(self.groups, len(self.biases))
+        return evaluated, constant
 
 
 @dataclass(frozen=True)
@@ -164,8 +192,7 @@ class FrameResidual:
 
     def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[Evaluated, float]:
         """Weighted [J r] of one alignment and its constant."""
-        evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), True)
-        return evaluated, weigh(part.alignment, evaluated)
+        return part.weighted(evaluate(part.alignment, *self._state(values), part.bias_px(values), True))
 
     def cost(self, values: Sequence[Any]) -> float:
         total = 0.0
@@ -222,28 +249,33 @@ def frame_residual(
     twist = variables.source(
         c_twist, 6, lambda v: checked_array("c_twist", np.zeros(6) if v is None else v, (6,))
     )
-    biases = [
-        None if bias is None else variables.source(bias, 1, _scalar)
-        for bias in _bias_of_each(alignments, biases_px)
-    ]
+    biases = [_bias_sources(bias, variables) for bias in _bias_of_each(alignments, biases_px)]
     if not variables.keys:
         raise FactorError("keys of a frame's factor", "constants only", "the key of one variable or more")
     cols = sum(variables.dims)
     parts = []
-    for alignment, bias in zip(alignments, biases, strict=True):
+    for alignment, (sources, groups) in zip(alignments, biases, strict=True):
         columns, targets = [], []
-        named = {"cTl": pose, "offset_s": offset, "c_twist": twist, "bias_px": bias}
-        for name, source in named.items():
-            if source is not None and source.slot is not None:
-                columns += list(_COLUMNS[name])
+        named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["offset_s"]), (twist, _COLUMNS["c_twist"])]
+        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(sources)]
+        for source, own in named:
+            if source.slot is not None:
+                columns += list(own)
                 start = sum(variables.dims[: source.slot])
-                targets += list(range(start, start + len(_COLUMNS[name])))
-        residual = 13 if bias is None else 14
-        parts.append(_Part(alignment, bias, [*columns, residual], [*targets, cols]))
+                targets += list(range(start, start + len(own)))
+        parts.append(_Part(alignment, sources, groups, [*columns, 13 + len(sources)], [*targets, cols]))
     return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
 
 
-def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | None]:
+def _bias_sources(
+    bias: int | float | GroupedBias | None, variables: _Variables
+) -> tuple[list[_Source], NDArray[np.intp] | None]:
+    if isinstance(bias, GroupedBias):
+        return [variables.source(each, 1, _scalar) for each in bias.biases], bias.groups
+    return ([] if bias is None else [variables.source(bias, 1, _scalar)]), None
+
+
+def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | GroupedBias | None]:
     """The bias of each alignment; a single one belongs to the silhouettes."""
     if isinstance(biases_px, list | tuple):
         if len(biases_px) != len(alignments):
@@ -257,6 +289,15 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
         if alignment.normals is None and bias is not None:
             raise FactorError(
                 "biases_px", "a bias for point-to-pixel matches", "None: only silhouettes have one"
+            )
+        if isinstance(bias, GroupedBias) and (
+            bias.groups.shape != (len(alignment),)
+            or not np.isin(bias.groups, np.arange(len(bias.biases))).all()
+        ):
+            raise FactorError(
+                "groups of a GroupedBias",
+                f"shape {bias.groups.shape}, up to {bias.groups.max(initial=-1)}",
+                f"({len(alignment)},), positions in {len(bias.biases)} biases",
             )
     return biases
 

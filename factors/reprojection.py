@@ -36,7 +36,7 @@ def residuals(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None = None,
+    bias_px: float | FloatArray | None = None,
     jacobians: Literal[True] = True,
 ) -> tuple[FloatArray, FloatArray]: ...
 @overload
@@ -45,7 +45,7 @@ def residuals(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None = None,
+    bias_px: float | FloatArray | None = None,
     *,
     jacobians: Literal[False],
 ) -> tuple[FloatArray, None]: ...
@@ -54,7 +54,7 @@ def residuals(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None = None,
+    bias_px: float | FloatArray | None = None,
     jacobians: bool = True,
 ) -> tuple[FloatArray, FloatArray | None]:
     """Unwhitened residuals, predicted - measured [px], and their Jacobian.
@@ -65,7 +65,7 @@ def residuals(
         offset_s: time offset [s].
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
         bias_px: silhouettes only: how far the mask's contour lies outside the true outline [px]
-            (dilation positive); given, it is the last column of the Jacobian.
+            (dilation positive), one number or (n,); given, it is the last column of the Jacobian.
         jacobians: False saves the work and returns None for J.
 
     Returns:
@@ -84,7 +84,7 @@ def weighted_residuals(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None = None,
+    bias_px: float | FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Whitened and robustly weighted residuals.
 
@@ -103,7 +103,7 @@ def alignment_cost(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None = None,
+    bias_px: float | FloatArray | None = None,
 ) -> float:
     """Robust cost: sum weight_i rho(|r_i| / sigma_i), with points behind as the module says."""
     return cost(alignment, evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=False))
@@ -129,6 +129,14 @@ class Evaluated:
         rows = self.rows.reshape(len(self.rows), -1)
         return rows if self.lift is None else np.concatenate([self.lift @ rows[:6], rows[6:]])
 
+    def by_group(self, groups: NDArray[np.intp], count: int) -> Evaluated:
+        """The same with a bias column for each of ``count`` groups of matches; groups (n,)."""
+        n = self.rows.shape[2]
+        rows = np.zeros((len(self.rows) + count - 1, 1, n))
+        rows[: len(self.rows) - 2], rows[-1] = self.rows[:-2], self.rows[-1]
+        rows[len(self.rows) - 2 + groups, 0, np.arange(n)] = self.rows[-2, 0]
+        return Evaluated(rows, self.lift, self.behind)
+
     def gram(self) -> FloatArray:
         """(cols + 1, cols + 1) Gram matrix of [J r]."""
         rows = self.rows.reshape(len(self.rows), -1)
@@ -146,7 +154,7 @@ def evaluate(
     cTl: gtsam.Pose3,
     offset_s: float,
     c_twist: FloatArray,
-    bias_px: float | None,
+    bias_px: float | FloatArray | None,
     jacobians: bool,
 ) -> Evaluated:
     """Residuals and, where ``jacobians`` is true, their derivatives; arguments as in :func:`residuals`."""
@@ -174,7 +182,9 @@ def evaluate(
     if normals is None:
         rows[-1] = error
     else:
-        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1] + (bias_px or 0.0)
+        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1]
+        if bias_px is not None:
+            rows[-1, 0] += bias_px
     if jacobians:
         moved.write_rows(_gradients(camera, x, y, inverse_z, normals), rows[:motion_rows])
         rows[motion_rows:-1] = 1.0  # by the bias

@@ -10,6 +10,7 @@ import pytest
 
 from factors import (
     FactorError,
+    GroupedBias,
     RobustKernel,
     alignment_cost,
     check_gradient,
@@ -160,6 +161,26 @@ def test_a_frame_is_the_sum_of_its_alignments(make_scene):
     (H, g), (expected_H, expected_g) = graphs
     np.testing.assert_allclose(H, expected_H, atol=1e-9 * np.abs(expected_H).max())
     np.testing.assert_allclose(g, expected_g, atol=1e-9 * np.abs(expected_g).max())
+
+
+@pytest.mark.parametrize("per_point", [False, True])
+@pytest.mark.parametrize("second", [B2, 0.4])
+def test_objects_with_a_bias_each_are_alignments_of_their_own(make_scene, per_point, second):
+    alignment, *state = make_scene(14, normals=True, per_point=per_point)
+    alignment = replace(alignment, kernel=RobustKernel("geman_mcclure", 2.0))
+    values = nearby(*state, bias=0.3)
+    values.insert(B2, np.array([-0.2]))
+    groups = np.arange(len(alignment)) % 3 % 2
+    whole = frame_factor([alignment], E, D, V, [GroupedBias((B, second), groups)])
+    parts = [alignment.take(np.flatnonzero(groups == k)) for k in (0, 1)]
+    split = frame_factor(parts, E, D, V, [B, second])
+    assert list(whole.keys()) == list(split.keys())
+    assert whole.error(values) > 0.0
+    assert whole.error(values) == pytest.approx(split.error(values), rel=1e-12)
+    found, expected = (f.linearize(values).information() for f in (whole, split))
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
+    stacked = frame_factor([alignment], E, D, V, [GroupedBias((B, second), groups)], condensed=False)
+    assert stacked.error(values) == pytest.approx(split.error(values), rel=1e-12)
 
 
 def test_extrinsic_and_delay_are_found_again(make_scene):
