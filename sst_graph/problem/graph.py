@@ -84,9 +84,17 @@ class Tracks:
         self, drives: Sequence[Drive], objects: Sequence[Mapping[ObjectId, int]] | None = None
     ) -> None:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track() for drive in drives]
-        self.objects = objects
+        self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._moving = [moving_objects(drive, tracks) for drive, tracks in found]
+        self._moving: Sequence[Mapping[ObjectId, float]] = [
+            moving_objects(drive, tracks) for drive, tracks in found
+        ]
+
+    def seeing(self, objects: Mapping[ObjectId, int], moving: Mapping[ObjectId, float]) -> Tracks:
+        """The same twists of a single drive, with other tracks of its objects and speeds of the moving ones."""
+        other = Tracks([])
+        other._tracks, other.objects, other._moving = self._tracks, [objects], [moving]
+        return other
 
     def standing(
         self,

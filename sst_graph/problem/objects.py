@@ -118,13 +118,13 @@ def moving_objects(
         centres = np.stack([centre for _, _, centre in sightings])
         for object_id, seconds, _ in sightings:
             near = np.abs(times - seconds) <= config.window_s
-            speed = _speed(times[near], centres[near], config)
+            speed = speed_of(times[near], centres[near], config)
             if speed > 0.0:
                 found[object_id] = speed
     return found
 
 
-def _speed(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:
+def speed_of(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:
     """Speed of centres (n, 2) [m] at times (n,) [s]; 0 where they wander like a parked object's."""
     span = float(np.ptp(times)) if len(times) else 0.0
     if len(times) < config.min_sightings or span <= 0.0:
