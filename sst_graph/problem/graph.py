@@ -91,7 +91,7 @@ class Tracks:
         ]
 
     def seeing(self, objects: Mapping[ObjectId, int], moving: Mapping[ObjectId, float]) -> Tracks:
-        """The same twists of a single drive, with other tracks of its objects and speeds of the moving ones."""
+        """The same twists of one drive, with other object tracks and speeds of the moving objects."""
         other = Tracks([])
         other._tracks, other.objects, other._moving = self._tracks, [objects], [moving]
         return other
