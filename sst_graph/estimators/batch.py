@@ -17,6 +17,7 @@ from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, solve_joint, support
+from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.start import find_start
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
@@ -25,6 +26,9 @@ from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
 from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
+from sst_graph.uncertainty.frame_information import to_document
+from sst_graph.uncertainty.gains import frame_gains
 
 FloatArray = NDArray[np.float64]
 
@@ -114,9 +118,8 @@ def answer_joint(
     tracks = Tracks(drives, objects) if by_object else tracks
     solution = max(_finals(drives, tracks, contest, guess, config, progress), key=support)
     # 4. How sure, and in which directions not at all.
-    covariance, model, _ = robust_covariance(
-        solution.graph, solution.values, solution.pairs, solution.state, objects
-    )
+    frozen = (solution.graph, solution.values, solution.pairs, solution.state, objects)
+    covariance, model, _ = robust_covariance(*frozen)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
@@ -134,6 +137,7 @@ def answer_joint(
                 for (d, c), bias in solution.state.biases_px.items()
             },
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+            FRAME_INFORMATION: to_document(frame_gains(*frozen, drives, model)),
         },
     )
 
@@ -198,6 +202,7 @@ _METHODS: dict[Method, _Method] = {
     "paper": answer_paper,
     "static": answer_static,
     "semalign": answer_semalign,
+    "motion": answer_motion,
 }
-_NEED_IMAGE_TRACKS = ("paper", "static")
+_NEED_IMAGE_TRACKS = ("paper", "static", "motion")
 """Methods whose velocity comes from visual odometry."""

@@ -1,0 +1,185 @@
+"""What each frame of a calibration brought, as it stands in ``calibration.json``.
+
+Under ``diagnostics.frame_information``, one list a quantity, one entry a frame. Ratios are relative to
+the calibration with all its frames, so that they hold whatever scale its covariance has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError
+from sst_graph.result import CalibrationResult, FrameId
+
+FloatArray = NDArray[np.float64]
+
+KEY = "frame_information"
+"""Where it stands in the diagnostics of a result."""
+
+DIGITS = 4
+"""Significant digits that are kept."""
+
+_UPPER = np.triu_indices(6)
+
+
+@dataclass(frozen=True)
+class FrameInformation:
+    """What one frame brings. Order of seven: the covariance's; see :mod:`factors`.
+
+    Attributes:
+        frame: which frame.
+        bits: information on extrinsic and time offset that it adds to all the other frames [bit].
+        without: (7,) sigmas without this frame, over those with all.
+        so_far: (7,) sigmas of the frames up to this one, over those of all.
+        view: (6, 6) information of the frame by itself on the extrinsic, the offset known
+            [1/rad^2, 1/(rad m), 1/m^2]; motion and the frame's own mask biases are marginalised out.
+        l_twist: (6,) the LiDAR's twist at its image [rad/s, m/s].
+        matches, objects: matched boundary points, and objects that they lie on.
+        nearest_m: range of the nearest of them [m].
+        left: share of them in the left half of the image.
+    """
+
+    frame: FrameId
+    bits: float
+    without: FloatArray
+    so_far: FloatArray
+    view: FloatArray
+    l_twist: FloatArray
+    matches: int
+    objects: int
+    nearest_m: float
+    left: float
+
+    @property
+    def speed(self) -> float:
+        """Speed of the LiDAR [m/s]."""
+        return float(np.linalg.norm(self.l_twist[3:]))
+
+    @property
+    def turn_rate(self) -> float:
+        """Rate of turn [rad/s]."""
+        return float(np.linalg.norm(self.l_twist[:3]))
+
+    @property
+    def information(self) -> FloatArray:
+        """(7, 7) information of the frame by itself on extrinsic and time offset."""
+        return with_offset(self.view, self.l_twist)
+
+
+def with_offset(view: FloatArray, l_twist: FloatArray) -> FloatArray:
+    """(7, 7) information on [extrinsic, offset] of a view (6, 6) that is taken at a twist (6,).
+
+    A static point is seen at Exp(-V tau) cTl p with V = Ad(cTl) l_twist: a later image is a pose moved
+    by -l_twist a second, so that J_offset = -J_extrinsic l_twist.
+    """
+    H = np.hstack([np.eye(6), -np.asarray(l_twist, dtype=np.float64)[:, None]])
+    return np.asarray(H.T @ view @ H)
+
+
+def to_document(frames: Sequence[FrameInformation]) -> dict[str, Any]:
+    """JSON-able columns, rounded to :data:`DIGITS`; a view is its upper triangle, row by row."""
+    return {
+        "drive": [frame.frame.drive for frame in frames],
+        "frame": [frame.frame.frame for frame in frames],
+        "bits": [_rounded(frame.bits) for frame in frames],
+        "without": [_rounded_all(frame.without) for frame in frames],
+        "so_far": [_rounded_all(frame.so_far) for frame in frames],
+        "view": [_rounded_all(frame.view[_UPPER]) for frame in frames],
+        "l_twist": [_rounded_all(frame.l_twist) for frame in frames],
+        "matches": [frame.matches for frame in frames],
+        "objects": [frame.objects for frame in frames],
+        "nearest_m": [_rounded(frame.nearest_m) for frame in frames],
+        "left": [_rounded(frame.left) for frame in frames],
+    }
+
+
+def frames_of(result: CalibrationResult) -> tuple[FrameInformation, ...]:
+    """What each frame of a result brought; empty where the result does not tell.
+
+    Raises:
+        DataError: the entry is there, and is not such columns.
+    """
+    document = result.diagnostics.get(KEY)
+    return () if document is None else from_document(document)
+
+
+def from_document(document: Any, place: str = f"diagnostics.{KEY}") -> tuple[FrameInformation, ...]:
+    """The inverse of :func:`to_document`.
+
+    Raises:
+        DataError: no such columns.
+    """
+    if not isinstance(document, Mapping):
+        raise DataError(place, type(document).__name__, "an object of columns")
+    names, numbers = document.get("drive"), document.get("frame")
+    if not isinstance(names, list) or not isinstance(numbers, list) or len(names) != len(numbers):
+        raise DataError(place, "no matching lists 'drive' and 'frame'", "one entry a frame in each")
+    n = len(names)
+    column = {
+        name: _column(document, name, (n, *shape), place)
+        for name, shape in {
+            "frame": (),
+            "bits": (),
+            "without": (7,),
+            "so_far": (7,),
+            "view": (len(_UPPER[0]),),
+            "l_twist": (6,),
+            "matches": (),
+            "objects": (),
+            "nearest_m": (),
+            "left": (),
+        }.items()
+    }
+    return tuple(
+        FrameInformation(
+            FrameId(str(names[k]), int(column["frame"][k])),
+            float(column["bits"][k]),
+            column["without"][k],
+            column["so_far"][k],
+            _symmetric(column["view"][k]),
+            column["l_twist"][k],
+            int(column["matches"][k]),
+            int(column["objects"][k]),
+            float(column["nearest_m"][k]),
+            float(column["left"][k]),
+        )
+        for k in range(n)
+    )
+
+
+def _column(document: Mapping[str, Any], name: str, shape: tuple[int, ...], place: str) -> FloatArray:
+    try:
+        array = np.array(document[name], dtype=np.float64).reshape(shape)
+    except (KeyError, TypeError, ValueError):
+        raise DataError(f"{place}.{name}", "no such numbers", f"shape {shape}") from None
+    if not np.isfinite(array).all():
+        raise DataError(f"{place}.{name}", "a value that is not finite", "finite numbers")
+    return array
+
+
+def _symmetric(upper: FloatArray) -> FloatArray:
+    """(6, 6) from its upper triangle; rounding may leave it a little indefinite, which is cut off."""
+    A = np.zeros((6, 6))
+    A[_UPPER] = upper
+    A = A + np.triu(A, 1).T
+    return positive_part(A)
+
+
+def positive_part(A: FloatArray) -> FloatArray:
+    """The symmetric matrix nearest to ``A`` (scaled to a unit diagonal) without negative eigenvalues."""
+    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
+    values, vectors = np.linalg.eigh(0.5 * (A + A.T) / np.outer(scale, scale))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _rounded_all(values: FloatArray) -> list[float]:
+    return [_rounded(float(value)) for value in values]

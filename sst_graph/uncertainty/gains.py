@@ -1,0 +1,239 @@
+"""What each frame brings to the covariance: by itself, beside all the others, and one after the other.
+
+The covariance of a set of frames is that of :mod:`sst_graph.uncertainty.covariance` over those frames
+alone, matches and error model unchanged: H sums the frames' information with the motion marginalised out,
+the surplus their scores; sides that several frames see keep their shared error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import PairMatches
+from sst_graph.problem.objects import ObjectId
+from sst_graph.problem.state import State, delay_key, twist_key
+from sst_graph.result import FrameId
+from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, Unknowns, match_table
+from sst_graph.uncertainty.frame_information import FrameInformation, positive_part
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class FramePart:
+    """One frame's part in the sums behind the covariance.
+
+    Attributes:
+        columns: (c,) unknowns that it tells something about.
+        information: (c, c) its information, motion marginalised out.
+        surplus: (c, c) variance of its score beyond that of independent matches, without what sides share
+            over frames.
+        sides: (s,) sides it sees.
+        scores: (s, c) score of each side for a unit of the side's error.
+    """
+
+    columns: IntArray
+    information: FloatArray
+    surplus: FloatArray
+    sides: IntArray
+    scores: FloatArray
+
+
+@dataclass
+class Sums:
+    """Sums over frames, priors included; all over the unknowns (n).
+
+    Attributes:
+        information: (n, n).
+        surplus: (n, n).
+        scores: (sides, n).
+        side: variance that a side shares over frames.
+    """
+
+    information: FloatArray
+    surplus: FloatArray
+    scores: FloatArray
+    side: float
+
+    def add(self, part: FramePart, sign: float = 1.0) -> None:
+        """Take a frame in, or out with ``sign`` -1."""
+        block = np.ix_(part.columns, part.columns)
+        self.information[block] += sign * part.information
+        self.surplus[block] += sign * part.surplus
+        self.scores[np.ix_(part.sides, part.columns)] += sign * part.scores
+
+    def covariance(self, columns: IntArray) -> FloatArray:
+        """Cluster-robust covariance of some of the unknowns."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))
+        scaled = self.information * np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
+        chosen = np.eye(len(scale))[:, columns]
+        rows = np.linalg.solve(scaled, chosen * scale[:, None]).T * scale
+        shared = rows @ self.scores.T
+        covariance = rows[:, columns] + rows @ self.surplus @ rows.T + self.side * (shared @ shared.T)
+        return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def frame_gains(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    pairs: Sequence[PairMatches],
+    state: State,
+    tracks: Sequence[dict[ObjectId, int]],
+    drives: Sequence[Drive],
+    model: ErrorModel,
+) -> tuple[FrameInformation, ...]:
+    """What each pair brought, in the order of the pairs; pairs that share an image count as one."""
+    unknowns = Unknowns.of(state, pairs)
+    table = match_table(pairs, state, tracks, unknowns)
+    prior, twisted = _frame_information(graph, values, unknowns)
+    groups = _groups(pairs)
+    parts = [_part(table, rows, *twisted[key], model) for key, (_, rows) in groups.items()]
+    sums = Sums(
+        prior.copy(), np.zeros_like(prior), np.zeros((int(table.sides.max()) + 1, len(prior))), model.side
+    )
+    so_far = []
+    columns = [_own(unknowns, state, pair) for pair, _ in groups.values()]
+    for part, own in zip(parts, columns, strict=True):
+        sums.add(part)
+        so_far.append(sums.covariance(own))
+    found = []
+    prior_covariance = np.asarray(np.linalg.inv(prior))
+    for (pair, rows), part, own, seen in zip(groups.values(), parts, columns, so_far, strict=True):
+        full = sums.covariance(own)
+        sums.add(part, -1.0)
+        without = sums.covariance(own)
+        sums.add(part)
+        view = _view(part, prior_covariance, int(own[6]), model.side)
+        found.append(_entry(pair, len(rows), drives, state, view, full, without, seen))
+    return tuple(found)
+
+
+def _groups(pairs: Sequence[PairMatches]) -> dict[int, tuple[PairMatches, IntArray]]:
+    """For each image's twist: its (first) pair, and its rows in the table of matches."""
+    from_row = np.cumsum([0, *(len(pair) for pair in pairs)])
+    groups: dict[int, tuple[PairMatches, IntArray]] = {}
+    for k, pair in enumerate(pairs):
+        rows = np.arange(from_row[k], from_row[k + 1])
+        key = twist_key(pair.drive, pair.pair.image)
+        first, before = groups.get(key, (pair, rows[:0]))
+        groups[key] = (first, np.concatenate([before, rows]))
+    return groups
+
+
+def _own(unknowns: Unknowns, state: State, pair: PairMatches) -> IntArray:
+    """(7,) columns of the extrinsic and of the pair's clock."""
+    return np.array([*range(6), unknowns.column(delay_key(state.clock(pair.drive)))])
+
+
+def _frame_information(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
+) -> tuple[FloatArray, dict[int, tuple[IntArray, FloatArray]]]:
+    """(n, n) information of all that no twist takes part in; of the rest by twist, over its own columns."""
+    n, known = unknowns.size, set(unknowns.keys)
+    prior = np.zeros((n, n))
+    terms: dict[int, list[tuple[IntArray, FloatArray]]] = {}
+    linear = graph.linearize(values)
+    for i in range(linear.size()):
+        factor = linear.at(i)
+        keys = list(factor.keys())
+        twists = [key for key in keys if key not in known]
+        if len(twists) > 1:
+            raise ValueError(f"a factor on {len(twists)} twists: frames are no longer separate")
+        columns = np.concatenate([_columns(key, unknowns) for key in keys])
+        if twists:
+            terms.setdefault(twists[0], []).append((columns, factor.information()))
+        else:
+            prior[np.ix_(columns, columns)] += factor.information()
+    return prior, {twist: _marginal(found, n) for twist, found in terms.items()}
+
+
+def _columns(key: int, unknowns: Unknowns) -> IntArray:
+    if key not in unknowns.keys:
+        return np.arange(unknowns.size, unknowns.size + 6)
+    first = unknowns.column(key)
+    return np.arange(first, first + (6 if first == 0 else 1))
+
+
+def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> tuple[IntArray, FloatArray]:
+    """Columns below ``n`` that the terms touch, and their information with the twist marginalised out."""
+    columns = np.unique(np.concatenate([columns for columns, _ in terms]))
+    H = np.zeros((len(columns), len(columns)))
+    for touched, information in terms:
+        at = np.searchsorted(columns, touched)
+        H[np.ix_(at, at)] += information
+    m = int(np.searchsorted(columns, n))
+    return columns[:m], H[:m, :m] - H[:m, m:] @ np.linalg.solve(H[m:, m:], H[m:, :m])
+
+
+def _part(
+    table: MatchTable, rows: IntArray, columns: IntArray, information: FloatArray, model: ErrorModel
+) -> FramePart:
+    J, z = table.J[np.ix_(rows, columns)], table.root_weights[rows]
+    sides, of_side = np.unique(table.sides[rows], return_inverse=True)
+    scores = np.stack([np.bincount(of_side, z * column, len(sides)) for column in J.T], axis=1)
+    in_frame = np.unique(table.side_frames[rows], return_inverse=True)[1]
+    sums = np.stack([np.bincount(in_frame, z * column) for column in J.T], axis=1)
+    surplus = (model.match - 1.0) * (J.T @ J) + model.side_frame * (sums.T @ sums)
+    return FramePart(
+        columns,
+        information,
+        np.asarray(surplus),
+        np.asarray(sides, dtype=np.intp),
+        np.asarray(scores, dtype=np.float64),
+    )
+
+
+def _view(part: FramePart, prior_covariance: FloatArray, offset: int, side: float) -> FloatArray:
+    """(6, 6) information on the extrinsic of one frame alone, the offset known, mask biases estimated."""
+    keep = np.flatnonzero(part.columns != offset)
+    columns = part.columns[keep]
+    prior = np.linalg.inv(prior_covariance[np.ix_(columns, columns)])
+    alone = Sums(
+        prior + part.information[np.ix_(keep, keep)],
+        part.surplus[np.ix_(keep, keep)],
+        part.scores[:, keep],
+        side,
+    )
+    own = np.linalg.inv(prior_covariance[:6, :6])
+    return positive_part(np.linalg.inv(alone.covariance(np.arange(6))) - own)
+
+
+def _entry(
+    pair: PairMatches,
+    matches: int,
+    drives: Sequence[Drive],
+    state: State,
+    view: FloatArray,
+    full: FloatArray,
+    without: FloatArray,
+    so_far: FloatArray,
+) -> FrameInformation:
+    drive = drives[pair.drive]
+    lPs = np.concatenate([m.alignment.lPs for m in pair.matches.values()])
+    us = np.concatenate([m.alignment.pixels[:, 0] for m in pair.matches.values()])
+    sigmas = np.sqrt(np.diag(full))
+    return FrameInformation(
+        FrameId(drive.name, drive.scans[pair.pair.scan].index),
+        0.5 * float(_log_det(without) - _log_det(full)) / float(np.log(2.0)),
+        np.sqrt(np.diag(without)) / sigmas,
+        np.sqrt(np.diag(so_far)) / sigmas,
+        view,
+        np.asarray(state.cTl.inverse().AdjointMap() @ pair.motion.c_twist),
+        matches,
+        sum(len(np.unique(m.objects)) for m in pair.matches.values()),
+        float(np.linalg.norm(lPs, axis=1).min()),
+        float((us < drive.camera.cx).mean()),
+    )
+
+
+def _log_det(covariance: FloatArray) -> float:
+    sigmas = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigmas, sigmas)
+    return float(np.linalg.slogdet(correlation)[1] + 2.0 * np.log(sigmas).sum())
