@@ -92,9 +92,10 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     _add_source_options(calibrate)
     calibrate.add_argument(
         "--method",
-        choices=("joint", "paper", "static", "semalign"),
+        choices=("joint", "paper", "static", "semalign", "motion"),
         help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: its first stage, "
-        "the extrinsic alone; semalign: sampled starts, the extrinsic alone",
+        "the extrinsic alone; semalign: sampled starts, the extrinsic alone; motion: LiDAR odometry against "
+        "visual odometry, no labels needed",
     )
     calibrate.add_argument(
         "--init",

@@ -7,6 +7,7 @@ from typing import Literal
 
 from sst_graph.estimators.challenge import ChallengeConfig
 from sst_graph.estimators.joint import JointConfig
+from sst_graph.estimators.motion import MotionConfig
 from sst_graph.estimators.paper import PaperConfig
 from sst_graph.estimators.semalign import SemAlignConfig
 from sst_graph.estimators.start import StartConfig
@@ -14,7 +15,7 @@ from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.observability import ObservabilityConfig
 
-Method = Literal["joint", "paper", "static", "semalign"]
+Method = Literal["joint", "paper", "static", "semalign", "motion"]
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,8 @@ class CalibrationConfig:
 
     Attributes:
         method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage),
-            ``semalign`` (sampled starts, points to pixels).
+            ``semalign`` (sampled starts, points to pixels), ``motion`` (LiDAR odometry
+            against visual odometry).
         classes: semantic classes to align.
         delay_per_drive: each drive has a time offset of its own, instead of one for all.
         prepare: what is taken from every frame.
@@ -31,6 +33,7 @@ class CalibrationConfig:
         joint: the outer and inner loop.
         paper: both stages of the paper.
         semalign: sampled starts.
+        motion: hand-eye calibration.
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
         observability: when a direction counts as unobservable.
     """
@@ -43,5 +46,6 @@ class CalibrationConfig:
     joint: JointConfig = field(default_factory=JointConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

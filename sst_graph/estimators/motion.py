@@ -1,0 +1,185 @@
+"""Calibration from motion alone: LiDAR odometry against visual odometry in a hand-eye factor graph.
+
+Neither labels nor common sight are needed. Sources: Taylor & Nieto, Motion-based calibration of multimodal
+sensor extrinsics and timing offset estimation, T-RO 2016; Park et al., Spatiotemporal camera-LiDAR
+calibration: a targetless and structureless approach, RA-L 2020.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.robust import RobustKernel
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.motion_start import MotionStartConfig, motion_starts
+from sst_graph.problem.drive import Drive, Progress
+from sst_graph.problem.hand_eye import (
+    CameraStep,
+    HandEyePriors,
+    HandEyeTerm,
+    NoiseScales,
+    camera_steps,
+    fitted_scales,
+    hand_eye_graph,
+    hand_eye_terms,
+    lidar_paths,
+    pair_motions,
+    state_values,
+)
+from sst_graph.problem.path import SensorPath
+from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.uncertainty.hand_eye import HandEyeErrors, hand_eye_covariance
+
+_LOG = logging.getLogger(__name__)
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Hand-eye calibration.
+
+    Attributes:
+        start: the closed-form start.
+        priors: around the guess, or around the start without a guess.
+        errors: what all pairs share.
+        kernel: of whitened rotations and directions, scales in sigmas.
+        max_rotation_sigma_rad: camera motions whose rotation is known worse are left out [rad].
+        min_pairs: fewest pairs for an answer.
+        max_outer: most times that the LiDAR's motion is looked up anew.
+        settled: an outer step shorter than this many standard deviations ends the outer loop.
+        inner_iterations: most Levenberg-Marquardt iterations in between.
+        least_scale: the odometry's sigmas are never made smaller by more than this factor.
+        rival_chi2: a different solution that costs at most this much more makes the answer doubtful.
+    """
+
+    start: MotionStartConfig = field(default_factory=MotionStartConfig)
+    priors: HandEyePriors = field(default_factory=HandEyePriors)
+    errors: HandEyeErrors = field(default_factory=HandEyeErrors)
+    kernel: RobustKernel = field(default_factory=lambda: RobustKernel("cauchy", 3.0))
+    max_rotation_sigma_rad: float = 0.02
+    min_pairs: int = 5
+    max_outer: int = 20
+    settled: float = 0.02
+    inner_iterations: int = 10
+    least_scale: float = 0.3
+    rival_chi2: float = 9.0
+
+
+@dataclass(frozen=True)
+class MotionSolution:
+    """Where the outer loop ended.
+
+    Attributes:
+        state: the estimate.
+        terms: its factors, under the noise that the residuals have.
+        scales: that noise, in multiples of what odometry claims.
+        covariance: (7, 7).
+        cost: robust chi-squared a pair, at the noise odometry claims; comparable between solutions.
+        outer_iterations: done.
+        converged: the last step was short.
+    """
+
+    state: State
+    terms: list[HandEyeTerm]
+    scales: NoiseScales
+    covariance: FloatArray
+    cost: float
+    outer_iterations: int
+    converged: bool
+
+
+def solve_motion(
+    drives: Sequence[Drive],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    config: MotionConfig,
+    progress: Progress | None = None,
+) -> list[MotionSolution]:
+    """Solutions from the best starts, the likeliest first.
+
+    Raises:
+        EstimationError: too few pairs of motions.
+    """
+    # 1. The motions, which depend on no calibration.
+    steps, paths = camera_steps(drives, config.max_rotation_sigma_rad), lidar_paths(drives)
+    # 2. Rotation and time offset by trying all offsets.
+    guess = None if guess_cTl is None else guess_cTl.rotation()
+    starts = motion_starts(steps, paths, guess, guess_offset_s, config.start)
+    if not starts:
+        raise EstimationError(_too_few(len(steps), config))
+    # 3. The graph from each of them.
+    solutions = []
+    for number, start in enumerate(starts):
+        translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
+        cTl = gtsam.Pose3(start.cRl, translation)
+        centre = State(guess_cTl or cTl, (guess_offset_s,))
+        solutions.append(_solve(steps, paths, State(cTl, (start.offset_s,)), centre, config))
+        if progress is not None:
+            progress("motion", number + 1, len(starts))
+    return sorted(solutions, key=lambda solution: solution.cost)
+
+
+def _solve(
+    steps: Sequence[CameraStep],
+    paths: Sequence[SensorPath],
+    state: State,
+    centre: State,
+    config: MotionConfig,
+) -> MotionSolution:
+    """Look the LiDAR's motion up at the time offset, optimise, until nothing moves."""
+    converged, outer = False, 0
+    while outer < config.max_outer and not converged:
+        outer += 1
+        # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
+        pairs = pair_motions(steps, paths, state.offsets_s[0])
+        if len(pairs) < config.min_pairs:
+            raise EstimationError(_too_few(len(pairs), config))
+        scales = fitted_scales(pairs, state, config.least_scale)
+        terms = hand_eye_terms(pairs, state, scales, config.kernel)
+        # 2. Inner optimisation.
+        graph = hand_eye_graph(terms, centre, config.priors)
+        values = _optimise(graph, state_values(state), config.inner_iterations)
+        covariance = hand_eye_covariance(graph, values, terms, config.errors)
+        # 3. Move; stop when the step is small.
+        moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(delay_key())[0]),))
+        step = difference(state, moved)
+        state = moved
+        converged = float(step @ np.linalg.solve(covariance, step)) < config.settled**2
+    misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
+    return MotionSolution(state, terms, scales, covariance, float(misfit), outer, converged)
+
+
+def difference(a: State, b: State) -> FloatArray:
+    """(7,) step from one state to another, in the tangent space of the covariance."""
+    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
+
+
+def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(iterations)
+    params.setlambdaInitial(1e-6)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _too_few(pairs: int, config: MotionConfig) -> str:
+    return (
+        f"{pairs} pairs of camera and LiDAR motion over the same time, expected {config.min_pairs} or more: "
+        "motion alone needs consecutive frames of a moving vehicle"
+    )
+
+
+def rival(solutions: Sequence[MotionSolution], config: MotionConfig) -> MotionSolution | None:
+    """A solution that fits almost as well as the first and is another one by the covariance of both."""
+    best, *others = solutions
+    for other in others:
+        step = difference(best.state, other.state)
+        apart = float(step @ np.linalg.solve(best.covariance + other.covariance, step))
+        if 2.0 * (other.cost - best.cost) < config.rival_chi2 and apart > config.rival_chi2:
+            return other
+    return None

@@ -1,0 +1,224 @@
+"""Pairs of camera and LiDAR motion, and their factor graph on E and D; no label, no depth.
+
+The camera's motion enters by rotation and direction alone: its length would hang on LiDAR depth placed by
+the very extrinsic that is sought.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import delay_prior, hand_eye_factor, rotation_hand_eye
+from factors.robust import RobustKernel
+from sst_graph.odometry.relative import DirectionMotion
+from sst_graph.odometry.standing import at_rest
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.path import PathStep, SensorPath
+from sst_graph.problem.state import EXTRINSIC, State, delay_key
+
+FloatArray = NDArray[np.float64]
+
+MIN_LENGTH_M = 0.1
+"""Shorter motions of the camera have no direction worth the name [m]."""
+_MEDIAN_CHI2 = {3: 2.366, 2: 1.386}
+"""Median of the chi-squared distribution by degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class CameraStep:
+    """What two images tell of the camera's motion.
+
+    Attributes:
+        drive: number of the drive.
+        image: position of the first image in it.
+        from_ns, to_ns: stamps of the images, camera clock [ns].
+        motion: rotation, and direction where it is ok.
+    """
+
+    drive: int
+    image: int
+    from_ns: int
+    to_ns: int
+    motion: DirectionMotion
+
+    @property
+    def rotation(self) -> gtsam.Rot3:
+        """Rotation of the second camera in the first."""
+        return self.motion.rotation if self.motion.ok else self.motion.turn
+
+
+@dataclass(frozen=True)
+class MotionPair:
+    """A camera's motion and the LiDAR's over the same time, as the time offset has it."""
+
+    camera: CameraStep
+    lidar: PathStep
+
+
+@dataclass(frozen=True)
+class NoiseScales:
+    """By what the sigmas of the odometry are multiplied so that the residuals fit them."""
+
+    rotation: float = 1.0
+    direction: float = 1.0
+
+
+@dataclass(frozen=True)
+class HandEyePriors:
+    """Deviations from the guess: so wide that they matter only where the motion says nothing.
+
+    Attributes:
+        rotation_rad, translation_m: of the extrinsic.
+        offset_s: of the time offset.
+    """
+
+    rotation_rad: float = 1.0
+    translation_m: float = 0.5
+    offset_s: float = 0.3
+
+
+def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list[CameraStep]:
+    """The camera's motion between consecutive images of all drives, where at least its rotation is known."""
+    return [
+        CameraStep(number, position, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
+        for number, drive in enumerate(drives)
+        for position, pair in enumerate(drive.image_pairs)
+        if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * max_rotation_sigma_rad**2
+    ]
+
+
+def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
+    """The LiDAR's path in each drive, exactly at rest where it stands."""
+    return [SensorPath(at_rest(drive.lidar_motions)) for drive in drives]
+
+
+def pair_motions(
+    steps: Sequence[CameraStep], paths: Sequence[SensorPath], offset_s: float
+) -> list[MotionPair]:
+    """Each camera motion with the LiDAR's over its stamps + offset, where the path reaches."""
+    shift = round(offset_s * 1e9)
+    found = ((step, paths[step.drive].step(step.from_ns + shift, step.to_ns + shift)) for step in steps)
+    return [MotionPair(step, lidar) for step, lidar in found if lidar is not None]
+
+
+@dataclass(frozen=True)
+class HandEyeTerm:
+    """One factor of the graph and what it was made of.
+
+    Attributes:
+        pair: the motions.
+        factor: on E and D.
+        covariance: (6, 6) of [rotation rad, direction], or (3, 3) where only the rotation is used.
+    """
+
+    pair: MotionPair
+    factor: gtsam.CustomFactor
+    covariance: FloatArray
+
+    @property
+    def has_direction(self) -> bool:
+        return len(self.covariance) == 6
+
+    def residual(self, values: gtsam.Values) -> FloatArray:
+        """(6,) or (3,) predicted - measured, unwhitened."""
+        return np.asarray(self.factor.unwhitenedError(values))
+
+
+def hand_eye_terms(
+    pairs: Sequence[MotionPair], state: State, scales: NoiseScales, kernel: RobustKernel
+) -> list[HandEyeTerm]:
+    """A factor for every pair, under the residuals' own noise; robust weights are frozen at the state."""
+    values = state_values(state)
+    terms = []
+    for pair in pairs:
+        term = _term(pair, state, scales.rotation, scales.direction)
+        turn, swerve = _sizes(term, values)
+        sizes = np.nan_to_num([turn / np.sqrt(3.0), swerve / np.sqrt(2.0)])
+        widening = 1.0 / np.sqrt(np.maximum(kernel.weight(sizes), 1e-6))
+        terms.append(_term(pair, state, scales.rotation * widening[0], scales.direction * widening[1]))
+    return terms
+
+
+def fitted_scales(pairs: Sequence[MotionPair], state: State, least: float) -> NoiseScales:
+    """Scales at which half of the residuals are as small as they claim."""
+    values = state_values(state)
+    sizes = np.array([_sizes(_term(pair, state, 1.0, 1.0), values) for pair in pairs])
+    directed = sizes[np.isfinite(sizes[:, 1]), 1]
+    rotation = float(np.sqrt(np.median(sizes[:, 0] ** 2) / _MEDIAN_CHI2[3]))
+    direction = float(np.sqrt(np.median(directed**2) / _MEDIAN_CHI2[2])) if len(directed) else 1.0
+    return NoiseScales(max(rotation, least), max(direction, least))
+
+
+def hand_eye_graph(
+    terms: Sequence[HandEyeTerm], centre: State, priors: HandEyePriors
+) -> gtsam.NonlinearFactorGraph:
+    """The terms and the priors around ``centre``."""
+    graph = gtsam.NonlinearFactorGraph()
+    for term in terms:
+        graph.add(term.factor)
+    sigmas = np.repeat([priors.rotation_rad, priors.translation_m], 3)
+    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.add(delay_prior(delay_key(), centre.offsets_s[0], priors.offset_s))
+    return graph
+
+
+def state_values(state: State) -> gtsam.Values:
+    """E and D of a state."""
+    values = gtsam.Values()
+    values.insert(EXTRINSIC, state.cTl)
+    values.insert(delay_key(), np.array(state.offsets_s[:1]))
+    return values
+
+
+def _term(pair: MotionPair, state: State, rotation_scale: float, direction_scale: float) -> HandEyeTerm:
+    """The factor of a pair, its sigmas multiplied by the scales."""
+    step, motion = pair.lidar, pair.camera.motion
+    predicted = state.cTl * step.aTb * state.cTl.inverse()
+    length = float(np.linalg.norm(predicted.translation()))
+    Ad = np.asarray(state.cTl.AdjointMap())
+    covariance = Ad @ step.covariance @ Ad.T
+    covariance[:3, :3] += motion.covariance[:3, :3]
+    offset_0 = state.offsets_s[0]
+    if not motion.ok or length < MIN_LENGTH_M:
+        own = rotation_scale**2 * covariance[:3, :3]
+        motions = (pair.camera.rotation, step.aTb.rotation(), step.twist_a[:3], step.twist_b[:3])
+        factor = rotation_hand_eye(EXTRINSIC, delay_key(), *motions, offset_0, own)
+        return HandEyeTerm(pair, factor, own)
+    # The direction's sigmas, across it, as those of a translation of the predicted length.
+    across = np.zeros((6, 5))
+    across[:3, :3] = np.eye(3)
+    basis = np.asarray(gtsam.Unit3(motion.direction).basis())
+    across[3:, 3:] = length * motion.rotation.matrix().T @ basis
+    covariance[:3, :3] -= motion.covariance[:3, :3]
+    covariance += across @ motion.covariance @ across.T
+    spread = np.repeat([rotation_scale, direction_scale], 3)
+    covariance *= np.outer(spread, spread)
+    measured = gtsam.Pose3(motion.rotation, length * motion.direction)
+    factor = hand_eye_factor(
+        EXTRINSIC,
+        delay_key(),
+        measured,
+        step.aTb,
+        step.twist_a,
+        step.twist_b,
+        offset_0,
+        covariance,
+        scale_known=False,
+    )
+    noise = factor.noiseModel()
+    assert isinstance(noise, gtsam.noiseModel.Gaussian)
+    return HandEyeTerm(pair, factor, np.asarray(noise.covariance()))
+
+
+def _sizes(term: HandEyeTerm, values: gtsam.Values) -> tuple[float, float]:
+    """Whitened length of the rotation's and of the direction's residual; NaN where there is none."""
+    r, C = term.residual(values), term.covariance
+    turn = float(np.sqrt(r[:3] @ np.linalg.solve(C[:3, :3], r[:3])))
+    if not term.has_direction:
+        return turn, np.nan
+    return turn, float(np.sqrt(r[3:] @ np.linalg.solve(C[3:, 3:], r[3:])))

@@ -1,0 +1,100 @@
+"""The covariance of a hand-eye estimate: neighbouring pairs err together, and all pairs share some error.
+
+A scan and an image end one pair and begin the next, so scores of neighbours are correlated: they are
+summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987). What all pairs share,
+such as a principal point that is off, no residual shows: it stands in :class:`HandEyeErrors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.problem.hand_eye import HandEyeTerm
+from sst_graph.problem.state import EXTRINSIC, delay_key
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HandEyeErrors:
+    """Sigmas of what all pairs share, and how far neighbours go together.
+
+    Attributes:
+        direction_deg: of every direction of travel, about each axis of the camera [deg].
+        turn_rate_deg_s: of every rotation, by the length of its interval [deg/s].
+        lags: neighbours up to this far apart go together.
+    """
+
+    direction_deg: float = 0.03
+    turn_rate_deg_s: float = 0.02
+    lags: int = 3
+
+
+def hand_eye_covariance(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    terms: Sequence[HandEyeTerm],
+    errors: HandEyeErrors,
+) -> FloatArray:
+    """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, never below the graph's own.
+
+    Args:
+        graph: the terms' factors and the priors, at its optimum ``values``.
+        terms: in the order of drive and time.
+    """
+    ordering = gtsam.Ordering()
+    ordering.push_back(EXTRINSIC)
+    ordering.push_back(delay_key())
+    hessian = graph.linearize(values).hessian(ordering)[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    bread = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    blocks, scores, shared = [], [], np.zeros((7, 6))
+    for term in terms:
+        J, r, root = _whitened(term, values)
+        blocks.append(J.T @ J)
+        scores.append(J.T @ r)
+        rotation = (
+            np.radians(errors.turn_rate_deg_s) * 1e-9 * (term.pair.camera.to_ns - term.pair.camera.from_ns)
+        )
+        shared[:, :3] += rotation * J.T @ root[:, :3]
+        if term.has_direction:
+            shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
+    surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags)
+    covariance = bread + bread @ (surplus + shared @ shared.T) @ bread
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _whitened(term: HandEyeTerm, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Whitened Jacobian (m, 7), residual (m,), and square root of the information (m, m)."""
+    matrix, negative = term.factor.linearize(values).jacobian()
+    root = np.linalg.inv(np.linalg.cholesky(term.covariance))
+    return np.asarray(matrix), -np.asarray(negative).reshape(-1), root
+
+
+def _breaks(terms: Sequence[HandEyeTerm]) -> NDArray[np.bool_]:
+    """(n,) whether a term does not go on where the one before ended."""
+    cameras = [term.pair.camera for term in terms]
+    return np.array([True] + [a.drive != b.drive or a.to_ns != b.from_ns for a, b in pairwise(cameras)])
+
+
+def _surplus(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], lags: int) -> FloatArray:
+    """(7, 7) by which the scores' own long-run variance exceeds the model's, where it does."""
+    run = np.cumsum(breaks)
+    total = scores.T @ scores
+    for lag in range(1, lags + 1):
+        same = run[lag:] == run[:-lag]
+        product = (scores[lag:][same]).T @ scores[:-lag][same]
+        total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
+    total *= len(scores) / max(len(scores) - 7.0, 1.0)
+    # Along the directions in which the model is the surer of the two.
+    root = np.linalg.cholesky(model + 1e-12 * np.trace(model) * np.eye(len(model)))
+    whitener = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(whitener @ (total - model) @ whitener.T)
+    half = root @ vectors
+    return np.asarray((half * np.maximum(values, 0.0)) @ half.T)
