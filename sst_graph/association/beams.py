@@ -22,6 +22,10 @@ IntArray = NDArray[np.intp]
 _CONE_NOISE_M = 0.02
 _ROUNDS = 6
 _MIN_RING_POINTS = 30
+_CONE_POINTS = 500
+"""Points of a ring that its cone is fitted to, about."""
+_APART = 10.0
+"""Distance of two rings among the keys that points are sorted by; azimuths differ by less [rad]."""
 _MIN_RHO_RATIO = 1.5
 """A cone's height is fitted only where the ring's far points are this much farther than its near ones."""
 
@@ -32,6 +36,7 @@ class Beams:
 
     Attributes:
         order: (n,) indices of the points sorted by (ring, azimuth).
+        keys: (n,) the same order as numbers that rise, see :meth:`key`.
         ring: (n,) ring of each point, 0 the lowest, rising with elevation.
         azimuth: (n,) azimuth of each point, counter-clockwise from the x axis [rad].
         rho: (n,) distance of each point from the z axis [m].
@@ -41,12 +46,18 @@ class Beams:
     """
 
     order: IntArray
+    keys: FloatArray
     ring: IntArray
     azimuth: FloatArray
     rho: FloatArray
     height: FloatArray
     step: float
     elevation: FloatArray
+
+    @staticmethod
+    def key(ring: IntArray, azimuth: FloatArray) -> FloatArray:
+        """Where a ring and an azimuth [rad] stand among ``keys``."""
+        return np.asarray(ring * _APART + azimuth)
 
 
 def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beams:
@@ -60,11 +71,14 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     elevation = np.arctan2(points[:, 2], np.maximum(rho, 1e-6))
     labels = recover_rings(elevation, rho) if rings is None else rings
     ring, median_elevation = _rank_by_elevation(labels, elevation)
-    order = np.lexsort((azimuth, ring))
-    steps = np.diff(azimuth[order])[np.diff(ring[order]) == 0]
+    keys = Beams.key(ring, azimuth)
+    order = np.argsort(keys)
+    steps = np.diff(keys[order])
+    steps = steps[steps < _APART - 2.0 * np.pi]
     step = float(np.median(steps)) if len(steps) else 0.0
-    height = _cone_heights(points[:, 2], rho, ring, len(median_elevation))
-    return Beams(order, ring, azimuth, rho, height, step, median_elevation)
+    some = order[:: max(1, len(order) // max(1, _CONE_POINTS * len(median_elevation)))]
+    height = _cone_heights(points[some, 2], rho[some], ring[some], len(median_elevation))
+    return Beams(order, keys[order], ring, azimuth, rho, height, step, median_elevation)
 
 
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
@@ -94,12 +108,15 @@ def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
 
 def _rank_by_elevation(labels: NDArray[np.integer], elevation: FloatArray) -> tuple[IntArray, FloatArray]:
     """Ring numbers that rise with elevation, and each ring's median elevation."""
-    names, ring = np.unique(labels, return_inverse=True)
-    ring = ring.reshape(-1).astype(np.intp)
-    by_ring = np.lexsort((elevation, ring))
-    starts = np.searchsorted(ring[by_ring], np.arange(len(names) + 1))
-    middle = by_ring[(starts[:-1] + starts[1:]) // 2] if len(names) else by_ring
-    medians = elevation[middle]
+    lowest = int(labels.min()) if len(labels) else 0
+    shifted = labels.astype(np.intp) - lowest
+    used = np.bincount(shifted) > 0
+    ring = (np.cumsum(used) - 1)[shifted]
+    # A sorted key that holds the ring before the point and the elevation behind it.
+    by_ring = np.sort(ring * _APART + elevation)
+    starts = np.searchsorted(by_ring, np.arange(np.count_nonzero(used) + 1) * _APART - 0.5 * _APART)
+    middle = (starts[:-1] + starts[1:]) // 2
+    medians = by_ring[middle] - np.arange(len(middle)) * _APART
     rank = np.argsort(medians, kind="stable")
     place = np.empty_like(rank)
     place[rank] = np.arange(len(rank))

@@ -172,15 +172,14 @@ def _top_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config
     object would prefer edges far below that ring, and so lift the mean by a tenth of the gap.
     """
     i = np.flatnonzero(mask & (beams.ring + 1 < len(beams.height)))
-    keys = beams.ring[beams.order] * 10.0 + beams.azimuth[beams.order]
-    above, near = _nearest_in_ring(beams, keys, i, beams.ring[i] + 1)
+    above, near = _nearest_in_ring(beams, i, beams.ring[i] + 1)
     ok = near & ~mask[above] & _is_behind(beams.rho, i, above, config)
     i, above = i[ok], above[ok]
     rho, tip = beams.rho[i], beams.height[beams.ring[i] + 1]
     rise = (tip + (points[above, 2] - tip) * rho / beams.rho[above] - points[i, 2]) / rho
     ok = (rise > 0.0) & (rise < np.radians(config.max_elevation_gap_deg))
     i, rise = i[ok], rise[ok]
-    below, known = _nearest_in_ring(beams, keys, i, beams.ring[i] - 1)
+    below, known = _nearest_in_ring(beams, i, beams.ring[i] - 1)
     edge = _carried_on(points[i], beams.rho[i], beams.rho[below], known & mask[below], config)
     half = 0.5 * rise * np.hypot(edge[:, 0], edge[:, 1])
     lPs, outward = edge.copy(), edge.copy()
@@ -189,11 +188,9 @@ def _top_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config
     return _Edges(i, lPs, outward, Edge.TOP)
 
 
-def _nearest_in_ring(
-    beams: Beams, keys: FloatArray, index: IntArray, ring: IntArray
-) -> tuple[IntArray, NDArray[np.bool_]]:
+def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:
     """The point of a ring nearest in azimuth to each of ``index``, and whether it is within a step or so."""
-    wanted = ring * 10.0 + beams.azimuth[index]
+    keys, wanted = beams.keys, Beams.key(ring, beams.azimuth[index])
     place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
     place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
     found = beams.order[place]

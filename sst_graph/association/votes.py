@@ -61,16 +61,28 @@ class States:
 
 @dataclass(frozen=True)
 class Level:
-    """Log-likelihood ratios of all frames at one blur, ready to be looked up."""
+    """Log-likelihood ratios of all frames at one blur, ready to be looked up.
+
+    Attributes:
+        camera: full-sized; masks are ``shrink`` times smaller, ``shape`` rows and columns.
+        lPs: (n, 3) points at their image's instant when the time offset is 0 [m].
+        velocities: (n, 3) of the points as the LiDAR sees them [m/s]; first order in the offset.
+        starts: (n,) where the table of the point's frame and class begins in ``tables``.
+        cells: (rows * columns,) cell of a pixel within its image.
+        first_cells: (n,) number of the first cell of the point's image.
+        weights: (n,) of the votes.
+        cell_count: cells of all images.
+    """
 
     camera: PinholeCamera
     lPs: Float32
+    velocities: Float32
     starts: IntArray
-    frame_of: IntArray
-    twists: FloatArray
-    base_taus: FloatArray
+    cells: IntArray
+    first_cells: IntArray
     tables: Float32
     weights: Float32
+    cell_count: int
     shrink: float
     shape: tuple[int, int]
 
@@ -88,49 +100,43 @@ class Level:
         return np.concatenate(scores)
 
     def _score(self, states: States) -> FloatArray:
-        camera, shrink = self.camera, self.shrink
-        R = states.rotations.astype(np.float32)
-        lPs = self._moved(states)
-        X, Y, Z = (
-            (lPs @ R[:, row, :, None])[..., 0] + states.translations[:, row, None].astype(np.float32)
-            for row in range(3)
-        )
-        front = Z > 0.5
-        inverse = 1.0 / np.where(front, Z, 1.0)
-        u = (camera.fx * X * inverse + (camera.cx + 0.5)) / shrink
-        v = (camera.fy * Y * inverse + (camera.cy + 0.5)) / shrink
-        rows, cols = self.shape
-        inside = front & (u >= 0) & (u < cols) & (v >= 0) & (v < rows)
-        index = np.where(inside, v, 0).astype(np.intp) * cols + np.where(inside, u, 0).astype(np.intp)
-        votes = np.where(inside, self.tables[self.starts + index], 0.0)
-        shares = self._shares(u.astype(np.float32), v.astype(np.float32), inside)
-        return np.asarray((votes * shares).sum(axis=1), dtype=np.float64)
-
-    def _shares(self, u: Float32, v: Float32, inside: NDArray[np.bool_]) -> Float32:
-        """(m, n) weight of each vote: the votes of one cell of one image share one voice.
+        """The votes of one cell of one image share one voice.
 
         Without this a pose gains by crowding all points into one large mask.
         """
-        rows, cols = self.shape
-        down, across = CELLS
-        cell = (v * (down / rows)).astype(np.intp) * across + (u * (across / cols)).astype(np.intp)
-        frames = len(self.base_taus)
-        cell = np.where(inside, cell + self.frame_of * (down * across), frames * down * across)
-        size = frames * down * across + 1
-        flat = (cell + np.arange(len(cell))[:, None] * size).reshape(-1)
-        weights = np.broadcast_to(self.weights, cell.shape).reshape(-1)
-        crowd = np.bincount(flat, weights, len(cell) * size)[flat].reshape(cell.shape)
-        return np.asarray(self.weights / (self.voice + crowd), dtype=np.float32)
+        state, point, pixel = self._seen(states)
+        votes = self.tables[self.starts[point] + pixel]
+        weights = self.weights[point]
+        cell = state * self.cell_count + self.first_cells[point] + self.cells[pixel]
+        crowd = np.bincount(cell, weights, len(states) * self.cell_count)[cell]
+        scores = np.bincount(state, votes * weights / (self.voice + crowd), len(states))
+        return scores.astype(np.float64, copy=False)
 
-    def _moved(self, states: States) -> Float32:
-        """(m, n, 3) points in the LiDAR frame, moved to their image's instant (first order)."""
-        taus = states.offsets[:, None] + self.base_taus
-        omega = self.twists[self.frame_of, :3].astype(np.float32)
-        v = self.twists[self.frame_of, 3:].astype(np.float32)
-        velocity = np.cross(omega, self.lPs) + v
-        if not velocity.any():
-            return self.lPs[None]
-        return np.asarray(self.lPs - taus[:, self.frame_of, None].astype(np.float32) * velocity)
+    def _seen(self, states: States) -> tuple[IntArray, IntArray, IntArray]:
+        """State, point and pixel of the shrunk mask of every projection that falls into its image."""
+        camera, shrink = self.camera, np.float32(self.shrink)
+        R = states.rotations.astype(np.float32)
+        t = states.translations.astype(np.float32)
+        X, Y, Z = (R[:, row] @ self.lPs.T + t[:, row, None] for row in range(3))
+        if self.velocities.any():
+            late = states.offsets.astype(np.float32)[:, None]
+            for row, axis in enumerate((X, Y, Z)):
+                axis -= late * (R[:, row] @ self.velocities.T)
+        half_x, half_y = self.camera.cx + 0.5, self.camera.cy + 0.5
+        rows, cols = self.shape
+        ahead = np.flatnonzero((Z > 0.5) & (np.abs(X) < Z * _reach(half_x, camera.width, camera.fx)))
+        inverse = 1.0 / Z.ravel()[ahead]
+        u = (np.float32(camera.fx) * X.ravel()[ahead] * inverse + np.float32(half_x)) / shrink
+        v = (np.float32(camera.fy) * Y.ravel()[ahead] * inverse + np.float32(half_y)) / shrink
+        inside = np.flatnonzero((u >= 0) & (u < cols) & (v >= 0) & (v < rows))
+        pixel = v[inside].astype(np.intp) * cols + u[inside].astype(np.intp)
+        state, point = np.divmod(ahead[inside], len(self.lPs))
+        return state, point, pixel
+
+
+def _reach(centre: float, width: int, focal: float) -> np.float32:
+    """Largest |X| / Z that an image shows."""
+    return np.float32(max(centre, width - centre) / focal)
 
 
 @dataclass(frozen=True)
@@ -193,18 +199,27 @@ class Votes:
         tables = [_vote_tables(frame.mask, self.classes, size, blur / shrink) for frame in self.frames]
         channels = len(self.classes) + 1
         starts = (self.frame_of * channels + self.class_of) * (size[0] * size[1])
+        velocities = self._velocities()
+        taus = np.array([frame.base_tau_s for frame in self.frames])[self.frame_of, None]
+        down, across = (np.arange(n) * c // n for n, c in zip(size[::-1], CELLS, strict=True))
         return Level(
             self.camera,
-            self.lPs[some],
+            (self.lPs - taus * velocities)[some].astype(np.float32),
+            velocities[some].astype(np.float32),
             starts[some].astype(np.intp),
-            self.frame_of[some],
-            np.stack([frame.l_twist for frame in self.frames]),
-            np.array([frame.base_tau_s for frame in self.frames]),
+            (down[:, None] * CELLS[1] + across).ravel(),
+            self.frame_of[some].astype(np.intp) * (CELLS[0] * CELLS[1]),
             np.concatenate([table.reshape(-1) for table in tables]),
             self.weights[some],
+            len(self.frames) * CELLS[0] * CELLS[1],
             shrink,
             (size[1], size[0]),
         )
+
+    def _velocities(self) -> FloatArray:
+        """(n, 3) negative apparent velocity of each point in the LiDAR frame [m/s]."""
+        twists = np.stack([frame.l_twist for frame in self.frames])[self.frame_of]
+        return np.cross(twists[:, :3], self.lPs) + twists[:, 3:]
 
 
 def _channels(labels: NDArray[np.uint8], classes: Sequence[SemanticClass]) -> IntArray:

@@ -52,23 +52,53 @@ def hold_contest(
     if not config.enabled:
         return Contest(((candidates[0].cTl, candidates[0].offset_s),), None)
     few = [_thinned(drive, config.contest_scans) for drive in drives]
-    simple = replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
-    solutions, failures = [], []
     contenders = config.free_contenders if guess_cTl is None else config.contenders
-    for candidate in _with_offsets(candidates[:contenders], guess_offset_s):
-        start = State(candidate.cTl, (candidate.offset_s,))
-        centre = prior_centre(start, guess_cTl, guess_offset_s)
-        try:
-            solution = solve_joint(few, start, simple, None, centre, tracks)
-        except EstimationError as error:
-            failures.append(error)
-            continue
-        if _is_within(solution, guess_cTl, config):
-            solutions.append(solution)
-    if not solutions:
-        raise failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
-    solutions.sort(key=support, reverse=True)
+    starts = [
+        State(candidate.cTl, (candidate.offset_s,))
+        for candidate in _with_offsets(candidates[:contenders], guess_offset_s)
+    ]
+    solutions: list[JointSolution] = []
+    for heat in _heats(joint):
+        solutions, failures = [], []
+        for start in starts:
+            centre = prior_centre(start, guess_cTl, guess_offset_s)
+            try:
+                solution = solve_joint(few, start, heat, None, centre, tracks)
+            except EstimationError as error:
+                failures.append(error)
+                continue
+            if _is_within(solution, guess_cTl, config):
+                solutions.append(solution)
+        if not solutions:
+            raise (
+                failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
+            )
+        solutions.sort(key=support, reverse=True)
+        starts = _survivors(solutions, config)
     return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config))
+
+
+def _heats(joint: JointConfig) -> list[JointConfig]:
+    """Settings of the two rounds: the wide kernels for all, the narrow ones for those that are left."""
+    simple = replace(
+        joint,
+        graph=replace(joint.graph, object_bias_sigma_px=0.0),
+        min_matches=1,
+        inner_iterations=min(2, joint.inner_iterations),
+    )
+    half = (len(joint.kernel_px) + 1) // 2
+    wide = replace(simple, kernel_px=joint.kernel_px[:half], max_outer=min(half, joint.max_outer))
+    return [wide, replace(simple, kernel_px=joint.kernel_px[half:] or joint.kernel_px[-1:])]
+
+
+def _survivors(solutions: Sequence[JointSolution], config: StartConfig) -> list[State]:
+    """Where solutions ended that differ and that enough matches support, the best first."""
+    least = config.survivor_ratio * support(solutions[0])
+    kept: list[State] = []
+    for solution in solutions:
+        if support(solution) >= least and not any(_alike(solution.state, s, 3.0) for s in kept):
+            kept.append(solution.state)
+    return kept
 
 
 def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
@@ -81,16 +111,22 @@ def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> lis
 
 def _finalists(solutions: Sequence[JointSolution], most: int) -> tuple[tuple[gtsam.Pose3, float], ...]:
     """The first ``most`` solutions that differ; a few frames cannot always tell near ones apart."""
-    found: list[tuple[gtsam.Pose3, float]] = []
+    found: list[State] = []
     for solution in solutions:
-        cTl, offset_s = solution.state.cTl, solution.state.offsets_s[0]
-        shifts = [(np.abs(gtsam.Pose3.Logmap(cTl.between(other))), abs(offset_s - s)) for other, s in found]
-        if all(
-            step[:3].max() > _ALIKE_RAD or step[3:].max() > _ALIKE_M or late > _ALIKE_S
-            for step, late in shifts
-        ):
-            found.append((cTl, offset_s))
-    return tuple(found[:most])
+        if not any(_alike(solution.state, state) for state in found):
+            found.append(solution.state)
+    return tuple((state.cTl, state.offsets_s[0]) for state in found[:most])
+
+
+def _alike(one: State, other: State, slack: float = 1.0) -> bool:
+    """Whether two solutions on a few frames lead to one answer."""
+    step = np.abs(gtsam.Pose3.Logmap(one.cTl.between(other.cTl)))
+    late = abs(one.offsets_s[0] - other.offsets_s[0])
+    return bool(
+        step[:3].max() <= slack * _ALIKE_RAD
+        and step[3:].max() <= slack * _ALIKE_M
+        and late <= slack * _ALIKE_S
+    )
 
 
 def _thinned(drive: Drive, most: int) -> Drive:

@@ -31,6 +31,8 @@ class StartConfig:
             a guess.
         finalists: most different solutions of the contest that are solved on all frames.
         contest_scans: scans of each drive that they are compared on.
+        survivor_ratio: solutions under the wide kernels that this fraction of the best one's matches
+            supports go on to the narrow ones.
         rival_ratio: a different solution that at least this fraction of the best one's matches supports
             makes the answer ambiguous.
         min_class_points: fewest points of the searched classes that make a frame worth looking at.
@@ -42,6 +44,7 @@ class StartConfig:
     free_contenders: int = 12
     finalists: int = 2
     contest_scans: int = 10
+    survivor_ratio: float = 0.6
     rival_ratio: float = 0.9
     min_class_points: int = 30
 
