@@ -25,7 +25,6 @@ from sst_graph.problem.hand_eye import (
     HandEyeTerm,
     NoiseScales,
     camera_steps,
-    fitted_scales,
     hand_eye_graph,
     hand_eye_terms,
     lidar_paths,
@@ -52,6 +51,7 @@ class MotionConfig:
         max_rotation_sigma_rad: camera motions whose rotation is known worse are left out [rad].
         min_pairs: fewest pairs for an answer.
         max_outer: most times that the LiDAR's motion is looked up anew.
+        full_steps: outer steps after which only half of each is made.
         settled: an outer step shorter than this many standard deviations ends the outer loop.
         inner_iterations: most Levenberg-Marquardt iterations in between.
         least_scale: the odometry's sigmas are never made smaller by more than this factor.
@@ -65,7 +65,8 @@ class MotionConfig:
     max_rotation_sigma_rad: float = 0.02
     min_pairs: int = 5
     max_outer: int = 20
-    settled: float = 0.02
+    full_steps: int = 6
+    settled: float = 0.1
     inner_iterations: int = 10
     least_scale: float = 0.3
     rival_chi2: float = 9.0
@@ -108,6 +109,8 @@ def solve_motion(
     """
     # 1. The motions, which depend on no calibration.
     steps, paths = camera_steps(drives, config.max_rotation_sigma_rad), lidar_paths(drives)
+    if len(steps) < config.min_pairs:
+        raise EstimationError(_too_few(len(steps), config))
     # 2. Rotation and time offset by trying all offsets.
     guess = None if guess_cTl is None else guess_cTl.rotation()
     starts = motion_starts(steps, paths, guess, guess_offset_s, config.start)
@@ -119,9 +122,14 @@ def solve_motion(
         translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
         cTl = gtsam.Pose3(start.cRl, translation)
         centre = State(guess_cTl or cTl, (guess_offset_s,))
-        solutions.append(_solve(steps, paths, State(cTl, (start.offset_s,)), centre, config))
+        solution = _solve(steps, paths, State(cTl, (start.offset_s,)), centre, config)
+        if solution is not None:
+            solutions.append(solution)
         if progress is not None:
             progress("motion", number + 1, len(starts))
+    if not solutions:
+        raise EstimationError("the time offset ran to where the drive has no LiDAR motion, from every start")
+    _LOG.info("motion: %d pairs, costs %s", len(steps), [round(s.cost, 1) for s in solutions])
     return sorted(solutions, key=lambda solution: solution.cost)
 
 
@@ -131,17 +139,19 @@ def _solve(
     state: State,
     centre: State,
     config: MotionConfig,
-) -> MotionSolution:
-    """Look the LiDAR's motion up at the time offset, optimise, until nothing moves."""
+) -> MotionSolution | None:
+    """Look the LiDAR's motion up at the time offset, optimise, until nothing moves.
+
+    None where the offset runs away to where too few pairs are left.
+    """
     converged, outer = False, 0
     while outer < config.max_outer and not converged:
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
         pairs = pair_motions(steps, paths, state.offsets_s[0])
-        if len(pairs) < config.min_pairs:
-            raise EstimationError(_too_few(len(pairs), config))
-        scales = fitted_scales(pairs, state, config.least_scale)
-        terms = hand_eye_terms(pairs, state, scales, config.kernel)
+        if len(pairs) < max(config.min_pairs, config.start.least_share * len(steps)):
+            return None
+        terms, scales = hand_eye_terms(pairs, state, config.kernel, config.least_scale)
         # 2. Inner optimisation.
         graph = hand_eye_graph(terms, centre, config.priors)
         values = _optimise(graph, state_values(state), config.inner_iterations)
@@ -149,7 +159,7 @@ def _solve(
         # 3. Move; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(delay_key())[0]),))
         step = difference(state, moved)
-        state = moved
+        state = moved if outer <= config.full_steps else _between(state, step)
         converged = float(step @ np.linalg.solve(covariance, step)) < config.settled**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, terms, scales, covariance, float(misfit), outer, converged)
@@ -158,6 +168,11 @@ def _solve(
 def difference(a: State, b: State) -> FloatArray:
     """(7,) step from one state to another, in the tangent space of the covariance."""
     return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
+
+
+def _between(state: State, step: FloatArray) -> State:
+    """Half of a step: robust weights and look-ups may go to and fro for ever."""
+    return State(state.cTl.retract(0.5 * step[:6]), (state.offsets_s[0] + 0.5 * float(step[6]),))
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:

@@ -114,11 +114,17 @@ class HandEyeTerm:
         pair: the motions.
         factor: on E and D.
         covariance: (6, 6) of [rotation rad, direction], or (3, 3) where only the rotation is used.
+        noise_pull: half of the expected change of the squared whitened residual as the offset grows and
+            the LiDAR's noise is averaged more or less [1/s].
+        rows_H_step: (6, 6) or (3, 6) the residual by a right perturbation of the LiDAR's motion, in units of
+            the scaled noise.
     """
 
     pair: MotionPair
     factor: gtsam.CustomFactor
     covariance: FloatArray
+    noise_pull: float
+    rows_H_step: FloatArray
 
     @property
     def has_direction(self) -> bool:
@@ -130,28 +136,27 @@ class HandEyeTerm:
 
 
 def hand_eye_terms(
-    pairs: Sequence[MotionPair], state: State, scales: NoiseScales, kernel: RobustKernel
-) -> list[HandEyeTerm]:
-    """A factor for every pair, under the residuals' own noise; robust weights are frozen at the state."""
+    pairs: Sequence[MotionPair], state: State, kernel: RobustKernel, least_scale: float
+) -> tuple[list[HandEyeTerm], NoiseScales]:
+    """A factor for every pair, and the scales at which half of the residuals are as small as they claim.
+
+    The factors' noise is scaled so; robust weights are frozen at the state.
+    """
     values = state_values(state)
-    terms = []
-    for pair in pairs:
-        term = _term(pair, state, scales.rotation, scales.direction)
-        turn, swerve = _sizes(term, values)
-        sizes = np.nan_to_num([turn / np.sqrt(3.0), swerve / np.sqrt(2.0)])
-        widening = 1.0 / np.sqrt(np.maximum(kernel.weight(sizes), 1e-6))
-        terms.append(_term(pair, state, scales.rotation * widening[0], scales.direction * widening[1]))
-    return terms
+    turns, swerves = np.array([_sizes(_term(pair, state, NoiseScales()), values) for pair in pairs]).T
+    directed = swerves[np.isfinite(swerves)]
+    scales = NoiseScales(
+        max(_scale(turns, 3), least_scale), max(_scale(directed, 2), least_scale) if len(directed) else 1.0
+    )
+    turn_weights = kernel.weight(turns / (scales.rotation * np.sqrt(3.0)))
+    swerve_weights = kernel.weight(np.nan_to_num(swerves) / (scales.direction * np.sqrt(2.0)))
+    weights = np.maximum(np.stack([turn_weights, swerve_weights], axis=1), 1e-6)
+    return [_term(pair, state, scales, w) for pair, w in zip(pairs, weights, strict=True)], scales
 
 
-def fitted_scales(pairs: Sequence[MotionPair], state: State, least: float) -> NoiseScales:
-    """Scales at which half of the residuals are as small as they claim."""
-    values = state_values(state)
-    sizes = np.array([_sizes(_term(pair, state, 1.0, 1.0), values) for pair in pairs])
-    directed = sizes[np.isfinite(sizes[:, 1]), 1]
-    rotation = float(np.sqrt(np.median(sizes[:, 0] ** 2) / _MEDIAN_CHI2[3]))
-    direction = float(np.sqrt(np.median(directed**2) / _MEDIAN_CHI2[2])) if len(directed) else 1.0
-    return NoiseScales(max(rotation, least), max(direction, least))
+def _scale(sizes: FloatArray, freedom: int) -> float:
+    """Ratio of the median whitened size to what it should be."""
+    return float(np.sqrt(np.median(sizes**2) / _MEDIAN_CHI2[freedom]))
 
 
 def hand_eye_graph(
@@ -163,7 +168,10 @@ def hand_eye_graph(
         graph.add(term.factor)
     sigmas = np.repeat([priors.rotation_rad, priors.translation_m], 3)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-    graph.add(delay_prior(delay_key(), centre.offsets_s[0], priors.offset_s))
+    # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
+    # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
+    pull = sum(term.noise_pull for term in terms)
+    graph.add(delay_prior(delay_key(), centre.offsets_s[0] + pull * priors.offset_s**2, priors.offset_s))
     return graph
 
 
@@ -175,44 +183,51 @@ def state_values(state: State) -> gtsam.Values:
     return values
 
 
-def _term(pair: MotionPair, state: State, rotation_scale: float, direction_scale: float) -> HandEyeTerm:
-    """The factor of a pair, its sigmas multiplied by the scales."""
+def _term(
+    pair: MotionPair, state: State, scales: NoiseScales, weights: FloatArray | None = None
+) -> HandEyeTerm:
+    """The factor of a pair, its sigmas multiplied by the scales; weights (2,) of rotation and direction."""
     step, motion = pair.lidar, pair.camera.motion
     predicted = state.cTl * step.aTb * state.cTl.inverse()
     length = float(np.linalg.norm(predicted.translation()))
-    Ad = np.asarray(state.cTl.AdjointMap())
-    covariance = Ad @ step.covariance @ Ad.T
-    covariance[:3, :3] += motion.covariance[:3, :3]
-    offset_0 = state.offsets_s[0]
-    if not motion.ok or length < MIN_LENGTH_M:
-        own = rotation_scale**2 * covariance[:3, :3]
-        motions = (pair.camera.rotation, step.aTb.rotation(), step.twist_a[:3], step.twist_b[:3])
-        factor = rotation_hand_eye(EXTRINSIC, delay_key(), *motions, offset_0, own)
-        return HandEyeTerm(pair, factor, own)
-    # The direction's sigmas, across it, as those of a translation of the predicted length.
+    directed = motion.ok and length >= MIN_LENGTH_M
+    rows = 6 if directed else 3
+    # 1. The noise of both motions as that of a pose of the predicted length.
+    basis = np.asarray(gtsam.Unit3(motion.direction).basis())
     across = np.zeros((6, 5))
     across[:3, :3] = np.eye(3)
-    basis = np.asarray(gtsam.Unit3(motion.direction).basis())
-    across[3:, 3:] = length * motion.rotation.matrix().T @ basis
-    covariance[:3, :3] -= motion.covariance[:3, :3]
-    covariance += across @ motion.covariance @ across.T
-    spread = np.repeat([rotation_scale, direction_scale], 3)
-    covariance *= np.outer(spread, spread)
-    measured = gtsam.Pose3(motion.rotation, length * motion.direction)
-    factor = hand_eye_factor(
-        EXTRINSIC,
-        delay_key(),
-        measured,
-        step.aTb,
-        step.twist_a,
-        step.twist_b,
-        offset_0,
-        covariance,
-        scale_known=False,
+    across[3:, 3:] = length * pair.camera.rotation.matrix().T @ basis
+    Ad = np.asarray(state.cTl.AdjointMap())
+    spread = np.repeat([scales.rotation, scales.direction], 3)
+    widened = spread if weights is None else spread / np.repeat(np.sqrt(weights), 3)
+    covariance = np.outer(widened, widened) * (
+        Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     )
-    noise = factor.noiseModel()
-    assert isinstance(noise, gtsam.noiseModel.Gaussian)
-    return HandEyeTerm(pair, factor, np.asarray(noise.covariance()))
+    # 2. The factor.
+    offset_0, turn = state.offsets_s[0], pair.camera.rotation
+    if directed:
+        measured = gtsam.Pose3(turn, length * motion.direction)
+        motions = (measured, step.aTb, step.twist_a, step.twist_b)
+        factor = hand_eye_factor(EXTRINSIC, delay_key(), *motions, offset_0, covariance, scale_known=False)
+        noise = factor.noiseModel()
+        assert isinstance(noise, gtsam.noiseModel.Gaussian)
+        own = np.asarray(noise.covariance())
+    else:
+        own = covariance[:3, :3]
+        turns = (turn, step.aTb.rotation(), step.twist_a[:3], step.twist_b[:3])
+        factor = rotation_hand_eye(EXTRINSIC, delay_key(), *turns, offset_0, own)
+    # 3. How the LiDAR's noise reaches the residual.
+    transfer = np.eye(6)
+    d = motion.direction
+    transfer[3:, 3:] = (np.eye(3) - np.outer(d, d)) / max(length, MIN_LENGTH_M) @ turn.matrix()
+    carried = (spread[:, None] * transfer @ Ad)[:rows]
+    return HandEyeTerm(
+        pair,
+        factor,
+        own,
+        0.5 * float(np.trace(np.linalg.solve(own, carried @ step.covariance_rate @ carried.T))),
+        carried,
+    )
 
 
 def _sizes(term: HandEyeTerm, values: gtsam.Values) -> tuple[float, float]:

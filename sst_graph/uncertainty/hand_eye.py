@@ -21,6 +21,10 @@ from sst_graph.problem.state import EXTRINSIC, delay_key
 FloatArray = NDArray[np.float64]
 
 
+LEAST_GENUINE = 0.01
+"""Of the information in any direction at least this part is taken for genuine, to keep it positive."""
+
+
 @dataclass(frozen=True)
 class HandEyeErrors:
     """Sigmas of what all pairs share, and how far neighbours go together.
@@ -52,8 +56,8 @@ def hand_eye_covariance(
     ordering.push_back(EXTRINSIC)
     ordering.push_back(delay_key())
     hessian = graph.linearize(values).hessian(ordering)[0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    bread = np.linalg.inv(hessian * np.outer(scale, scale)) * np.outer(scale, scale)
+    feigned = np.sum([_feigned(term) for term in terms], axis=0)
+    bread = _inverse_of_genuine(hessian, feigned)
     blocks, scores, shared = [], [], np.zeros((7, 6))
     for term in terms:
         J, r, root = _whitened(term, values)
@@ -68,6 +72,29 @@ def hand_eye_covariance(
     surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags)
     covariance = bread + bread @ (surplus + shared @ shared.T) @ bread
     return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _feigned(term: HandEyeTerm) -> FloatArray:
+    """(7, 7) information that the noise of the LiDAR's motion seems to bring: a turn that was none."""
+    step, H = term.pair.lidar, term.rows_H_step
+    weight = np.linalg.inv(term.covariance)
+    result = np.zeros((7, 7))
+    result[6, 6] = np.trace(weight @ H @ step.twist_covariance @ H.T)
+    variances, axes = np.linalg.eigh(step.covariance)
+    for variance, axis in zip(variances, axes.T, strict=True):
+        J = H @ gtsam.Pose3.adjointMap(axis)
+        result[:6, :6] += max(variance, 0.0) * J.T @ weight @ J
+    return result
+
+
+def _inverse_of_genuine(hessian: FloatArray, feigned: FloatArray) -> FloatArray:
+    """(7, 7) inverse of the information without what noise feigns, which stays positive."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    both = np.outer(scale, scale)
+    whitener = np.linalg.inv(np.linalg.cholesky(hessian * both + 1e-14 * np.eye(7)))
+    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (feigned * both) @ whitener.T)
+    root = whitener.T @ vectors
+    return np.asarray((root / np.maximum(values, LEAST_GENUINE)) @ root.T * both)
 
 
 def _whitened(term: HandEyeTerm, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
