@@ -15,7 +15,7 @@ from sst_graph.config import to_dict
 from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
-from sst_graph.uncertainty.observability import weak_directions
+from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, weak_directions
 
 FloatArray = NDArray[np.float64]
 
@@ -58,7 +58,8 @@ def result_of(
     answer: Answer, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
     """The result: unobservable where the covariance says so, not_converged where there are doubts."""
-    weak = weak_directions(answer.covariance, answer.cTl, config.observability)
+    advice = MOTION if config.method == "motion" else SILHOUETTES
+    weak = weak_directions(answer.covariance, answer.cTl, config.observability, advice)
     status: Status = "not_converged" if answer.doubts else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(

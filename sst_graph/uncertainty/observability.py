@@ -24,6 +24,38 @@ _NAMES = (
 
 
 @dataclass(frozen=True)
+class Advice:
+    """What to record so that a direction is told, by what is weak in it.
+
+    Attributes:
+        together: translation against time offset.
+        offset, rotation, translation: one of them alone.
+    """
+
+    together: str
+    offset: str
+    rotation: str
+    translation: str
+
+
+SILHOUETTES = Advice(
+    together="record a stop, a change of speed or a turn",
+    offset="record motion: several frames at some speed, with a change of speed or a turn",
+    rotation="record objects on all sides of the image, near and far",
+    translation="record objects nearer to the sensors, at several distances",
+)
+"""For calibration by objects that both sensors see."""
+MOTION = Advice(
+    together="record turns to both sides, at different speeds",
+    offset="record turns that begin and end, or rough road: the time offset is seen where turning changes",
+    rotation="record turns, as tight as may be: a straight drive leaves the rotation about its direction open",
+    translation="record tight turns and ramps; motion in a plane leaves the height open, and a camera without "
+    "a scale the sideways shift: method joint sees them",
+)
+"""For calibration by motion alone."""
+
+
+@dataclass(frozen=True)
 class ObservabilityConfig:
     """Largest standard deviations of an answer that may be called ok.
 
@@ -39,7 +71,7 @@ class ObservabilityConfig:
 
 
 def weak_directions(
-    covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
+    covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig, advice: Advice = SILHOUETTES
 ) -> tuple[WeakDirection, ...]:
     """Directions whose standard deviation is past the limits, the weakest first.
 
@@ -53,11 +85,11 @@ def weak_directions(
     for value, vector in sorted(zip(values, vectors.T, strict=True), key=lambda pair: -pair[0]):
         if value <= 1.0:
             break
-        found.append(_describe(limits * vector * np.sqrt(value), cTl))
+        found.append(_describe(limits * vector * np.sqrt(value), cTl, advice))
     return tuple(found)
 
 
-def _describe(step: FloatArray, cTl: gtsam.Pose3) -> WeakDirection:
+def _describe(step: FloatArray, cTl: gtsam.Pose3, advice: Advice) -> WeakDirection:
     """A weak direction from its one-sigma step (7,) [rad, m, s]."""
     scaled = step / DIRECTION_SCALES
     sigma = float(np.linalg.norm(scaled))
@@ -65,12 +97,12 @@ def _describe(step: FloatArray, cTl: gtsam.Pose3) -> WeakDirection:
     if vector[np.abs(vector).argmax()] < 0:
         step, vector = -step, -vector
     c_step = np.asarray(cTl.rotation().matrix()) @ step[3:6]
-    sentence, advice = _words(step[:3], c_step, float(step[6]), vector)
-    return WeakDirection(vector, sigma, sentence, advice)
+    sentence, remedy = _words(step[:3], c_step, float(step[6]), vector, advice)
+    return WeakDirection(vector, sigma, sentence, remedy)
 
 
 def _words(
-    rotation: FloatArray, c_translation: FloatArray, offset_s: float, vector: FloatArray
+    rotation: FloatArray, c_translation: FloatArray, offset_s: float, vector: FloatArray, advice: Advice
 ) -> tuple[str, str]:
     """What one sigma along a weak direction means, and what to record."""
     parts = {
@@ -87,23 +119,23 @@ def _words(
             f"the LiDAR {words} cannot be told from the image taken {sign}: "
             f"1 m equals {rate_ms:.0f} ms of time offset (one sigma: {100 * translation_m:.1f} cm, "
             f"{abs(offset_s) * 1e3:.1f} ms)",
-            "record a stop, a change of speed or a turn",
+            advice.together,
         )
     if parts["offset"] >= max(parts["rotation"], parts["translation"]):
         return (
             f"the time offset is known to {abs(offset_s) * 1e3:.1f} ms only (one sigma)",
-            "record motion: several frames at some speed, with a change of speed or a turn",
+            advice.offset,
         )
     if parts["rotation"] > parts["translation"]:
         angle = np.degrees(float(np.linalg.norm(rotation)))
         return (
             f"the rotation is known to {angle:.2f} deg only (one sigma) about the LiDAR axis "
             + np.array2string(rotation / max(float(np.linalg.norm(rotation)), 1e-12), precision=2),
-            "record objects on all sides of the image, near and far",
+            advice.rotation,
         )
     return (
         f"the translation is known to {100 * translation_m:.1f} cm only (one sigma), the LiDAR {words}",
-        "record objects nearer to the sensors, at several distances",
+        advice.translation,
     )
 
 
