@@ -37,6 +37,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_calibrate,
         _add_track,
         _add_evaluate,
+        _add_inspect,
         _add_overlay,
         _add_export,
         _add_experiment,
@@ -162,6 +163,22 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     )
     evaluate.add_argument("--json", action="store_true", help="print JSON (degrees, metres, seconds)")
     return evaluate
+
+
+def _add_inspect(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "how far a result can be trusted: sigmas, correlations, weak directions, what to record next"
+    inspect = commands.add_parser("inspect", help=text, description=f"{text}; docs/inspect.md explains it.")
+    inspect.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    inspect.add_argument("--all-frames", action="store_true", help="every frame in the table")
+    inspect.add_argument(
+        "--next", type=int, default=10, metavar="N", help="frames that predictions add (default %(default)s)"
+    )
+    inspect.add_argument("--json", action="store_true", help="print JSON (units in the names)")
+    inspect.add_argument(
+        "--plots", type=Path, metavar="DIR", help="folder for plots as PNG (needs matplotlib)"
+    )
+    inspect.add_argument("--overwrite", action="store_true", help="replace earlier plots in DIR")
+    return inspect
 
 
 def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

@@ -1,0 +1,125 @@
+"""A picture of the factor graph behind a result, drawn from what the result knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from sst_graph.uncertainty.inspection import Inspection
+
+MOST_FRAMES = 6
+"""Frames drawn; of a longer record the first ones and the last."""
+
+_VARIABLE = {"boxstyle": "circle,pad=0.35", "fc": "white", "ec": "black", "lw": 1.2}
+_TOP, _MOTION, _TWIST, _SILHOUETTE, _BIAS = 4.0, 3.0, 2.0, 1.0, 0.0
+
+
+def draw_graph(figure: Any, inspection: Inspection) -> Any:
+    """Circles are unknowns, squares factors. The rows: E and D; motion; V(k); silhouettes; B(class)."""
+    ax = figure.subplots()
+    result = inspection.result
+    frames = [(frame.drive, frame.frame) for frame in result.frames_used]
+    shown = frames if len(frames) <= MOST_FRAMES else [*frames[: MOST_FRAMES - 1], frames[-1]]
+    n = max(1, len(shown))
+    offsets = [drive.drive for drive in result.drive_offsets]
+    tops = {"E": ((n - 1) * 0.5 - 0.8, _TOP)}
+    for k, drive in enumerate(offsets or [""]):
+        tops[f"D{drive}"] = ((n - 1) * 0.5 + 0.8 + 0.9 * k, _TOP)
+    biases = _biases(result.diagnostics.get("mask_bias_px"), {drive for drive, _ in shown})
+    bases = {
+        key: ((n - 1) * (k + 1) / (len(biases) + 1) if n > 1 else float(k), _BIAS)
+        for k, key in enumerate(biases)
+    }
+    twists = result.method in ("joint", "track")
+    for k, (drive, frame) in enumerate(shown):
+        clock = tops[f"D{drive}" if offsets else "D"]
+        mine = [at for (owner, _), at in bases.items() if owner in ("", drive)]
+        _draw_frame(ax, float(k), frame, twists, [tops["E"], clock], mine)
+    if len(shown) < len(frames):
+        words = f"…\n{len(frames) - len(shown)}\nmore\n…"
+        ax.text(n - 1.37, _TWIST, words, ha="center", va="center", fontsize=9)
+    _draw_shared(ax, tops, bases)
+    ax.set_xlim(-0.7, n - 0.4)
+    ax.set_ylim(_BIAS - 0.6, _TOP + 0.75)
+    ax.axis("off")
+    ax.set_title(_caption(inspection, len(frames)), fontsize=11)
+    return figure
+
+
+def _draw_frame(
+    ax: Any,
+    x: float,
+    frame: int,
+    twists: bool,
+    tops: Sequence[tuple[float, float]],
+    bases: Sequence[tuple[float, float]],
+) -> None:
+    """One frame: its twist, its motion and its silhouettes, with their edges."""
+    silhouette = (x, _SILHOUETTE)
+    for at in bases:
+        _edge(ax, silhouette, at, "tab:orange")
+    if twists:
+        motion = (x, _MOTION)
+        for at in tops:
+            _edge(ax, motion, at, "tab:green")
+            _bent(ax, silhouette, at)
+        _edge(ax, motion, (x, _TWIST), "tab:green")
+        _edge(ax, (x, _TWIST), silhouette, "tab:blue")
+        _square(ax, motion, "tab:green")
+        ax.text(x, _TWIST, f"V{frame}", ha="center", va="center", fontsize=9, bbox=_VARIABLE, zorder=4)
+    else:
+        for at in tops:
+            _edge(ax, silhouette, at, "tab:blue")
+    _square(ax, silhouette, "tab:blue")
+    ax.text(x - 0.1, _SILHOUETTE + 0.08, f"frame {frame}", ha="right", fontsize=8, color="tab:blue", zorder=4)
+
+
+def _draw_shared(
+    ax: Any,
+    tops: Mapping[str, tuple[float, float]],
+    bases: Mapping[tuple[str, str], tuple[float, float]],
+) -> None:
+    """Extrinsic, offsets and mask biases, each with its prior."""
+    for name, (x, y) in tops.items():
+        _edge(ax, (x, y), (x, y + 0.45), "grey")
+        _square(ax, (x, y + 0.45), "grey")
+        label = name if len(name) == 1 else f"D\n{name[1:]}"
+        ax.text(x, y, label, ha="center", va="center", fontsize=10, bbox=_VARIABLE, zorder=4)
+    for (drive, label), (x, y) in bases.items():
+        _edge(ax, (x, y), (x, y - 0.4), "grey")
+        _square(ax, (x, y - 0.4), "grey")
+        words = f"B {label}" + (f"\n{drive}" if drive else "")
+        ax.text(x, y, words, ha="center", va="center", fontsize=8, bbox={**_VARIABLE, "boxstyle": "round"})
+
+
+def _biases(found: Any, drives: set[str]) -> list[tuple[str, str]]:
+    """(drive or "", class) of every mask bias that the result names for the drives shown."""
+    if not isinstance(found, Mapping):
+        return []
+    pairs = [tuple(str(name).rpartition(":")[::2]) for name in found]
+    return [(drive, label) for drive, label in pairs if not drive or drive in drives]
+
+
+def _caption(inspection: Inspection, frames: int) -> str:
+    objects = [frame.objects for frame in inspection.frames]
+    spread = f", {min(objects)} to {max(objects)} objects each" if objects else ""
+    own = "; each object's own bias between B and its silhouettes is left out" if objects else ""
+    return (
+        f"Factor graph of {frames} frame{'s' * (frames != 1)}{spread}. Circles: unknowns (E extrinsic, "
+        f"D time offset, V twist, B mask bias{own}).\n"
+        "Squares: factors (blue: silhouettes of a frame, green: motion from odometry, grey: priors)"
+    )
+
+
+def _edge(ax: Any, a: tuple[float, float], b: tuple[float, float], colour: str) -> None:
+    ax.plot([a[0], b[0]], [a[1], b[1]], color=colour, lw=0.9, alpha=0.7, zorder=1)
+
+
+def _bent(ax: Any, a: tuple[float, float], b: tuple[float, float]) -> None:
+    """An edge that passes beside the motion factor and the twist above the silhouettes."""
+    x = [a[0], a[0] + 0.28, a[0] + 0.28, b[0]]
+    ax.plot(x, [a[1], a[1] + 0.5, _MOTION + 0.1, b[1]], color="tab:blue", lw=0.7, alpha=0.45, zorder=1)
+
+
+def _square(ax: Any, at: tuple[float, float], colour: str) -> None:
+    ax.plot(*at, marker="s", ms=9, color=colour, zorder=3)
