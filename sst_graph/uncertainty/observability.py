@@ -47,10 +47,9 @@ SILHOUETTES = Advice(
 """For calibration by objects that both sensors see."""
 MOTION = Advice(
     together="record turns to both sides, at different speeds",
-    offset="record turns that begin and end, or rough road: the time offset is seen where turning changes",
-    rotation="record turns, as tight as may be: a straight drive leaves the rotation about its direction open",
-    translation="record tight turns and ramps; motion in a plane leaves the height open, and a camera without "
-    "a scale the sideways shift: method joint sees them",
+    offset="record turns that begin and end, or a rough road: where turning changes, the time offset is seen",
+    rotation="record turns: a straight drive leaves the rotation about its direction open",
+    translation="record tight turns and ramps, or use method joint: motion in a plane leaves the height open",
 )
 """For calibration by motion alone."""
 
