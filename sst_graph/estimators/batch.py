@@ -18,6 +18,7 @@ from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, solve_joint, support
 from sst_graph.estimators.motion_answer import answer_motion
+from sst_graph.estimators.motion_joint import WithMotion, with_motion
 from sst_graph.estimators.start import find_start
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
@@ -63,7 +64,7 @@ def calibrate(
     _check(sources, config)
     began = time.perf_counter()
     prepare = config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS:
+    if config.method not in _NEED_IMAGE_TRACKS and not (config.method == "joint" and config.use_motion):
         prepare = dataclasses.replace(prepare, use_visual_odometry=False)
     drives = [prepare_drive(source, config.classes, prepare, progress) for source in sources]
     seconds = time.perf_counter() - began
@@ -101,6 +102,8 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
         raise ConfigError(f"delay_per_drive needs drives of different names, found {names}")
     if config.delay_per_drive and config.method != "joint":
         raise ConfigError(f"delay_per_drive needs method joint, found {config.method}")
+    if config.delay_per_drive and config.use_motion:
+        raise ConfigError("use_motion knows one time offset only: leave out delay_per_drive")
 
 
 def answer_joint(
@@ -117,7 +120,13 @@ def answer_joint(
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
     solution = max(_finals(drives, tracks, contest, guess, config, progress), key=support)
-    # 4. How sure, and in which directions not at all.
+    # 4. What the motion alone says, where it is asked.
+    heard = WithMotion(solution)
+    if config.use_motion:
+        centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+        heard = with_motion(drives, tracks, objects, solution, centre, config, progress)
+        solution = heard.solution
+    # 5. How sure, and in which directions not at all.
     frozen = (solution.graph, solution.values, solution.pairs, solution.state, objects)
     covariance, model, _ = robust_covariance(*frozen)
     return Answer(
@@ -125,7 +134,7 @@ def answer_joint(
         solution.state.offsets_s[0],
         covariance[:7, :7],
         _frames_used(drives, solution),
-        doubts=_doubts(solution, contest),
+        doubts=(*_doubts(solution, contest), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -136,6 +145,7 @@ def answer_joint(
                 f"{drives[d].name}:{c.name.lower()}": bias
                 for (d, c), bias in solution.state.biases_px.items()
             },
+            **({"motion": heard.diagnostics} if config.use_motion else {}),
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
             FRAME_INFORMATION: to_document(frame_gains(*frozen, drives, model)),
         },

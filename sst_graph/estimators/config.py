@@ -28,6 +28,8 @@ class CalibrationConfig:
             against visual odometry).
         classes: semantic classes to align.
         delay_per_drive: each drive has a time offset of its own, instead of one for all.
+        use_motion: method joint also hears what camera and LiDAR motion say (hand-eye), as a factor and as a
+            check.
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
@@ -41,6 +43,7 @@ class CalibrationConfig:
     method: Method = "joint"
     classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
     delay_per_drive: bool = False
+    use_motion: bool = False
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)

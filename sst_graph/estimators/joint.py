@@ -77,12 +77,14 @@ def solve_joint(
     progress: Progress | None = None,
     guess: State | None = None,
     tracks: Tracks | None = None,
+    belief: gtsam.NonlinearFactor | None = None,
 ) -> JointSolution:
     """Re-pair, re-match, optimise, until nothing moves.
 
     Args:
         guess: what the weak priors are centred on; the start where it is None.
         tracks: twist and object tracks of the drives; made here where it is None.
+        belief: what else is known of the extrinsic and the first clock's offset.
 
     Raises:
         EstimationError: too few matches at any step.
@@ -100,6 +102,8 @@ def solve_joint(
         _check_matches(pairs, config)
         # 2. Inner optimisation with the matches frozen.
         graph, values = joint_graph(pairs, state, config.graph, guess)
+        if belief is not None:
+            graph.add(belief)
         values = _optimise(graph, values, config.inner_iterations)
         # 3. Move; stop when the step is small at the last scale.
         moved = state_from(values, state, pairs)

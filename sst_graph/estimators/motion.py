@@ -55,6 +55,7 @@ class MotionConfig:
         settled: an outer step shorter than this many standard deviations ends the outer loop.
         inner_iterations: most Levenberg-Marquardt iterations in between.
         least_scale: the odometry's sigmas are never made smaller by more than this factor.
+        max_disagreement: chi-squared of 7 up to which the joint method takes the motion in.
         rival_chi2: a different solution that costs at most this much more makes the answer doubtful.
     """
 
@@ -69,6 +70,7 @@ class MotionConfig:
     settled: float = 0.1
     inner_iterations: int = 10
     least_scale: float = 0.3
+    max_disagreement: float = 40.0
     rival_chi2: float = 9.0
 
 

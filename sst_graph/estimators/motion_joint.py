@@ -1,0 +1,103 @@
+"""What motion alone says, as one more factor of the joint graph, and as a check of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.config import CalibrationConfig
+from sst_graph.estimators.joint import JointSolution, solve_joint
+from sst_graph.estimators.motion import difference, solve_motion
+from sst_graph.problem.drive import Drive, Progress
+from sst_graph.problem.graph import Tracks
+from sst_graph.problem.objects import ObjectId
+from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.uncertainty.covariance import robust_covariance
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class WithMotion:
+    """A joint solution after motion was heard.
+
+    Attributes:
+        solution: with the motion in its graph, or as it was where motion says nothing or something else.
+        doubts: a sentence where the two contradict each other.
+        diagnostics: JSON-able numbers.
+    """
+
+    solution: JointSolution
+    doubts: tuple[str, ...] = ()
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+
+def with_motion(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    objects: Sequence[dict[ObjectId, int]],
+    solution: JointSolution,
+    guess: State,
+    config: CalibrationConfig,
+    progress: Progress | None = None,
+) -> WithMotion:
+    """The joint solution with the hand-eye solution as a factor, where the two agree.
+
+    The labels see translation, and the time offset by speed alone; the motion sees the time offset by
+    turning, also where the speed is constant. Both lean on the LiDAR's odometry, whose noise counts as
+    independent here.
+
+    Args:
+        objects: tracks of the objects of each drive, for the covariance.
+        guess: what the weak priors are centred on.
+    """
+    # 1. The hand-eye solution from the joint one.
+    state = solution.state
+    try:
+        motion = solve_motion(drives, state.cTl, state.offsets_s[0], config.motion, progress)[0]
+    except EstimationError as error:
+        return WithMotion(solution, (), {"left_out": str(error)})
+    # 2. Do they agree?
+    covariance, _, _ = robust_covariance(
+        solution.graph, solution.values, solution.pairs, solution.state, objects
+    )
+    step = difference(state, motion.state)
+    apart = float(step @ np.linalg.solve(covariance[:7, :7] + motion.covariance, step))
+    sigmas = np.sqrt(np.diag(motion.covariance))
+    facts = {"chi2_of_7": apart, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
+    if apart > config.motion.max_disagreement or not motion.converged:
+        return WithMotion(solution, _contradiction(step, apart, motion.converged), facts)
+    # 3. Silhouettes once more, the motion among the factors.
+    belief = belief_factor(motion.state, motion.covariance)
+    last_scale = replace(config.joint, kernel_px=config.joint.kernel_px[-1:])
+    return WithMotion(
+        solve_joint(drives, state, last_scale, progress, guess, tracks, belief), (), {"fused": True, **facts}
+    )
+
+
+def belief_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:
+    """[Log(E_0^-1 E); D - D_0] with a (7, 7) covariance, linear about the state (E_0, D_0)."""
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    unit = gtsam.noiseModel.Unit.Create(7)
+    linear = gtsam.JacobianFactor(EXTRINSIC, root[:, :6], delay_key(), root[:, 6:], np.zeros(7), unit)
+    point = gtsam.Values()
+    point.insert(EXTRINSIC, state.cTl)
+    point.insert(delay_key(), np.array(state.offsets_s[:1]))
+    return gtsam.LinearContainerFactor(linear, point)
+
+
+def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:
+    """A sentence about two solutions that lie apart; none where the motion found no end by itself."""
+    if not converged:
+        return ()
+    degrees, metres = np.degrees(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
+    return (
+        f"motion alone says another calibration, {degrees:.2f} deg, {100 * metres:.0f} cm and "
+        f"{1e3 * step[6]:+.1f} ms away (chi-squared {chi2:.0f} of 7): labels or odometry are wrong",
+    )
