@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from factors.robust import RobustKernel
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_config import AdoptionConfig
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.graph import GraphConfig, Tracks, associate
+from sst_graph.problem.graph import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.types import SemanticClass
 
 
@@ -56,10 +57,21 @@ def held_out_cost(
     A point that finds no contour costs as much as the farthest match.
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
+    points = [sum(map(len, scan.boundaries.values())) for scan in drive.scans]
+    return mean_cost([(pair, points[pair.pair.scan]) for pair in pairs], point, classes, kernel, config)
+
+
+def mean_cost(
+    pairs: Sequence[tuple[PairMatches, int]],
+    point: Point,
+    classes: tuple[SemanticClass, ...],
+    kernel: RobustKernel,
+    config: GraphConfig,
+) -> float | None:
+    """Mean robust cost of boundary points, given each pair's matches and number of boundary points."""
     worst = float(kernel.loss(config.match.gate * kernel.scale))
     cost, count = 0.0, 0
-    for pair in pairs:
-        total = sum(len(b) for b in drive.scans[pair.pair.scan].boundaries.values())
+    for pair, total in pairs:
         count += total
         cost += worst * (total - len(pair))
         for c, matches in pair.matches.items():

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,20 +20,52 @@ _LEAST_INFORMATION = 1.0
 rounding over rounding."""
 
 
+@dataclass(frozen=True)
+class Joint:
+    """Covariance of the estimate.
+
+    Attributes:
+        matrix: (n, n) over [extrinsic, offset, biases, object biases].
+        tracks: of the objects.
+        core_size: unknowns before the objects' biases.
+    """
+
+    matrix: FloatArray
+    tracks: tuple[int, ...]
+    core_size: int
+
+    def seeing(self, places: Mapping[int, int], sigma_px: float) -> FloatArray:
+        """(m, m) covariance of [extrinsic, offset, biases, and some objects' biases].
+
+        Args:
+            places: place of its class's bias by the object's track; the bias of an object that is not known
+                yet is its class's, give or take ``sigma_px``.
+        """
+        source, extra = list(range(self.core_size)), [0.0] * self.core_size
+        for track, place in places.items():
+            known = track in self.tracks
+            source.append(self.core_size + self.tracks.index(track) if known else 7 + place)
+            extra.append(0.0 if known else sigma_px**2)
+        return np.asarray(self.matrix[np.ix_(source, source)] + np.diag(extra))
+
+
 class StepAlarm:
     """The score of the last few new frames at the estimate made before them.
 
-    Where nothing changed, the gradient g of their cost at the estimate is zero-mean with variance
-    M + H P H (M: of the matches, cluster-robust; P: of the estimate), whatever the frames can tell, so
+    Where nothing changed, the gradient g of their cost by extrinsic, offset and biases at the estimate is
+    zero-mean with variance M + H P H' (M: of the matches, cluster-robust; P: of the estimate, the objects'
+    biases included; H: how g depends on it), whatever the frames can tell, so
 
-        T = g' (M + H P H)^-1 g
+        T = g' (M + H P H')^-1 g
 
     follows chi-square over the unknowns. Its usual size on this data is learnt and divided out, where it is
     more than the model says.
     """
 
-    def __init__(self, config: AlarmConfig) -> None:
+    def __init__(self, config: AlarmConfig, object_sigma_px: float = 0.0) -> None:
+        """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         self.config = config
+        self.object_sigma_px = object_sigma_px
         self.recent: deque[PairScore] = deque(maxlen=config.frames)
         self.usual: deque[float] = deque(maxlen=config.baseline)
         self.raised = 0
@@ -44,13 +77,13 @@ class StepAlarm:
         self.raised = 0
         self.quiet = 0
 
-    def check(self, scores: Sequence[PairScore], covariance: FloatArray, model: ErrorModel) -> float | None:
+    def check(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float | None:
         """The statistic with new frames' scores, over its usual size; None while it can't be told."""
         self.recent.extend(scores)
         if not scores or len(self.recent) < self.config.frames:
             return None
-        statistic = chi_square(list(self.recent), covariance, model)
-        scale = self._scale(len(covariance))
+        statistic = chi_square(list(self.recent), joint, model, self.object_sigma_px)
+        scale = self._scale(joint.core_size)
         value = statistic / scale
         self.quiet += 1
         if value > self.config.chi2:
@@ -74,23 +107,26 @@ class StepAlarm:
         return max(1.0, float(np.quantile(self.usual, 0.9)) / expected)
 
 
-def chi_square(scores: Sequence[PairScore], covariance: FloatArray, model: ErrorModel) -> float:
+def chi_square(
+    scores: Sequence[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float = 0.0
+) -> float:
     """T of the new frames, see :class:`StepAlarm`."""
-    n = len(covariance)
-    H, g, M = np.zeros((n, n)), np.zeros(n), np.zeros((n, n))
+    n = joint.core_size
+    places = {track: place for score in scores for track, place in score.places.items()}
+    order = list(places)
+    H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
     by_side: dict[int, FloatArray] = {}
     for score in scores:
-        H += score.belief.information
-        g += score.belief.vector
-        M += max(1.0, model.match) * score.JJ
-        rows = score.sides.scores
-        M += model.side_frame * (rows.T @ rows)
-        for side, row in zip(score.sides.sides.tolist(), rows, strict=True):
+        own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
+        H[:, own] += score.belief.information[:n]
+        g += score.belief.vector[:n]
+        M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
+        for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
             by_side[side] = by_side[side] + row if side in by_side else row
     if by_side:
         rows = np.stack(list(by_side.values()))
         M += model.side * (rows.T @ rows)
-    variance = M + H @ covariance @ H + _LEAST_INFORMATION * np.eye(n)
+    variance = M + H @ joint.seeing(places, object_sigma_px) @ H.T + _LEAST_INFORMATION * np.eye(n)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(variance), 1e-30))
     scaled = variance * np.outer(scale, scale) + 1e-9 * np.eye(n)
     return float((scale * g) @ np.linalg.solve(scaled, scale * g))

@@ -26,14 +26,14 @@ from sst_graph.estimators.scores import ScoreSums
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
-from sst_graph.estimators.window import Window
+from sst_graph.estimators.window import Sighting, Window
 from sst_graph.files import atomic_write_bytes
 from sst_graph.problem.drive import ScanFeatures, image_features
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 1
+VERSION = 2
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -160,6 +160,17 @@ def _put_window(arrays: Arrays, window: Window) -> dict[str, Any]:
             for track, (c, place) in objects.live.items()
         ],
         "objects_seen": [objects.scans, objects.following],
+        "sightings": [
+            [track, s.scan, int(s.name[0]), s.name[1], s.stamp_ns, s.centre.tolist()]
+            for track, seen in window.sightings.items()
+            for s in seen
+        ],
+        "moving": [
+            [scan, int(c), number, speed]
+            for scan, speeds in window.moving.items()
+            for (c, number), speed in speeds.items()
+        ],
+        "judged_anew": sorted(window.judged_anew),
     }
 
 
@@ -189,6 +200,12 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
         window.objects.live[track] = (SemanticClass(c), np.array(place))
         window.objects.last_seen[track] = last
     window.objects.scans, window.objects.following = head["objects_seen"]
+    for track, scan, c, number, stamp_ns, centre in head["sightings"]:
+        sighting = Sighting(scan, (SemanticClass(c), number), stamp_ns, np.array(centre))
+        window.sightings.setdefault(track, []).append(sighting)
+    for scan, c, number, speed in head["moving"]:
+        window.moving.setdefault(scan, {})[SemanticClass(c), number] = speed
+    window.judged_anew = set(head["judged_anew"])
 
 
 def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
@@ -229,11 +246,15 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
 def _put_point(arrays: Arrays, name: str, point: Point) -> None:
     arrays[f"{name}/cTl"] = point.cTl.matrix()
     arrays[f"{name}/rest"] = np.array([point.offset_s, *point.biases_px])
+    arrays[f"{name}/tracks"] = np.array(point.tracks, np.int64)
+    arrays[f"{name}/objects"] = point.object_biases_px
 
 
 def _point(arrays: Arrays, name: str) -> Point:
     rest = arrays[f"{name}/rest"]
-    return Point(gtsam.Pose3(arrays[f"{name}/cTl"]), float(rest[0]), rest[1:])
+    tracks = tuple(arrays[f"{name}/tracks"].tolist())
+    cTl = gtsam.Pose3(arrays[f"{name}/cTl"])
+    return Point(cTl, float(rest[0]), rest[1:], tracks, arrays[f"{name}/objects"])
 
 
 def _put_gaussian(arrays: Arrays, name: str, belief: Gaussian) -> None:

@@ -16,6 +16,21 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Found:
+    """New matches of a scan.
+
+    Attributes:
+        pair: the matches.
+        score: their belief and sums.
+        stamp_ns: of the scan.
+    """
+
+    pair: PairMatches
+    score: PairScore
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
 class Entry:
     """A pair in the graph.
 
@@ -69,15 +84,26 @@ class EpochSums:
 
     @classmethod
     def empty(cls, point: Point) -> EpochSums:
+        """Nothing yet, about [extrinsic, offset, biases] at a point."""
+        point = point.core()
         n = point.size
         return cls(Gaussian(point, np.zeros((n, n)), np.zeros(n)), ScoreSums.empty(n))
 
     def copy(self) -> EpochSums:
         return EpochSums(self.belief, self.sums.copy())
 
-    def add(self, score: PairScore, scan: int) -> None:
+    def add(self, score: PairScore, scan: int, sigma_px: float) -> None:
+        """Take in a pair; objects that are new to the epoch lie within ``sigma_px`` of their class's bias."""
+        known = self.belief.point.tracks
+        new = {track: place for track, place in score.places.items() if track not in known}
+        if new:
+            self.belief = self.belief.with_objects(new, sigma_px)
+            self.sums.grow(self.belief.point.size)
         self.belief = self.belief.plus(score.belief)
-        self.sums.add(score, scan)
+        self.sums.add(score, self.belief.point.columns(score.belief.point.tracks), scan)
 
-    def surplus(self, model: ErrorModel) -> FloatArray:
-        return self.sums.surplus([], model)
+    def retired(self, start_ns: int, model: ErrorModel) -> RetiredEpoch:
+        """What stays of the epoch: its objects' biases marginalized out."""
+        surplus = self.sums.surplus([], [], model)
+        belief, T = self.belief.without(self.belief.point.tracks)
+        return RetiredEpoch(start_ns, belief, T @ surplus @ T.T)

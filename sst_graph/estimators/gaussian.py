@@ -2,51 +2,96 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import custom_factor
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
 class Point:
-    """A value of the unknowns; tangent order [extrinsic 6, offset 1, biases], as the covariance.
+    """A value of the unknowns; tangent order [extrinsic 6, offset 1, biases, object biases].
 
     Attributes:
         cTl: extrinsic.
         offset_s: time offset [s].
         biases_px: (c,) mask bias of each class [px].
+        tracks: objects with a mask bias of their own, by the number of their track.
+        object_biases_px: (k,) those biases [px].
     """
 
     cTl: gtsam.Pose3
     offset_s: float
     biases_px: FloatArray
+    tracks: tuple[int, ...] = ()
+    object_biases_px: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def size(self) -> int:
+        return self.core_size + len(self.tracks)
+
+    @property
+    def core_size(self) -> int:
+        """Unknowns before the objects' biases."""
         return 7 + len(self.biases_px)
 
+    def columns(self, tracks: Sequence[int]) -> IntArray:
+        """Columns of [extrinsic, offset, biases, and these objects' biases]."""
+        places = [self.core_size + self.tracks.index(track) for track in tracks]
+        return np.array([*range(self.core_size), *places], dtype=np.intp)
+
+    def seen(self, places: Mapping[int, int]) -> Point:
+        """The point with just these objects; one that has no bias yet takes its class's.
+
+        Args:
+            places: place of its class's bias by the number of the track.
+        """
+        known = dict(zip(self.tracks, self.object_biases_px.tolist(), strict=True))
+        biases = [known.get(track, float(self.biases_px[place])) for track, place in places.items()]
+        return replace(self, tracks=tuple(places), object_biases_px=np.array(biases))
+
+    def with_object(self, track: int, bias_px: float) -> Point:
+        """The point with one more object."""
+        biases = np.append(self.object_biases_px, bias_px)
+        return replace(self, tracks=(*self.tracks, track), object_biases_px=biases)
+
+    def core(self) -> Point:
+        """The point without objects."""
+        return self.seen({})
+
     def local(self, other: Point) -> FloatArray:
-        """(n,) step from here to another point."""
+        """(n,) step from here to another point, over the objects that are known here."""
         turn = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        theirs = other.object_biases_px
+        if other.tracks != self.tracks:
+            theirs = theirs[other.columns(self.tracks)[other.core_size :] - other.core_size]
         return np.concatenate(
-            [turn, [other.offset_s - self.offset_s], np.subtract(other.biases_px, self.biases_px)]
+            [
+                turn,
+                [other.offset_s - self.offset_s],
+                np.subtract(other.biases_px, self.biases_px),
+                theirs - self.object_biases_px,
+            ]
         )
 
     def moved(self, step: FloatArray) -> Point:
         """The point a step (n,) away."""
-        return Point(
-            self.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
-            self.offset_s + float(step[6]),
-            self.biases_px + step[7:],
+        return replace(
+            self,
+            cTl=self.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
+            offset_s=self.offset_s + float(step[6]),
+            biases_px=self.biases_px + step[7 : self.core_size],
+            object_biases_px=self.object_biases_px + step[self.core_size :],
         )
 
     def state(self, classes: Sequence[SemanticClass]) -> State:
@@ -70,17 +115,71 @@ class Gaussian:
     vector: FloatArray
 
     def at(self, point: Point) -> Gaussian:
-        """The same belief about another, near point."""
+        """The same belief about another, near point; objects that are new there are left out."""
+        point = point if point.tracks == self.point.tracks else _like(self.point, point)
         return Gaussian(point, self.information, self.vector - self.information @ self.point.local(point))
 
     def plus(self, other: Gaussian) -> Gaussian:
-        """Both beliefs together, at this one's point."""
+        """Both beliefs together, at this one's point; the objects of the other are all known here."""
         other = other.at(self.point)
-        return Gaussian(self.point, self.information + other.information, self.vector + other.vector)
+        columns = self.point.columns(other.point.tracks)
+        information, vector = self.information.copy(), self.vector.copy()
+        information[np.ix_(columns, columns)] += other.information
+        vector[columns] += other.vector
+        return Gaussian(self.point, information, vector)
+
+    def with_objects(self, places: Mapping[int, int], sigma_px: float) -> Gaussian:
+        """The belief with biases of further objects, each within ``sigma_px`` of its class's.
+
+        Args:
+            places: place of its class's bias by the number of the track.
+        """
+        if not places:
+            return self
+        of_class = [float(self.point.biases_px[place]) for place in places.values()]
+        point = replace(
+            self.point,
+            tracks=(*self.point.tracks, *places),
+            object_biases_px=np.append(self.point.object_biases_px, of_class),
+        )
+        n = self.point.size
+        information, vector = np.zeros((point.size, point.size)), np.zeros(point.size)
+        information[:n, :n], vector[:n] = self.information, self.vector
+        weight = sigma_px**-2.0
+        for i, place in enumerate(places.values()):
+            a, b = 7 + place, n + i
+            information[a, a] += weight
+            information[b, b] += weight
+            information[a, b] = information[b, a] = -weight
+        return Gaussian(point, information, vector)
+
+    def without(self, tracks: Sequence[int]) -> tuple[Gaussian, FloatArray]:
+        """The belief with some objects' biases marginalized out, and how scores follow.
+
+        Returns:
+            the belief; T (m, n) = [I, -H_xo H_oo^-1]: a score (n,) of the whole belief counts in the smaller
+            one as T times it.
+        """
+        kept = [track for track in self.point.tracks if track not in set(tracks)]
+        x = self.point.columns(kept)
+        o = np.setdiff1d(np.arange(self.point.size), x)
+        T = np.zeros((len(x), self.point.size))
+        T[np.arange(len(x)), x] = 1.0
+        H = self.information
+        T[:, o] = -np.linalg.solve(H[np.ix_(o, o)], H[np.ix_(o, x)]).T
+        point = replace(self.point, tracks=tuple(kept), object_biases_px=_picked(self.point, kept))
+        information = T @ H[:, x]
+        return Gaussian(point, 0.5 * (information + information.T), T @ self.vector), T
+
+    def core(self) -> Gaussian:
+        """The belief on [extrinsic, offset, biases] alone."""
+        return self.without(self.point.tracks)[0] if self.point.tracks else self
 
     def transition(self, variances: FloatArray) -> FloatArray:
-        """A (n, n) = (I + information Q)^-1 of a random walk with Q = diag(variances (n,))."""
-        return np.asarray(np.linalg.inv(np.eye(self.point.size) + self.information * variances[None, :]))
+        """A (n, n) = (I + information Q)^-1 of a random walk, Q = diag(variances (m,), 0): the rest stays."""
+        Q = np.zeros(self.point.size)
+        Q[: len(variances)] = variances
+        return np.asarray(np.linalg.inv(np.eye(self.point.size) + self.information * Q[None, :]))
 
     def drifted(self, variances: FloatArray) -> Gaussian:
         """The belief after a random walk."""
@@ -93,30 +192,38 @@ class Gaussian:
         return self.point.moved(scaled_inverse(self.information) @ self.vector)
 
     def factor(self, keys: Sequence[int]) -> gtsam.LinearContainerFactor:
-        """As a factor on [extrinsic, offset, biases...]; it can be pickled and serialized."""
-        linear, starts = gtsam.GaussianFactorGraph(), [0, 6, *range(7, self.point.size + 1)]
-        blocks = [slice(a, b) for a, b in pairwise(starts)]
-        # The constant makes the least cost 0: optimizers stop where a cost is not positive.
-        constant = float(self.vector @ (scaled_inverse(self.information) @ self.vector))
-        for i, (key, a) in enumerate(zip(keys, blocks, strict=True)):
-            f = constant if i == 0 else 0.0
-            linear.add(gtsam.HessianFactor(key, self.information[a, a], self.vector[a], f))
-            for other, b in zip(keys[i + 1 :], blocks[i + 1 :], strict=True):
-                m, k = a.stop - a.start, b.stop - b.start
-                zero_a, zero_b = np.zeros((m, m)), np.zeros((k, k))
-                linear.add(
-                    gtsam.HessianFactor(
-                        key, other, zero_a, self.information[a, b], np.zeros(m), zero_b, np.zeros(k), 0.0
-                    )
-                )
+        """As a factor on [extrinsic, offset, biases..., object biases...]; it can be pickled."""
+        n, starts = self.point.size, [0, 6, *range(7, self.point.size + 1)]
+        scale = np.sqrt(np.maximum(np.diag(self.information), 1e-30))
+        R = np.linalg.cholesky(self.information / np.outer(scale, scale) + 1e-14 * np.eye(n)).T
+        b = np.linalg.solve(R.T, self.vector / scale)
+        R = R * scale
+        blocks = [np.asarray(R[:, start:end], np.float64) for start, end in pairwise(starts)]
+        error = np.asarray(-b, np.float64)
+
+        def linear(*_: object, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+            return error, blocks if jacobians else None
+
         values = gtsam.Values()
         insert_point(values, keys, self.point)
-        return gtsam.LinearContainerFactor(gtsam.HessianFactor(linear), values)
+        dims = [end - start for start, end in pairwise(starts)]
+        factor = custom_factor(gtsam.noiseModel.Unit.Create(n), keys, linear, dims, n)
+        return gtsam.LinearContainerFactor(factor.linearize(values), values)
+
+
+def _like(target: Point, source: Point) -> Point:
+    """The source's values, with the objects of the target."""
+    return replace(source, tracks=target.tracks, object_biases_px=_picked(source, target.tracks))
+
+
+def _picked(point: Point, tracks: Sequence[int]) -> FloatArray:
+    """(k,) biases of some objects of a point [px]."""
+    return point.object_biases_px[point.columns(tracks)[point.core_size :] - point.core_size]
 
 
 def insert_point(values: gtsam.Values, keys: Sequence[int], point: Point) -> None:
     """Put a point into values under [extrinsic, offset, biases...], where a key is not there yet."""
-    scalars = [point.offset_s, *point.biases_px]
+    scalars = [point.offset_s, *point.biases_px, *point.object_biases_px]
     if not values.exists(keys[0]):
         values.insert(keys[0], point.cTl)
     for key, scalar in zip(keys[1:], scalars, strict=True):

@@ -53,7 +53,7 @@ class History:
         """All epochs since the last break, the window's included, each given all the others."""
         epochs = [*self.epochs, *smoother.live_epochs()]
         walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
-        point = smoother.point
+        point = smoother.point.core()
         beliefs = [_honest(epoch, point) for epoch in epochs]
         forward = _passed(beliefs, walks, smoother.prior)
         nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))

@@ -14,20 +14,18 @@ from factors.camera import PinholeCamera
 from factors.errors import FactorError
 from factors.robust import RobustKernel
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.estimators.adoption import Adoption, held_out_cost
-from sst_graph.estimators.alarm import StepAlarm
-from sst_graph.estimators.epochs import Entry
+from sst_graph.estimators.adoption import Adoption
+from sst_graph.estimators.alarm import Joint, StepAlarm
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
-from sst_graph.estimators.scores import PairScore, score_pair, with_share
+from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
 from sst_graph.estimators.window import Window
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.problem.drive import Drive, ScanFeatures, image_features, scan_features
-from sst_graph.problem.graph import PairMatches, Tracks, associate
+from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
 from sst_graph.uncertainty.observability import weak_directions
@@ -35,7 +33,6 @@ from sst_graph.uncertainty.observability import weak_directions
 _LOG = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
-Found = dict[int, tuple[PairMatches, PairScore, int]]
 
 _UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
@@ -61,14 +58,15 @@ class Tracker:
         self.config = config or TrackerConfig()
         calibration = self.config.calibration
         self.classes = calibration.classes
-        self.kernel = RobustKernel("geman_mcclure", calibration.joint.kernel_px[-1])
         self.window = Window(camera, self.config.window)
+        self.matcher = WindowMatcher(self.window, self.config)
         self.odometry = LidarOdometry(calibration.prepare.lidar_odometry)
         self.last_scan: Scan | None = None
         self.guess = Guess(initial, initial_offset_s, calibration.start.enabled)
         self.smoother: WindowSmoother | None = None
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
-        self.alarm = StepAlarm(self.config.alarm)
+        self.joint = Joint(self.covariance, (), len(self.covariance))
+        self.alarm = StepAlarm(self.config.alarm, calibration.joint.graph.object_bias_sigma_px)
         self.adoption = Adoption(self.config.adoption)
         self.history_store = History(self.config.drift.history)
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
@@ -76,7 +74,6 @@ class Tracker:
         self.attempts = 0
         self.waited = 0
         self.inflation = 1.0
-        self._tracks: tuple[int, Tracks] | None = None
 
     @property
     def started(self) -> bool:
@@ -144,9 +141,10 @@ class Tracker:
 
     def resume(self, smoother: WindowSmoother, scans: set[int], point: Point) -> None:
         """Go on with a smoother that an earlier run left behind, some of the window's scans in it."""
-        found, _ = self.match(point, drive=None)
-        smoother.update({k: v for k, v in found.items() if k in scans}, set(), 0)
+        found, _ = self.matcher.match(point, None, share=self._share)
+        smoother.update({k: v for k, v in found.items() if k in scans}, set(), 0, self.window.objects.live)
         smoother.rest_at(point)
+        self._take_covariance(smoother)
         self.smoother = smoother
 
     def _check_image(self, image: CameraImage) -> None:
@@ -208,9 +206,9 @@ class Tracker:
         start_ns = drive.scans[0].stamp_ns
         prior = prior_belief(point, self.guess, self.classes, calibration.joint.graph)
         smoother = WindowSmoother(prior, start_ns, self.classes, calibration.joint.graph, config.drift)
-        found, _ = self.match(point, drive=None)
-        smoother.update(found, set(), self.window.first_scan)
-        self.covariance = smoother.covariance()[0]
+        found, _ = self.matcher.match(point, None, share=self._share)
+        smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
+        self._take_covariance(smoother)
         self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
         self.alarm.restart()
         self.adoption.restart()
@@ -225,7 +223,7 @@ class Tracker:
         before = smoother.point
         # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
         chosen = self._to_match(number, smoother)
-        found, missing = self.match(before, drive=chosen)
+        found, missing = self.matcher.match(before, chosen, share=self._share)
         new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         chi2 = self._watch(new, before)
@@ -235,32 +233,48 @@ class Tracker:
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
         if new or not missing <= {number}:
-            smoother.update(found, missing, first)
+            smoother.update(found, missing, first, self.window.objects.live)
+            self.window.judged_anew -= chosen
         self.entered.extend(new)
-        covariance, naive = smoother.covariance()
-        if not (np.isfinite(covariance).all() and (np.diag(covariance) > 0.0).all()):
-            raise EstimationError("a covariance that is not finite")
-        self.covariance = covariance
-        self.inflation = max(1.0, float(np.trace(np.linalg.solve(naive, covariance)) / len(naive)))
+        self._take_covariance(smoother)
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
         return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new))
 
+    def _take_covariance(self, smoother: WindowSmoother) -> None:
+        """Take over the covariance of a smoother's estimate.
+
+        Raises:
+            EstimationError: it is none.
+        """
+        joint, naive = smoother.covariance()
+        if not (np.isfinite(joint).all() and (np.diag(joint) > 0.0).all()):
+            raise EstimationError("a covariance that is not finite")
+        m = smoother.past.point.core_size
+        self.covariance, self.joint = joint[:m, :m], Joint(joint, smoother.past.point.tracks, m)
+        share = np.trace(np.linalg.solve(naive[:m, :m], self.covariance)) / m
+        self.inflation = max(1.0, float(share))
+
     def _to_match(self, number: int, smoother: WindowSmoother) -> set[int]:
         """Scans to match: the newest, those still without a pair, the oldest, and some in turn."""
         numbers = [n for n, _ in self.window.scans]
         waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
-        staleness = {n: self._stale(entry) for n, entry in smoother.entries.items()}
+        staleness = self._staleness(smoother)
         known = sorted(staleness, key=staleness.__getitem__, reverse=True)
         stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
         some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
-        return {number, *waiting[-4:], *numbers[:1], *some} | (set(numbers[-2:]) & set(known))
+        judged = sorted(self.window.judged_anew & set(known))[: self.config.renew_most]
+        return {number, *waiting[-4:], *numbers[:1], *some, *judged} | (set(numbers[-2:]) & set(known))
 
-    def _stale(self, entry: Entry) -> float:
-        """How far the estimate has moved since an entry was matched, in standard deviations."""
-        step = entry.score.belief.point.local(self.point)
-        return float(np.sqrt(np.maximum(0.0, step @ np.linalg.solve(self.covariance, step))))
+    def _staleness(self, smoother: WindowSmoother) -> dict[int, float]:
+        """How far the estimate has moved since each pair was matched, in standard deviations."""
+        if not smoother.entries:
+            return {}
+        points = [entry.score.belief.point.core() for entry in smoother.entries.values()]
+        steps = np.stack([point.local(self.point.core()) for point in points])
+        squares = np.einsum("ij,ij->i", steps, np.linalg.solve(self.covariance, steps.T).T)
+        return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))
 
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
@@ -277,45 +291,20 @@ class Tracker:
         scales = self.config.calibration.joint.kernel_px
         for scale in (*scales, *[scales[-1]] * most):
             before = smoother.point
-            found, missing = self.match(before, None, scale)
+            kernel = RobustKernel("geman_mcclure", scale)
+            found, missing = self.matcher.match(before, None, kernel, self._share)
             found = {scan: pair for scan, pair in found.items() if scan in smoother.entries}
             try:
-                smoother.update(found, missing, 0)
+                smoother.update(found, missing, 0, self.window.objects.live)
                 smoother.polish()
-                self.covariance = smoother.covariance()[0]
+                self._take_covariance(smoother)
             except EstimationError as error:
                 _LOG.warning("tracker: not settled: %s", error)
                 return False
-            step = before.local(smoother.point)
+            step = before.core().local(smoother.point.core())
             if scale == scales[-1] and step @ np.linalg.solve(self.covariance, step) < 0.02**2:
                 return True
         return False
-
-    def tracks(self, part: Drive) -> Tracks:
-        """Twists over the window's motions, made once a scan."""
-        if self._tracks is None or self._tracks[0] != self.window.next_scan:
-            self._tracks = (self.window.next_scan, Tracks([part]))
-        return self._tracks[1]
-
-    def match(
-        self, point: Point, drive: set[int] | None, kernel_px: float | None = None
-    ) -> tuple[Found, set[int]]:
-        """Matches of some scans of the window (None: all) at a point, and the scans that have none."""
-        kernel = self.kernel if kernel_px is None else RobustKernel("geman_mcclure", kernel_px)
-        part, numbers = self.window.drive(None if drive is None else drive.__contains__)
-        config = self.config.calibration.joint.graph
-        pairs = associate([part], self.tracks(part), point.state(self.classes), kernel, config)
-        found: Found = {}
-        for pair in pairs:
-            if len(pair) < self.config.min_frame_matches:
-                continue
-            number = numbers[pair.pair.scan]
-            if self._share < 1.0:
-                pair = with_share(pair, self._share)
-            tracks = self.window.tracks[number]
-            score = score_pair(pair, point, self.classes, tracks, config, self._share)
-            found[number] = (pair, score, part.scans[pair.pair.scan].stamp_ns)
-        return found, set(numbers) - set(found)
 
     @property
     def _share(self) -> float:
@@ -326,28 +315,19 @@ class Tracker:
         """The change test on new frames, under its wide kernel."""
         if not new or not self.config.alarm.enabled or self.smoother is None:
             return None
-        part, numbers = self.window.drive(set(new).__contains__)
         kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
-        config = self.config.calibration.joint.graph
-        pairs = associate([part], self.tracks(part), before.state(self.classes), kernel, config)
-        tracks = self.window.tracks
-        scores = [
-            score_pair(pair, before, self.classes, tracks[numbers[pair.pair.scan]], config) for pair in pairs
-        ]
-        return self.alarm.check(scores, self.covariance, self.smoother.model)
+        scores = self.matcher.scores(before, new, kernel)
+        return self.alarm.check(scores, self.joint, self.smoother.model)
 
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""
-        if not new or self.smoother is None:
+        if not new:
             return
-        part, _ = self.window.drive(set(new).__contains__)
-        config = self.config.calibration.joint.graph
         in_use = self.adoption.adopted or self._guess_point()
-        tracks = self.tracks(part)
-        candidate = held_out_cost(part, tracks, before, self.classes, self.kernel, config)
+        candidate = self.matcher.cost(before, new)
         other = candidate
-        if in_use is not None and float(np.abs(before.local(in_use)).max()) > 0.0:
-            other = held_out_cost(part, tracks, in_use, self.classes, self.kernel, config)
+        if in_use is not None and float(np.abs(before.core().local(in_use.core())).max()) > 0.0:
+            other = self.matcher.cost(in_use, new)
         self.adoption.compare(candidate, other)
 
     def _guess_point(self) -> Point | None:

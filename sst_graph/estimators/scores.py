@@ -15,10 +15,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import frame_factor, twist_transfer_factor, velocity_factor
+from factors import GroupedBias, frame_factor, twist_transfer_factor, velocity_factor
 from factors.alignment import weighted_residuals
-from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
+from factors.motion import twist_ad
+from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.problem.graph import GraphConfig, PairMatches
+from sst_graph.problem.state import object_bias_key
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import SIDE_FLOOR, SIDE_FRAME_FLOOR, ErrorModel, spread_beyond
@@ -54,16 +56,25 @@ class PairScore:
     """What one pair says: its belief, motion marginalised out, and the sums of its matches.
 
     Attributes:
-        belief: on [extrinsic, offset, biases].
+        belief: on [extrinsic, offset, biases, and the biases of the objects it sees].
         JJ: (n, n) sum of J'J of its matches, times their common share.
         sides: by side.
+        sums: (n, n) sum of squared scores by side.
         matches: number of matches.
+        places: place of its class's bias for each object with a bias, by its track.
     """
 
     belief: Gaussian
     JJ: FloatArray
     sides: SideSums
+    sums: FloatArray
     matches: int
+    places: Mapping[int, int] = field(default_factory=dict)
+
+
+def object_places(pair: PairMatches, classes: Sequence[SemanticClass]) -> dict[int, int]:
+    """Place of its class's bias for each object of a pair that has a bias of its own."""
+    return {int(track): classes.index(c) for c, tracks in pair.tracks.items() for track in np.unique(tracks)}
 
 
 def pair_factors(
@@ -76,13 +87,17 @@ def pair_factors(
     config: GraphConfig,
 ) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
     """Silhouettes and motion of one pair, on the keys of its epoch [E, D, biases...] and its twist."""
-    silhouettes = frame_factor(
-        [matches.alignment for matches in pair.matches.values()],
-        keys[0],
-        keys[1],
-        V_key,
-        [keys[2 + classes.index(c)] for c in pair.matches],
-    )
+    biases: list[int | float | GroupedBias | None] = []
+    for c in pair.matches:
+        tracks = pair.tracks.get(c)
+        if tracks is None:
+            biases.append(keys[2 + classes.index(c)])
+            continue
+        names, groups = np.unique(tracks, return_inverse=True)
+        own = tuple(object_bias_key(0, int(track)) for track in names)
+        biases.append(GroupedBias(own, groups.reshape(-1)))
+    alignments = [matches.alignment for matches in pair.matches.values()]
+    silhouettes = frame_factor(alignments, keys[0], keys[1], V_key, biases)
     if pair.l_twist is None:
         sigmas = np.repeat(config.still_sigma, 3)
         return silhouettes, velocity_factor(V_key, np.zeros(6), np.diag(sigmas**2))
@@ -110,73 +125,90 @@ def score_pair(
     config: GraphConfig,
     share: float = 1.0,
 ) -> PairScore:
-    """Linearize a pair's factors at the point its matches were made at.
+    """Linearize a pair at the point its matches were made at: the factors of :func:`pair_factors`.
 
     Args:
         tracks: number of the track of each (class, object) of the scan.
         share: factor that the weights of all matches carry beside their own.
     """
-    keys, V_key = [0, 1, *(3 + i for i in range(len(classes)))], 2
-    used = [0, 1, *(keys[2 + classes.index(c)] for c in pair.matches)]
-    factors = pair_factors(pair, classes, keys, V_key, point.offset_s, point.cTl, config)
-    graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
-    for factor in factors:
-        graph.add(factor)
-    insert_point(values, keys, point)
-    values.insert(V_key, pair.motion.c_twist)
-    for key in [*sorted(used), V_key]:
-        ordering.push_back(key)
-    H, g = graph.linearize(values).hessian(ordering)
-    m = len(g) - 6
-    gain = np.linalg.solve(H[m:, m:], np.column_stack([H[m:, :m], g[m:]]))
-    small_H, small_g = H[:m, :m] - H[:m, m:] @ gain[:, :m], g[:m] - H[:m, m:] @ gain[:, m]
-    columns = [*range(7), *(4 + key for key in sorted(used)[2:])]
-    information, vector = np.zeros((point.size, point.size)), np.zeros(point.size)
-    information[np.ix_(columns, columns)] = small_H
-    vector[columns] = small_g
-    JJ, sides = _side_sums(pair, point, classes, tracks, share)
-    return PairScore(Gaussian(point, information, vector), JJ, sides, len(pair))
+    places = object_places(pair, classes)
+    point = point.seen(places)
+    J, JV, r, roots = _rows(pair, point, classes)
+    # [unknowns, twist]: silhouettes, then the twist that odometry tells.
+    A = np.concatenate([J, JV], axis=1)
+    H, g = A.T @ A, -A.T @ r
+    n = point.size
+    columns = [*range(7), *range(n, n + 6)]
+    H[np.ix_(columns, columns)] += _motion_information(pair, point, config)
+    gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
+    information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
+    belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
+    side = [
+        np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp) * _SIDES + m.sides
+        for c, m in pair.matches.items()
+    ]
+    sides = _side_sums(J, r, roots, np.concatenate(side), share)
+    return PairScore(belief, share * (J.T @ J), sides, sides.scores.T @ sides.scores, len(pair), places)
+
+
+def _rows(
+    pair: PairMatches, point: Point, classes: Sequence[SemanticClass]
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Weighted rows of all matches by unknowns (m, n) and twist (m, 6), residuals and root weights (m,)."""
+    blocks, twists, residuals, roots = [], [], [], []
+    for c, matches in pair.matches.items():
+        alignment, place, objects = matches.alignment, classes.index(c), pair.tracks.get(c)
+        biases: float | FloatArray = float(point.biases_px[place])
+        columns = np.full(len(alignment), 7 + place)
+        if objects is not None:
+            names, groups = np.unique(objects, return_inverse=True)
+            own = np.array([point.tracks.index(int(track)) for track in names])[groups.reshape(-1)]
+            biases, columns = point.object_biases_px[own], point.core_size + own
+        r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, biases)
+        block = np.zeros((len(r), point.size))
+        block[:, :7] = J[:, :7]
+        block[np.arange(len(r)), columns] = J[:, 13]
+        blocks.append(block)
+        twists.append(J[:, 7:13])
+        residuals.append(r)
+        roots.append(np.abs(J[:, 13]) * alignment.sigmas_px)
+    return np.concatenate(blocks), np.concatenate(twists), np.concatenate(residuals), np.concatenate(roots)
+
+
+def _motion_information(pair: PairMatches, point: Point, config: GraphConfig) -> FloatArray:
+    """(13, 13) information of the odometry on [extrinsic, offset, twist]; its residual at the point is 0."""
+    if pair.l_twist is None:
+        information = np.zeros((13, 13))
+        information[7:, 7:] = np.diag(np.repeat(config.still_sigma, 3) ** -2.0)
+        return information
+    Ad = np.asarray(point.cTl.AdjointMap())
+    A = np.zeros((6, 13))
+    A[:, :6], A[:, 7:] = Ad @ twist_ad(pair.l_twist.twist), np.eye(6)
+    A[:, 6] = -Ad @ pair.l_twist.acceleration
+    return np.asarray(A.T @ np.linalg.solve(camera_twist(pair.l_twist, point.cTl).covariance, A))
 
 
 def _side_sums(
-    pair: PairMatches,
-    point: Point,
-    classes: Sequence[SemanticClass],
-    tracks: Mapping[tuple[SemanticClass, int], int],
-    share: float,
-) -> tuple[FloatArray, SideSums]:
-    blocks, roots, residuals, sides = [], [], [], []
-    JJ = np.zeros((point.size, point.size))
-    for c, matches in pair.matches.items():
-        place = classes.index(c)
-        bias = float(point.biases_px[place])
-        alignment = matches.alignment
-        r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, bias)
-        block = np.zeros((len(r), point.size))
-        block[:, :7], block[:, 7 + place] = J[:, :7], J[:, 13]
-        JJ += share * (block.T @ block)
-        root = np.abs(J[:, 13]) * alignment.sigmas_px
-        blocks.append(block * root[:, None])
-        residuals.append(np.where(root > 1e-6, r / np.maximum(root, 1e-6), 0.0))
-        roots.append(root / np.sqrt(share))
-        track = np.array([tracks[c, int(number)] for number in matches.objects], dtype=np.intp)
-        sides.append(track * _SIDES + matches.sides)
-    names, which = np.unique(np.concatenate(sides), return_inverse=True)
+    J: FloatArray, weighted: FloatArray, root: FloatArray, side: IntArray, share: float
+) -> SideSums:
+    """Sums by side of weighted rows J (m, n), weighted residuals and root weights; side (m,)."""
+    names, which = np.unique(side, return_inverse=True)
     which = which.reshape(-1)
-    rows, r, w = np.concatenate(blocks), np.concatenate(residuals), np.concatenate(roots) ** 2
+    r = np.where(root > 1e-6, weighted / np.maximum(root, 1e-6), 0.0)
+    w = root**2 / share
     weights, weights2, within = (
         np.asarray(np.bincount(which, values), np.float64) for values in (w, w * w, w * r**2)
     )
     means = np.bincount(which, w * r) / np.maximum(weights, 1e-12)
-    scores = np.zeros((len(names), point.size))
-    np.add.at(scores, which, rows)
+    scores = np.zeros((len(names), J.shape[1]))
+    np.add.at(scores, which, J * root[:, None])
     within = np.maximum(within - weights * means**2, 0.0)
-    return JJ, SideSums(names, scores, means, weights, weights2, within)
+    return SideSums(names, scores, means, weights, weights2, within)
 
 
 @dataclass
 class ScoreSums:
-    """The sums over all frames that have left the window.
+    """The sums over all frames that have left the window, in the columns of the belief that took them in.
 
     Attributes:
         JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side.
@@ -194,22 +226,33 @@ class ScoreSums:
     def empty(cls, n: int) -> ScoreSums:
         return cls(np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)))
 
-    def add(self, score: PairScore, scan: int, memory: int = 50) -> None:
-        """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed."""
-        self.JJ = self.JJ + score.JJ
-        self.frames = self.frames + score.sides.scores.T @ score.sides.scores
-        for side, row in zip(score.sides.sides, score.sides.scores, strict=True):
-            before = self.live.get(int(side))
-            self.live[int(side)] = (row if before is None else before[0] + row, scan)
+    def add(self, score: PairScore, columns: IntArray, scan: int, memory: int = 50) -> None:
+        """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed.
+
+        Args:
+            columns: where the pair's unknowns stand among those of the sums.
+        """
+        self.JJ, self.frames = self.JJ.copy(), self.frames.copy()
+        self.JJ[np.ix_(columns, columns)] += score.JJ
+        self.frames[np.ix_(columns, columns)] += score.sums
+        rows = np.zeros((len(score.sides.sides), len(self.JJ)))
+        rows[:, columns] = score.sides.scores
+        for side, row in zip(score.sides.sides.tolist(), rows, strict=True):
+            before = self.live.get(side)
+            self.live[side] = (row if before is None else before[0] + row, scan)
         for side in [side for side, (_, last) in self.live.items() if last < scan - memory]:
             row, _ = self.live.pop(side)
             self.closed = self.closed + np.outer(row, row)
         self.recent.append(_recent_rows(score.sides))
 
-    def advance(self, A: FloatArray) -> None:
-        """Follow the belief through a random walk; ``A`` as :meth:`Gaussian.transition` gives it."""
-        self.JJ, self.frames, self.closed = (A @ M @ A.T for M in (self.JJ, self.frames, self.closed))
-        self.live = {side: (A @ row, last) for side, (row, last) in self.live.items()}
+    def grow(self, n: int) -> None:
+        """Make room for further unknowns, n in all."""
+        self.transform(np.eye(n, len(self.JJ)))
+
+    def transform(self, T: FloatArray) -> None:
+        """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
+        self.JJ, self.frames, self.closed = (T @ M @ T.T for M in (self.JJ, self.frames, self.closed))
+        self.live = {side: (T @ row, last) for side, (row, last) in self.live.items()}
 
     def copy(self) -> ScoreSums:
         return ScoreSums(
@@ -221,18 +264,30 @@ class ScoreSums:
         rows = [*self.recent, *(_recent_rows(score.sides) for score in window)]
         return fit_sides(np.concatenate(rows))
 
-    def surplus(self, window: Sequence[PairScore], model: ErrorModel) -> FloatArray:
-        """(n, n) variance of the score beyond that of independent matches."""
-        JJ, frames, live = self.JJ, self.frames, {s: row for s, (row, _) in self.live.items()}
-        for score in window:
-            JJ = JJ + score.JJ
-            frames = frames + score.sides.scores.T @ score.sides.scores
-            for side, row in zip(score.sides.sides.tolist(), score.sides.scores, strict=True):
-                live[side] = live[side] + row if side in live else row
-        rows = np.stack(list(live.values())) if live else np.zeros((0, len(JJ)))
-        return np.asarray(
-            (model.match - 1.0) * JJ + model.side_frame * frames + model.side * (self.closed + rows.T @ rows)
-        )
+    def surplus(
+        self, window: Sequence[PairScore], columns: Sequence[IntArray], model: ErrorModel
+    ) -> FloatArray:
+        """(n, n) variance of the score beyond that of independent matches.
+
+        Args:
+            window: pairs beside those taken in.
+            columns: where their unknowns stand.
+        """
+        n = len(self.JJ)
+        total = (model.match - 1.0) * self.JJ + model.side_frame * self.frames
+        sides = [np.array(list(self.live), dtype=np.intp), *(score.sides.sides for score in window)]
+        rows = np.zeros((sum(len(part) for part in sides), n))
+        for i, (row, _) in enumerate(self.live.values()):
+            rows[i] = row
+        start = len(self.live)
+        for score, own in zip(window, columns, strict=True):
+            total[np.ix_(own, own)] += (model.match - 1.0) * score.JJ + model.side_frame * score.sums
+            rows[start : start + len(score.sides.sides), own] = score.sides.scores
+            start += len(score.sides.sides)
+        names, which = np.unique(np.concatenate(sides), return_inverse=True)
+        by_side = np.zeros((len(names), n))
+        np.add.at(by_side, which.reshape(-1), rows)
+        return np.asarray(total + model.side * (self.closed + by_side.T @ by_side))
 
 
 def _recent_rows(sides: SideSums) -> FloatArray:

@@ -4,23 +4,56 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
-from sst_graph.problem.objects import ObjectTracker
+from sst_graph.problem.objects import MovingConfig, ObjectId, ObjectTracker, speed_of
 from sst_graph.types import RelativeMotion, SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+_SPEED_CHANGE = 0.2
+"""Speeds of an object that differ by more than this fraction are a new judgement."""
 
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
+MOVING = MovingConfig()
+"""What counts as an object that moves by itself, as in the batch."""
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """An object in a scan.
+
+    Attributes:
+        scan: number of the scan.
+        name: class and number of the object within it.
+        stamp_ns: of the scan.
+        centre: (2,) in the world, seen from above [m].
+    """
+
+    scan: int
+    name: tuple[SemanticClass, int]
+    stamp_ns: int
+    centre: FloatArray
 
 
 class Window:
-    """Bounded buffers of one drive; scans are numbered from 0 and never twice."""
+    """Bounded buffers of one drive; scans are numbered from 0 and never twice.
+
+    Attributes:
+        tracks: track of each (class, object) of a scan, by the scan's number.
+        sightings: the latest ones of each track, in the order of time.
+        moving: speed of the objects of a scan that move by themselves, by the scan's number [m/s].
+        judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
+    """
 
     def __init__(self, camera: PinholeCamera, scans: int) -> None:
         self.camera = camera
@@ -29,6 +62,9 @@ class Window:
         self.motions: deque[RelativeMotion] = deque(maxlen=scans + 10)
         self.tracks: dict[int, dict[tuple[SemanticClass, int], int]] = {}
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
+        self.sightings: dict[int, list[Sighting]] = {}
+        self.moving: dict[int, dict[tuple[SemanticClass, int], float]] = {}
+        self.judged_anew: set[int] = set()
         self.next_scan = 0
         self.wTl = gtsam.Pose3()
 
@@ -54,9 +90,55 @@ class Window:
         )
         self.scans.append((number, lean))
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
-        for old in [k for k in self.tracks if k < self.first_scan]:
-            del self.tracks[old]
+        self._judge(number, features.stamp_ns)
+        for by_scan in (self.tracks, self.moving):
+            for old in [k for k in by_scan if k < self.first_scan]:
+                del by_scan[old]
+        self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
         return number
+
+    def _judge(self, number: int, stamp_ns: int) -> None:
+        """Which objects of the latest scans move: as the batch judges, from the sightings so far."""
+        for name, track in self.tracks[number].items():
+            centre = self.objects.live[track][1][:2]
+            self.sightings.setdefault(track, []).append(Sighting(number, name, stamp_ns, centre))
+        reach_ns = round(MOVING.window_s * 1e9)
+        for track, seen in list(self.sightings.items()):
+            seen = [sighting for sighting in seen if stamp_ns - sighting.stamp_ns <= 2 * reach_ns]
+            self.sightings[track] = seen
+            if not seen:
+                del self.sightings[track]
+            elif seen[-1].scan == number:
+                self._judge_track(seen, stamp_ns - reach_ns, reach_ns)
+
+    def _judge_track(self, seen: Sequence[Sighting], since_ns: int, reach_ns: int) -> None:
+        """Speeds of one object in its sightings since a stamp, each from those around it."""
+        centres = np.stack([sighting.centre for sighting in seen])
+        stamps = np.array([sighting.stamp_ns for sighting in seen], dtype=np.int64)
+        # A line fitted to n places rises by less than 1.5 times their spread.
+        never = 1.5 * float(np.linalg.norm(np.ptp(centres, axis=0))) < MOVING.min_travel_m
+        for sighting in seen:
+            if sighting.stamp_ns < since_ns:
+                continue
+            near = np.abs(stamps - sighting.stamp_ns) <= reach_ns
+            times = np.asarray((stamps[near] - sighting.stamp_ns) * 1e-9, np.float64)
+            speed = 0.0 if never else speed_of(times, centres[near], MOVING)
+            speeds = self.moving.setdefault(sighting.scan, {})
+            before = speeds.pop(sighting.name, 0.0)
+            if speed > 0.0:
+                speeds[sighting.name] = speed
+            if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
+                self.judged_anew.add(sighting.scan)
+
+    def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, float]]:
+        """Tracks of the objects of some scans, and speeds of the moving ones, by the scan's position."""
+        tracks: dict[ObjectId, int] = {}
+        speeds: dict[ObjectId, float] = {}
+        for position, number in enumerate(numbers):
+            tracks.update({(position, c, n): track for (c, n), track in self.tracks[number].items()})
+            moving = self.moving.get(number, {})
+            speeds.update({(position, c, n): speed for (c, n), speed in moving.items()})
+        return tracks, speeds
 
     def add_image(self, features: ImageFeatures) -> None:
         """Keep an image in the order of stamps.

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.estimators.alarm import StepAlarm, chi_square
+from sst_graph.estimators.alarm import Joint, StepAlarm, chi_square
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
 from sst_graph.estimators.scores import PairScore, SideSums, fit_sides
 from sst_graph.estimators.tracker_config import AlarmConfig, TrackerConfig
@@ -90,7 +90,7 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
     ones, fifty = np.ones(4), np.full(4, 50.0)
     sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
-    return PairScore(Gaussian(point, J.T @ J, -J.T @ r), J.T @ J, sides, 200)
+    return PairScore(Gaussian(point, J.T @ J, -J.T @ r), J.T @ J, sides, scores.T @ scores, 200)
 
 
 def _model() -> ErrorModel:
@@ -100,7 +100,7 @@ def _model() -> ErrorModel:
 def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
     rng, P = np.random.default_rng(1), 1e-3 * np.eye(N)
     values = [
-        chi_square([_score(rng, x, 4 * k) for k in range(3)], P, _model())
+        chi_square([_score(rng, x, 4 * k) for k in range(3)], Joint(P, (), N), _model())
         for x in rng.multivariate_normal(np.zeros(N), P, 300)
     ]
     assert np.mean(values) == pytest.approx(N, rel=0.12)
@@ -111,11 +111,13 @@ def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
     rng, P = np.random.default_rng(2), 1e-4 * np.eye(N)
     alarm = StepAlarm(AlarmConfig(warm_up=5))
     for k in range(200):
-        alarm.check([_score(rng, np.zeros(N), 4 * k)], P, _model())
+        alarm.check([_score(rng, np.zeros(N), 4 * k)], Joint(P, (), N), _model())
         assert not alarm.alarm
     step = np.full(N, 0.3)
     raised = [
-        k for k in range(10) if alarm.check([_score(rng, step, 9000 + 4 * k)], P, _model()) and alarm.alarm
+        k
+        for k in range(10)
+        if alarm.check([_score(rng, step, 9000 + 4 * k)], Joint(P, (), N), _model()) and alarm.alarm
     ]
     assert raised and raised[0] < 8
 
@@ -140,4 +142,4 @@ def test_a_direction_without_information_raises_nothing() -> None:
     still = dataclasses.replace(
         score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
     )
-    assert chi_square([still], 1e-6 * np.eye(N), _model()) < 40.0
+    assert chi_square([still], Joint(1e-6 * np.eye(N), (), N), _model()) < 40.0

@@ -1,0 +1,199 @@
+"""One update of the window's smoother, prepared on copies."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import gtsam
+import numpy as np
+
+from factors import delay_drift, extrinsic_drift
+from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
+from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.scores import pair_factors
+from sst_graph.problem.state import object_bias_key, twist_key
+
+if TYPE_CHECKING:
+    from sst_graph.estimators.smoother import WindowSmoother
+
+
+def read_point(isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] = ()) -> Point:
+    """The estimate under [E, D, biases..., biases of the objects...].
+
+    Raises:
+        ValueError: it is not finite.
+    """
+    cTl = isam.calculateEstimatePose3(keys[0])
+    scalars = np.array([isam.calculateEstimateVector(key)[0] for key in keys[1:]])
+    if not (np.isfinite(scalars).all() and np.isfinite(cTl.matrix()).all()):
+        raise ValueError("an estimate that is not finite")
+    objects = len(scalars) - len(tracks)
+    return Point(cTl, float(scalars[0]), scalars[1:objects], tracks, scalars[objects:])
+
+
+class Change:
+    """One update, prepared on copies."""
+
+    def __init__(
+        self,
+        smoother: WindowSmoother,
+        found: Mapping[int, Found],
+        dropped: set[int],
+        first_scan: int,
+        alive: Container[int],
+    ) -> None:
+        self._smoother, self._found, self._dropped, self._first_scan = smoother, found, dropped, first_scan
+        self._alive = alive
+        self.isam = gtsam.ISAM2(smoother.isam)
+        self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
+        self.past, self.past_id = smoother.past, smoother.past_id
+        self.epochs = smoother.epochs
+        self.epoch_sums = smoother.epoch_sums.copy()
+        self.sums = smoother.sums.copy()
+        self.retired: list[RetiredEpoch] = []
+        self.point = smoother.point
+        self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._remove: list[int] = []
+        self._added: list[tuple[str, int]] = []
+
+    def apply(self) -> None:
+        """Prepare all changes, update the copy of iSAM2, read the estimate."""
+        # 1. What goes, what comes again, what is new.
+        self._retire()
+        self._welcome()
+        self._enter()
+        self._close_epochs()
+        self._bury()
+        if self.past is not self._smoother.past:
+            self._replace_past()
+        # 2. Everything at once.
+        result = self.isam.update(self._graph, self._values, self._remove)
+        self._number(list(result.getNewFactorsIndices()))
+        # 3. The estimate, if it is one.
+        tracks = self.past.point.tracks
+        keys = self._smoother.keys(self.epochs[-1].number, tracks)
+        self.point = read_point(self.isam, keys, tracks)
+
+    def _retire(self) -> None:
+        for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
+            entry = self.entries.pop(scan)
+            self._remove += self.ids.pop(scan)
+            while entry.epoch > self.epochs[0].number:
+                self._next_epoch()
+            self.past = self.past.plus(entry.score.belief)
+            self.sums.add(entry.score, self.past.point.columns(entry.score.belief.point.tracks), scan)
+            if self._smoother.drift.enabled:
+                self.epoch_sums.add(entry.score, scan, self._smoother.graph.object_bias_sigma_px)
+        for scan in self._dropped & set(self.entries):
+            del self.entries[scan]
+            self._remove += self.ids.pop(scan)
+
+    def _welcome(self) -> None:
+        """Objects seen for the first time get a mask bias of their own, tied to their class's."""
+        known, new = set(self.past.point.tracks), dict[int, int]()
+        for found in self._found.values():
+            new.update({t: place for t, place in found.score.places.items() if t not in known})
+        if not new:
+            return
+        self.past = self.past.with_objects(new, self._smoother.graph.object_bias_sigma_px)
+        self.sums.grow(self.past.point.size)
+        for track, place in new.items():
+            bias = float(self._smoother.point.biases_px[place])
+            self._values.insert(object_bias_key(0, track), np.array([bias]))
+            self.point = self.point.with_object(track, bias)
+
+    def _bury(self) -> None:
+        """Objects that the window does not see, and that will not be seen again, leave the unknowns."""
+        seen = {track for entry in self.entries.values() for track in entry.score.places}
+        gone = [t for t in self.past.point.tracks if t not in seen and t not in self._alive]
+        if gone:
+            self.past, T = self.past.without(gone)
+            self.sums.transform(T)
+
+    def _enter(self) -> None:
+        smoother = self._smoother
+        for scan, new in sorted(self._found.items()):
+            pair, score = new.pair, new.score
+            known = self.entries.get(scan)
+            epoch = self._epoch_at(new.stamp_ns) if known is None else known.epoch
+            if known is not None:
+                self._remove += self.ids[scan]
+            point = score.belief.point
+            key = twist_key(0, scan)
+            factors = pair_factors(
+                pair, smoother.classes, smoother.keys(epoch), key, point.offset_s, point.cTl, smoother.graph
+            )
+            for factor in factors:
+                self._add(factor, "pair", scan)
+            if known is None:
+                self._values.insert(key, pair.motion.c_twist)
+            self.entries[scan] = Entry(pair, score, epoch)
+
+    def _epoch_at(self, stamp_ns: int) -> int:
+        """The epoch of a stamp; a new one where the last has lasted long enough."""
+        smoother, last = self._smoother, self.epochs[-1]
+        seconds = (stamp_ns - last.start_ns) * 1e-9
+        if not smoother.drift.enabled or seconds < smoother.drift.epoch_s:
+            for epoch in reversed(self.epochs):
+                if stamp_ns >= epoch.start_ns:
+                    return epoch.number
+            return self.epochs[0].number
+        number, drift = last.number + 1, smoother.drift
+        a, b = smoother.keys(last.number), smoother.keys(number)
+        rate = float(np.radians(drift.rotation_deg))
+        self._add(extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m), "link", number)
+        self._add(delay_drift(a[1], b[1], seconds, drift.offset_s), "link", -number)
+        self._values.insert(b[0], smoother.point.cTl)
+        self._values.insert(b[1], np.array([smoother.point.offset_s]))
+        self.epochs = (*self.epochs, Epoch(number, stamp_ns))
+        return number
+
+    def _close_epochs(self) -> None:
+        """Epochs that no pair of the window sees any more go into the past."""
+        while len(self.epochs) > 1 and all(e.epoch > self.epochs[0].number for e in self.entries.values()):
+            if self.epochs[1].links is None:
+                break
+            self._next_epoch()
+
+    def _next_epoch(self) -> None:
+        """The past moves on to the next epoch by the random walk."""
+        smoother = self._smoother
+        old, new = self.epochs[0], self.epochs[1]
+        variances = smoother.walk(max(1e-3, (new.start_ns - old.start_ns) * 1e-9))
+        self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model))
+        self.epoch_sums = EpochSums.empty(self.past.point)
+        self.sums.transform(self.past.transition(variances))
+        self.past = self.past.drifted(variances)
+        self._remove += new.links or ()
+        self.epochs = (replace(new, links=None), *self.epochs[2:])
+
+    def _replace_past(self) -> None:
+        self._remove.append(self.past_id)
+        self.past = self.past.at(self.point)
+        keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
+        self._add(self.past.factor(keys), "past", 0)
+
+    def _add(self, factor: gtsam.NonlinearFactor, kind: str, number: int) -> None:
+        self._graph.add(factor)
+        self._added.append((kind, number))
+
+    def _number(self, indices: list[int]) -> None:
+        """Remember under which index iSAM2 keeps each new factor."""
+        pairs: dict[int, list[int]] = {}
+        links: dict[int, int] = {}
+        for (kind, number), index in zip(self._added, indices, strict=True):
+            if kind == "past":
+                self.past_id = index
+            elif kind == "pair":
+                pairs.setdefault(number, []).append(index)
+            else:
+                links[number] = index
+        self.ids.update({scan: (a, b) for scan, (a, b) in pairs.items()})
+        self.epochs = tuple(
+            replace(epoch, links=(links[epoch.number], links[-epoch.number]))
+            if epoch.number in links
+            else epoch
+            for epoch in self.epochs
+        )

@@ -1,0 +1,88 @@
+"""Matches of the window's scans, at any point, with the window's knowledge of the objects."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from factors.robust import RobustKernel
+from sst_graph.estimators.adoption import mean_cost
+from sst_graph.estimators.epochs import Found
+from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.scores import PairScore, score_pair, with_share
+from sst_graph.estimators.tracker_config import TrackerConfig
+from sst_graph.estimators.window import Window
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.graph import PairMatches, Tracks, associate
+
+
+class WindowMatcher:
+    """Pairs and matches the scans of a window: moving objects left out, each object with its track."""
+
+    def __init__(self, window: Window, config: TrackerConfig) -> None:
+        self.window = window
+        self.config = config
+        self.classes = config.calibration.classes
+        self.graph = config.calibration.joint.graph
+        self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
+        self._twists: tuple[int, Tracks] | None = None
+        self._last: tuple[Point, dict[int, PairMatches]] | None = None
+
+    def match(
+        self,
+        point: Point,
+        chosen: Collection[int] | None,
+        kernel: RobustKernel | None = None,
+        share: float = 1.0,
+    ) -> tuple[dict[int, Found], set[int]]:
+        """Matches of some scans (None: all) at a point, and the scans that have none.
+
+        Args:
+            share: factor on the weights of all matches.
+        """
+        pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
+        if kernel is None:
+            self._last = (point, pairs)
+        stamps = self.window.stamps_ns()
+        found = {}
+        for number, pair in pairs.items():
+            if len(pair) >= self.config.min_frame_matches:
+                pair = pair if share == 1.0 else with_share(pair, share)
+                found[number] = Found(pair, self._score(pair, number, point, share), stamps[number])
+        return found, set(numbers) - set(found)
+
+    def scores(self, point: Point, chosen: Collection[int], kernel: RobustKernel) -> list[PairScore]:
+        """What some scans say at a point."""
+        pairs, _ = self._pairs(point, chosen, kernel)
+        return [self._score(pair, number, point, 1.0) for number, pair in pairs.items()]
+
+    def cost(self, point: Point, chosen: Collection[int]) -> float | None:
+        """Mean cost of the boundary points of some scans at a point; None where none can be seen."""
+        if self._last is not None and self._last[0] is point:
+            pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
+        else:
+            pairs, _ = self._pairs(point, chosen, self.kernel)
+        points = {number: sum(map(len, scan.boundaries.values())) for number, scan in self.window.scans}
+        counted = [(pair, points[number]) for number, pair in pairs.items()]
+        return mean_cost(counted, point, self.classes, self.kernel, self.graph)
+
+    def _pairs(
+        self, point: Point, chosen: Collection[int] | None, kernel: RobustKernel
+    ) -> tuple[dict[int, PairMatches], list[int]]:
+        part, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
+        state = point.state(self.classes)
+        pairs = associate([part], self._tracks(part, numbers), state, kernel, self.graph)
+        return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
+
+    def _score(self, pair: PairMatches, number: int, point: Point, share: float) -> PairScore:
+        return score_pair(pair, point, self.classes, self.window.tracks[number], self.graph, share)
+
+    def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
+        """Twists over the window's motions, made once a scan, and objects where they have biases."""
+        if self._twists is None or self._twists[0] != self.window.next_scan:
+            self._twists = (self.window.next_scan, Tracks([part]))
+        twists = self._twists[1]
+        return (
+            twists.seeing(*self.window.objects_of(numbers))
+            if self.graph.object_bias_sigma_px > 0.0
+            else twists
+        )
