@@ -17,6 +17,7 @@ from sst_graph.uncertainty.inspection import (
     Inspection,
     telling_frames,
 )
+from sst_graph.uncertainty.planning import MOST_FRAMES as MOST_RECORDED
 from sst_graph.uncertainty.planning import Plan, Prediction, worst_ratio
 from sst_graph.uncertainty.planning import limits_of as limits_of_result
 
@@ -26,6 +27,12 @@ NO_FRAMES = (
     "this result does not tell what each frame brought (method joint of sst-graph calibrate does), so "
     "nothing is said about frames and what to record next"
 )
+
+MOST_SENTENCES = 5
+"""Correlations that are put into words."""
+
+MOST_FRAMES = 12
+"""Frames in the table unless all are asked for."""
 
 _SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
 
@@ -64,20 +71,21 @@ def correlation_sentence(pair: Correlation) -> str:
 
 
 def frame_list(frames: Sequence[FrameInformation], positions: Sequence[int]) -> str:
-    """Frames by number, runs of neighbours (of one drive) shortened: "0, 4-7"."""
+    """Frames by number, runs of neighbours (of one drive) shortened: "0, 4-7", "a/00: 0, 4-7; b/00: 3"."""
     runs: list[list[int]] = []
     for k in sorted(positions):
         if runs and k == runs[-1][-1] + 1 and frames[k].frame.drive == frames[k - 1].frame.drive:
             runs[-1].append(k)
         else:
             runs.append([k])
-    named = len({frame.frame.drive for frame in frames}) > 1
-    words = []
+    by_drive: dict[str, list[str]] = {}
     for run in runs:
         first, last = frames[run[0]].frame, frames[run[-1]].frame
         span = f"{first.frame}" if len(run) == 1 else f"{first.frame}-{last.frame}"
-        words.append(f"{first.drive} {span}" if named else span)
-    return ", ".join(words) or "none"
+        by_drive.setdefault(first.drive, []).append(span)
+    if len({frame.frame.drive for frame in frames}) == 1:
+        return ", ".join(word for words in by_drive.values() for word in words) or "none"
+    return "; ".join(f"{drive}: {', '.join(words)}" for drive, words in by_drive.items()) or "none"
 
 
 def advice_sentences(inspection: Inspection, plan: Plan) -> list[str]:
@@ -158,7 +166,11 @@ def _correlation_block(inspection: Inspection) -> list[str]:
     lines = [f"{'correlation':<12}" + "".join(f"{name:>8}" for name in _SHORT)]
     for name, row in zip(_SHORT, inspection.correlation, strict=True):
         lines.append(f"{name:<12}" + "".join(f"{value:>+8.2f}" for value in row))
-    lines += [f"- {correlation_sentence(pair)}" for pair in inspection.strong]
+    lines += [f"- {correlation_sentence(pair)}" for pair in inspection.strong[:MOST_SENTENCES]]
+    if (more := len(inspection.strong) - MOST_SENTENCES) > 0:
+        lines.append(
+            f"- {more} more pairs of {inspection.strong[-1].value:+.2f} and stronger (--json has them)"
+        )
     return lines
 
 
@@ -177,11 +189,11 @@ def _weak_block(inspection: Inspection) -> list[str]:
 def _frame_block(inspection: Inspection, all_frames: bool) -> list[str]:
     frames = inspection.frames
     order = sorted(range(len(frames)), key=lambda k: -frames[k].bits)
-    shown = sorted(order if all_frames or len(frames) <= 12 else order[:12])
+    shown = sorted(order if all_frames or len(frames) <= MOST_FRAMES else order[:MOST_FRAMES])
     left_out = len(frames) - len(shown)
     lines = [
         "what each frame brings: bits it adds to all the others; sigma without it over sigma with it"
-        + (f" (the 12 that add most; {left_out} more with --all-frames)" if left_out else ""),
+        + (f" (the {MOST_FRAMES} that add most; {left_out} more with --all-frames)" if left_out else ""),
         f"{'frame':<16}{'bits':>7}"
         + "".join(f"{name:>8}" for name in _SHORT)
         + f"{'m/s':>7}{'deg/s':>7}{'matches':>9}{'objects':>9}{'nearest':>9}",
@@ -194,10 +206,12 @@ def _frame_block(inspection: Inspection, all_frames: bool) -> list[str]:
             + f"{frame.speed:>7.1f}{np.degrees(frame.turn_rate):>7.1f}{frame.matches:>9}{frame.objects:>9}"
             + f"{frame.nearest_m:>7.1f} m"
         )
+    if len(frames) == 1:
+        return [*lines, "- one frame: without it nothing but the priors is left"]
     for unknown, name in enumerate(NAMES):
-        telling = telling_frames(frames, unknown)
         words = ", ".join(
-            f"{_frame_name(inspection, k)} (+{100 * (frames[k].without[unknown] - 1):.1f} %)" for k in telling
+            f"{_frame_name(inspection, k)} ({_growth(frames[k].without[unknown])})"
+            for k in telling_frames(frames, unknown)
         )
         lines.append(f"- matters most for {name} (sigma without it): {words or 'no frame by itself'}")
     share, found = 100.0 * inspection.redundant_share, frame_list(frames, inspection.redundant)
@@ -218,13 +232,16 @@ def _plan_block(inspection: Inspection, plan: Plan) -> list[str]:
         f"{'':<38}" + "".join(f"{unit:>8}" for unit in UNITS) + f"{'':>10}{'':>7}{'frames':>8}",
     ]
     for prediction in (plan.now, *plan.motions, plan.nearer):
-        enough = "-" if prediction.enough is None else str(prediction.enough)
+        enough = f">{MOST_RECORDED}" if prediction.enough is None else str(prediction.enough)
+        enough = "" if prediction is plan.now else enough
         lines.append(
             f"{prediction.name:<38}"
             + "".join(f"{short(value):>8}" for value in _sigmas(prediction.sigmas))
             + f"{short(prediction.worst):>10}{prediction.bits:>7.1f}{enough:>8}"
         )
     lines += [f"- {sentence}" for sentence in advice_sentences(inspection, plan)]
+    if inspection.result.drive_offsets:
+        lines.append(f"- the offset here is that of {inspection.result.drive_offsets[0].drive}")
     if inspection.result.status == "not_converged":
         lines.append("- the estimate itself is not to be trusted: take these figures as rough")
     return lines
@@ -234,10 +251,14 @@ def _status_after(best: Prediction, count: int, now: Prediction) -> str:
     if now.worst <= 1.0:
         return f"the worst direction from {short(now.worst)} to {short(best.worst)} of its limit"
     if best.enough is None:
-        return "no number of such frames brings every direction within its limit"
+        return f"no number of such frames (up to {MOST_RECORDED}) brings every direction within its limit"
     if best.enough <= count:
         return f"all directions would be within the limits ({_such(best.enough)} would do)"
     return f"{_such(best.enough)} would bring all directions within the limits"
+
+
+def _growth(ratio: float) -> str:
+    return f"+{100.0 * (ratio - 1.0):.1f} %" if ratio < 2.0 else f"times {short(ratio)}"
 
 
 def _such(count: int) -> str:

@@ -42,7 +42,7 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     ax.set_xlim(-0.7, n - 0.4)
     ax.set_ylim(_BIAS - 0.6, _TOP + 0.75)
     ax.axis("off")
-    ax.set_title(_caption(inspection, len(frames)), fontsize=11)
+    ax.set_title(_caption(inspection, len(frames)), fontsize=10)
     return figure
 
 
@@ -103,10 +103,12 @@ def _biases(found: Any, drives: set[str]) -> list[tuple[str, str]]:
 def _caption(inspection: Inspection, frames: int) -> str:
     objects = [frame.objects for frame in inspection.frames]
     spread = f", {min(objects)} to {max(objects)} objects each" if objects else ""
-    own = "; each object's own bias between B and its silhouettes is left out" if objects else ""
+    own = (
+        "; each object has a bias of its own between B and its silhouettes, left out here" if objects else ""
+    )
     return (
-        f"Factor graph of {frames} frame{'s' * (frames != 1)}{spread}. Circles: unknowns (E extrinsic, "
-        f"D time offset, V twist, B mask bias{own}).\n"
+        f"Factor graph of {frames} frame{'s' * (frames != 1)}{spread}\n"
+        f"Circles: unknowns (E extrinsic, D time offset, V twist, B mask bias{own})\n"
         "Squares: factors (blue: silhouettes of a frame, green: motion from odometry, grey: priors)"
     )
 

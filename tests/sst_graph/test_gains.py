@@ -1,0 +1,114 @@
+"""What frames bring, against the covariance computed anew from some of the frames."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from factors import RobustKernel
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
+from sst_graph.problem.graph import GraphConfig, PairMatches, Tracks, associate, joint_graph
+from sst_graph.problem.objects import ObjectId, object_tracks
+from sst_graph.problem.state import State
+from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.covariance import (
+    ErrorModel,
+    Unknowns,
+    marginal_covariance,
+    match_table,
+    robust_covariance,
+    score_variance,
+)
+from sst_graph.uncertainty.frame_information import FrameInformation
+from sst_graph.uncertainty.gains import frame_gains
+
+CONFIG = GraphConfig()
+
+
+@cache
+def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[ObjectId, int]]]:
+    """A small drive of four frames, matched at the truth."""
+    source = simulate(
+        SimulationConfig(
+            seed=3, frames=4, width=621, height=188, motion=motion, time_offset_s=0.0, azimuth_step_deg=0.35
+        )
+    )
+    drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
+    objects = [object_tracks(drive)]
+    state = State(source.truth.cTl)
+    kernel = RobustKernel("geman_mcclure", 3.0)
+    return drive, state, associate([drive], Tracks([drive], objects), state, kernel, CONFIG), objects
+
+
+@cache
+def gains(motion: str) -> tuple[np.ndarray, ErrorModel, tuple[FrameInformation, ...]]:
+    drive, state, pairs, objects = matched(motion)
+    graph, values = joint_graph(pairs, state, CONFIG)
+    covariance, model, _ = robust_covariance(graph, values, pairs, state, objects)
+    return covariance, model, frame_gains(graph, values, pairs, state, objects, [drive], model)
+
+
+def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
+    """(7, 7) covariance of some of the frames, with the error model of all."""
+    _, state, pairs, objects = matched(motion)
+    some = [pairs[k] for k in positions]
+    graph, values = joint_graph(some, state, CONFIG)
+    unknowns = Unknowns.of(state, some)
+    bread = marginal_covariance(graph, values, unknowns)
+    table = match_table(some, state, objects, unknowns)
+    surplus = score_variance(table, gains(motion)[1]) - table.J.T @ table.J
+    return (bread + bread @ surplus @ bread)[:7, :7]
+
+
+@pytest.mark.parametrize("motion", ["standing", "constant"])
+def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
+    covariance, _, frames = gains(motion)
+    sigmas = np.sqrt(np.diag(covariance))[:7]
+    assert len(frames) == 4
+    for k, frame in enumerate(frames):
+        rest = covariance_of(motion, [i for i in range(4) if i != k])
+        np.testing.assert_allclose(frame.without, np.sqrt(np.diag(rest)) / sigmas, rtol=1e-6)
+        bits = 0.5 * (np.linalg.slogdet(rest)[1] - np.linalg.slogdet(covariance[:7, :7])[1]) / np.log(2.0)
+        assert frame.bits == pytest.approx(bits, abs=1e-5)
+        first = covariance_of(motion, list(range(k + 1)))
+        np.testing.assert_allclose(frame.so_far, np.sqrt(np.diag(first)) / sigmas, rtol=1e-6)
+    np.testing.assert_allclose(frames[-1].so_far, 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("motion", ["standing", "constant"])
+def test_a_view_is_the_frame_alone(motion: str) -> None:
+    for k, frame in enumerate(gains(motion)[2]):
+        priors = np.diag(np.repeat([CONFIG.rest_sigma_rad, CONFIG.rest_sigma_m], 3) ** -2.0)
+        alone = covariance_of(motion, [k])
+        given_offset = np.linalg.inv(np.linalg.inv(alone)[:6, :6])
+        found = np.linalg.inv(frame.view + priors)
+        ratio = np.sqrt(np.diag(found) / np.diag(given_offset))
+        # The sandwich with the offset held differs a little from the sandwich's conditional.
+        np.testing.assert_allclose(ratio, 1.0, atol=0.15)
+
+
+def test_the_offset_follows_from_the_twist() -> None:
+    _, state, pairs, objects = matched("constant")
+    unknowns = Unknowns.of(state, pairs)
+    table = match_table(pairs, state, objects, unknowns)
+    start = 0
+    for pair, frame in zip(pairs, gains("constant")[2], strict=True):
+        J = table.J[start : start + len(pair)]
+        start += len(pair)
+        # Up to the acceleration that odometry sees in a constant motion.
+        assert np.abs(J[:, 6] + J[:, :6] @ frame.l_twist).max() < 0.05 * np.abs(J[:, 6]).max()
+        assert frame.speed > 3.0
+
+
+def test_what_is_said_of_a_scene() -> None:
+    drive, _, pairs, _ = matched("standing")
+    for pair, frame in zip(pairs, gains("standing")[2], strict=True):
+        (matches,) = pair.matches.values()
+        assert (frame.frame.drive, frame.frame.frame) == (drive.name, drive.scans[pair.pair.scan].index)
+        assert frame.matches == len(pair) and frame.objects == len(set(matches.objects.tolist()))
+        assert frame.nearest_m == pytest.approx(min(np.linalg.norm(p) for p in matches.alignment.lPs))
+        assert frame.left == pytest.approx(np.mean(matches.alignment.pixels[:, 0] < drive.camera.cx))
+        assert frame.speed < 0.05
