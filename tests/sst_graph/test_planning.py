@@ -1,0 +1,170 @@
+"""Predictions of what to record: closed forms, and the classic cure of forward against delay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors.camera import PinholeCamera
+from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.uncertainty.frame_information import FrameInformation, with_offset
+from sst_graph.uncertainty.observability import ObservabilityConfig
+from sst_graph.uncertainty.planning import (
+    Proposal,
+    driving_axes,
+    limits_of,
+    motion_twists,
+    nearer,
+    plan_recording,
+    predict,
+    predicted_covariance,
+    worst_ratio,
+)
+
+CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.0, -0.1, -0.3]))
+"""The camera looks along the LiDAR's x axis."""
+CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1200, 360)
+LIMITS = ObservabilityConfig()
+
+
+def view_of(cPs: np.ndarray, cTl: gtsam.Pose3 = CTL) -> np.ndarray:
+    """(6, 6) information of points (n, 3) in the camera, each seen to 1 px, on cTl."""
+    R = cTl.rotation().matrix()
+    L = np.zeros((6, 6))
+    for cP, uv_H_cP in zip(cPs, CAMERA.uv_H_cP(cPs), strict=True):
+        J = uv_H_cP @ R @ np.hstack([-gtsam.Rot3.Hat(cTl.transformTo(cP)), np.eye(3)])
+        L += J.T @ J
+    return L
+
+
+def street(seed: int = 0, n: int = 40) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.uniform(-6, 6, n), rng.uniform(-1, 1.5, n), rng.uniform(6, 25, n)], axis=1)
+
+
+def at_constant_speed(
+    speed: float = 8.0, frames: int = 5
+) -> tuple[CalibrationResult, list[FrameInformation]]:
+    """A result whose frames all drove at one speed along the LiDAR's x, and its frames."""
+    twist = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    views = [view_of(street(seed)) / 500.0 for seed in range(frames)]
+    information = sum(with_offset(view, twist) for view in views)
+    priors = np.diag(np.array([1.0] * 3 + [0.5] * 3 + [0.3]) ** -2.0)
+    result = CalibrationResult(CTL, 0.0, np.linalg.inv(information + priors), "unobservable", CAMERA)
+    ones = np.ones(7)
+    return result, [
+        FrameInformation(FrameId("street/00", k), 0.1, ones, ones, view, twist, 80, 4, 6.0, 0.5)
+        for k, view in enumerate(views)
+    ]
+
+
+def test_information_adds_to_the_inverse() -> None:
+    rng = np.random.default_rng(1)
+    root, more = rng.normal(size=(7, 7)), rng.normal(size=(3, 7))
+    C, L = root @ root.T, more.T @ more
+    np.testing.assert_allclose(predicted_covariance(C, L), np.linalg.inv(np.linalg.inv(C) + L), rtol=1e-8)
+    np.testing.assert_allclose(predicted_covariance(C, np.zeros((7, 7))), C)
+    # A covariance without an inverse, and units far apart.
+    flat = np.diag([1e-12, 1.0, 0.0, 1e6, 1.0, 1.0, 1.0])
+    L = np.diag([1e12, 1.0, 1.0, 1e-6, 0.0, 3.0, 0.0])
+    np.testing.assert_allclose(
+        np.diag(predicted_covariance(flat, L)), [5e-13, 0.5, 0.0, 5e5, 1.0, 0.25, 1.0], rtol=1e-9
+    )
+
+
+def test_worst_ratio() -> None:
+    sigmas = np.array([np.radians(0.25)] * 3 + [0.01, 0.01, 0.1] + [0.001])
+    assert worst_ratio(np.diag(sigmas**2), LIMITS) == pytest.approx(2.0)
+
+
+def test_steady_driving_does_not_help_and_standing_does() -> None:
+    result, frames = at_constant_speed()
+    plan = plan_recording(result, frames, 10)
+    by_name = {motion.name: motion for motion in plan.motions}
+    x_and_offset = [3, 6]
+    now = plan.now.sigmas[x_and_offset]
+    # The same speed leaves the line x = speed * offset where it was; standing or another speed cuts it.
+    np.testing.assert_array_less(0.95 * now, by_name["straight on at 8.0 m/s"].sigmas[x_and_offset])
+    np.testing.assert_array_less(0.95 * now, by_name["as in this record"].sigmas[x_and_offset])
+    for cure in ("standing", "straight on at 4.0 m/s", "speed changing, 0 to 8 m/s"):
+        np.testing.assert_array_less(by_name[cure].sigmas[x_and_offset], 0.25 * now)
+        assert by_name[cure].bits > 2.0 and by_name[cure].worst < 0.25 * plan.now.worst
+    assert plan.now.worst > 1.0 > plan.best.worst
+    assert plan.motions[-1].name == "straight on at 8.0 m/s" or plan.motions[-1].name == "as in this record"
+    assert [m.worst for m in plan.motions] == sorted(m.worst for m in plan.motions)
+    assert plan.now.bits == 0.0 and plan.motions[-1].enough is None
+
+
+def test_a_prediction_is_what_the_frames_then_give() -> None:
+    result, frames = at_constant_speed()
+    mean = np.mean([frame.view for frame in frames], axis=0)
+    standing = with_offset(mean, np.zeros(6))
+    expected = np.linalg.inv(np.linalg.inv(result.covariance) + 10 * standing)
+    (found,) = [m for m in plan_recording(result, frames, 10).motions if m.name == "standing"]
+    np.testing.assert_allclose(found.sigmas, np.sqrt(np.diag(expected)), rtol=1e-6)
+
+
+def test_the_fewest_frames_that_are_enough() -> None:
+    C = np.diag(np.array([0.001] * 3 + [0.001] * 3 + [0.05]) ** 2)
+    one = Proposal("one", np.diag([0.0] * 6 + [1.0 / 0.02**2]))
+    found = predict(C, one, 1, LIMITS)
+    # 1 / 0.05^2 + n / 0.02^2 >= 1 / 0.005^2 from n = 15.84 on.
+    assert found.enough == 16
+    assert predict(C, one, 16, LIMITS).worst <= 1.0 < predict(C, one, 15, LIMITS).worst
+    assert predict(C, replace(one, information=np.zeros((7, 7))), 1, LIMITS).enough is None
+    assert predict(C, one, 1, LIMITS, search=False).enough is None
+    wide = ObservabilityConfig(offset_s=0.1)
+    assert predict(C, one, 1, wide).enough == 0
+
+
+def test_nearer_views_of_points() -> None:
+    cPs = street(3)
+    found = nearer(view_of(cPs), CTL)
+    np.testing.assert_allclose(found, view_of(0.5 * cPs), rtol=1e-9, atol=1e-6 * np.abs(found).max())
+
+
+def test_axes_of_driving() -> None:
+    _, frames = at_constant_speed()
+    forward, up = driving_axes(CTL, frames)
+    np.testing.assert_allclose(forward, [1, 0, 0])
+    np.testing.assert_allclose(up, [0, 0, 1])
+    # A camera that looks to the left still drives the way the record does; without motion, it looks ahead.
+    left = CTL * gtsam.Pose3(gtsam.Rot3.Rz(-np.pi / 2), np.zeros(3))
+    np.testing.assert_allclose(driving_axes(left, frames)[0], [1, 0, 0], atol=1e-12)
+    standing = [replace(frame, l_twist=np.zeros(6)) for frame in frames]
+    np.testing.assert_allclose(driving_axes(CTL, standing)[0], [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(driving_axes(left, standing)[0], [0, 1, 0], atol=1e-12)
+    turns = motion_twists(CTL, frames)["turning, 20 deg/s both ways, 5 m/s"]
+    np.testing.assert_allclose(turns, [[0, 0, s * np.radians(20), 5, 0, 0] for s in (1, -1)], atol=1e-12)
+
+
+def test_views_are_ranked_by_what_they_would_bring() -> None:
+    result, frames = at_constant_speed()
+    poor = replace(frames[2], view=0.01 * frames[2].view)
+    frames = [*frames[:2], poor, *frames[3:]]
+    plan = plan_recording(result, frames, 3)
+    assert plan.views[-1].position == 2
+    assert sorted(view.position for view in plan.views) == [0, 1, 2, 3, 4]
+    assert plan.nearer.sigmas[4] < plan.best.sigmas[4]
+
+
+@pytest.mark.parametrize(
+    ("config", "expected"),
+    [
+        ({}, LIMITS),
+        (
+            {"observability": {"rotation_deg": 0.1, "translation_m": 0.02, "offset_s": 0.002}},
+            (0.1, 0.02, 0.002),
+        ),
+        ({"calibration": {"observability": {"offset_s": 0.001}}}, (0.5, 0.05, 0.001)),
+        ({"observability": {"offset_s": 0.0, "rotation_deg": "x"}}, LIMITS),
+        ({"observability": None, "calibration": 3}, LIMITS),
+    ],
+)
+def test_limits_of_a_result(config: dict[str, object], expected: object) -> None:
+    result = CalibrationResult(CTL, 0.0, np.eye(7), "ok", CAMERA, config=config)
+    limits = ObservabilityConfig(*expected) if isinstance(expected, tuple) else expected
+    assert limits_of(result) == limits
