@@ -24,7 +24,7 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     offsets = [drive.drive for drive in result.drive_offsets]
     tops = {"E": ((n - 1) * 0.5 - 0.8, _TOP)}
     for k, drive in enumerate(offsets or [""]):
-        tops[f"D{drive}"] = ((n - 1) * 0.5 + 0.8 + 0.9 * k, _TOP)
+        tops[f"D{drive}"] = ((n - 1) * 0.5 + 0.8 + 1.1 * k, _TOP)
     biases = _biases(result.diagnostics.get("mask_bias_px"), {drive for drive, _ in shown})
     bases = {
         key: ((n - 1) * (k + 1) / (len(biases) + 1) if n > 1 else float(k), _BIAS)
@@ -34,12 +34,13 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     for k, (drive, frame) in enumerate(shown):
         clock = tops[f"D{drive}" if offsets else "D"]
         mine = [at for (owner, _), at in bases.items() if owner in ("", drive)]
-        _draw_frame(ax, float(k), frame, twists, [tops["E"], clock], mine)
+        name = f"{drive}:{frame}" if len({owner for owner, _ in frames}) > 1 else f"frame {frame}"
+        _draw_frame(ax, float(k), frame, name, twists, [tops["E"], clock], mine)
     if len(shown) < len(frames):
         words = f"…\n{len(frames) - len(shown)}\nmore\n…"
         ax.text(n - 1.37, _TWIST, words, ha="center", va="center", fontsize=9)
     _draw_shared(ax, tops, bases)
-    ax.set_xlim(-0.7, n - 0.4)
+    ax.set_xlim(min(-0.7, 0.5 * n - 2.5), max(n - 0.4, 0.5 * n + 1.8))
     ax.set_ylim(_BIAS - 0.6, _TOP + 0.75)
     ax.axis("off")
     ax.set_title(_caption(inspection, len(frames)), fontsize=10)
@@ -50,6 +51,7 @@ def _draw_frame(
     ax: Any,
     x: float,
     frame: int,
+    name: str,
     twists: bool,
     tops: Sequence[tuple[float, float]],
     bases: Sequence[tuple[float, float]],
@@ -71,7 +73,7 @@ def _draw_frame(
         for at in tops:
             _edge(ax, silhouette, at, "tab:blue")
     _square(ax, silhouette, "tab:blue")
-    ax.text(x - 0.1, _SILHOUETTE + 0.08, f"frame {frame}", ha="right", fontsize=8, color="tab:blue", zorder=4)
+    ax.text(x - 0.1, _SILHOUETTE + 0.08, name, ha="right", fontsize=8, color="tab:blue", zorder=4)
 
 
 def _draw_shared(
@@ -83,8 +85,8 @@ def _draw_shared(
     for name, (x, y) in tops.items():
         _edge(ax, (x, y), (x, y + 0.45), "grey")
         _square(ax, (x, y + 0.45), "grey")
-        label = name if len(name) == 1 else f"D\n{name[1:]}"
-        ax.text(x, y, label, ha="center", va="center", fontsize=10, bbox=_VARIABLE, zorder=4)
+        ax.text(x, y, name[0], ha="center", va="center", fontsize=10, bbox=_VARIABLE, zorder=4)
+        ax.text(x + 0.12, y + 0.22, name[1:], va="center", fontsize=8, zorder=4)
     for (drive, label), (x, y) in bases.items():
         _edge(ax, (x, y), (x, y - 0.4), "grey")
         _square(ax, (x, y - 0.4), "grey")
@@ -102,7 +104,8 @@ def _biases(found: Any, drives: set[str]) -> list[tuple[str, str]]:
 
 def _caption(inspection: Inspection, frames: int) -> str:
     objects = [frame.objects for frame in inspection.frames]
-    spread = f", {min(objects)} to {max(objects)} objects each" if objects else ""
+    few, many = (min(objects), max(objects)) if objects else (0, 0)
+    spread = f", {few if few == many else f'{few} to {many}'} objects each" if objects else ""
     own = (
         "; each object has a bias of its own between B and its silhouettes, left out here" if objects else ""
     )

@@ -28,7 +28,8 @@ _PAIRS = (
 
 
 def inspection_plots(inspection: Inspection) -> dict[str, Any]:
-    """matplotlib figures by file name; those about frames only where the result tells of frames.
+    """matplotlib figures by file name; those about frames only where the result tells of
+    several frames, what to record next where it tells of one.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
@@ -48,9 +49,10 @@ def inspection_plots(inspection: Inspection) -> dict[str, Any]:
         "correlation.png": draw_correlation(figure(7.5, 6.5), inspection),
         "graph.png": draw_graph(figure(12.0, 7.0), inspection),
     }
-    if inspection.plan is not None:
+    if len(inspection.frames) > 1:
         plots["sigma_over_frames.png"] = draw_sigma_over_frames(figure(9.0, 9.0), inspection)
         plots["gain_by_frame.png"] = draw_gains(figure(12.0, 7.0), inspection)
+    if inspection.plan is not None:
         plots["record_next.png"] = draw_plan(figure(10.0, 4.5), inspection.plan)
     return plots
 
@@ -108,7 +110,7 @@ def draw_sigma_over_frames(figure: Any, inspection: Inspection) -> Any:
         _plain_ticks(ax.yaxis)
         ax.set_ylabel(f"sigma of {label}")
         ax.grid(True, which="both", alpha=0.25)
-        _mark_drives(ax, inspection)
+        _mark_drives(ax, inspection, 0.5)
         if len(unknowns) > 1:
             ax.legend(loc="upper right", ncols=3)
     axes[-1].set_xlabel("frames so far")
@@ -140,6 +142,8 @@ def draw_gains(figure: Any, inspection: Inspection) -> Any:
     step = max(1, -(-len(frames) // 20))
     bottom.set_xticks(x[::step], [str(frames[k].frame.frame) for k in x[::step]])
     several = len({frame.frame.drive for frame in frames}) > 1
+    for ax in (top, bottom):
+        _mark_drives(ax, inspection, -0.5)
     bottom.set_xlabel("frame" + (" (drives one after the other)" if several else ""))
     figure.suptitle("What each frame brings")
     return figure
@@ -177,11 +181,12 @@ def _plain_ticks(axis: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _mark_drives(ax: Any, inspection: Inspection) -> None:
+def _mark_drives(ax: Any, inspection: Inspection, shift: float) -> None:
+    """A line between drives; position k of the frames is drawn at k + shift + 0.5."""
     names = [frame.frame.drive for frame in inspection.frames]
     for k in range(1, len(names)):
         if names[k] != names[k - 1]:
-            ax.axvline(k + 0.5, color="grey", lw=0.8, ls="--")
+            ax.axvline(k + shift, color="black", lw=0.8, ls="--")
 
 
 def _kind(speed: float, turn_degps: float) -> str:

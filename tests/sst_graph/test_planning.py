@@ -90,9 +90,9 @@ def test_steady_driving_does_not_help_and_standing_does() -> None:
     np.testing.assert_array_less(0.95 * now, by_name["straight on at 8.0 m/s"].sigmas[x_and_offset])
     np.testing.assert_array_less(0.95 * now, by_name["as in this record"].sigmas[x_and_offset])
     for cure in ("standing", "straight on at 4.0 m/s", "speed changing, 0 to 8 m/s"):
-        np.testing.assert_array_less(by_name[cure].sigmas[x_and_offset], 0.25 * now)
-        assert by_name[cure].bits > 2.0 and by_name[cure].worst < 0.25 * plan.now.worst
-    assert plan.now.worst > 1.0 > plan.best.worst
+        np.testing.assert_array_less(by_name[cure].sigmas[x_and_offset], 0.5 * now)
+        assert by_name[cure].bits > 3.0 and by_name[cure].worst < 0.5 * plan.now.worst
+    assert by_name["standing"].sigmas[3] < 0.12 * now[0] and plan.best.worst < 1.5 < plan.now.worst
     assert plan.motions[-1].name == "straight on at 8.0 m/s" or plan.motions[-1].name == "as in this record"
     assert [m.worst for m in plan.motions] == sorted(m.worst for m in plan.motions)
     assert plan.now.bits == 0.0 and plan.motions[-1].enough is None
