@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -51,6 +51,7 @@ class MotionConfig:
         max_rotation_sigma_rad: camera motions whose rotation is known worse are left out [rad].
         min_pairs: fewest pairs for an answer.
         max_outer: most times that the LiDAR's motion is looked up anew.
+        heat_outer: outer steps from every start, before the best go on.
         full_steps: outer steps after which only half of each is made.
         settled: an outer step shorter than this many standard deviations ends the outer loop.
         inner_iterations: most Levenberg-Marquardt iterations in between.
@@ -66,6 +67,7 @@ class MotionConfig:
     max_rotation_sigma_rad: float = 0.02
     min_pairs: int = 5
     max_outer: int = 20
+    heat_outer: int = 4
     full_steps: int = 6
     settled: float = 0.1
     inner_iterations: int = 10
@@ -80,15 +82,17 @@ class MotionSolution:
 
     Attributes:
         state: the estimate.
+        centre: of the priors.
         terms: its factors, under the noise that the residuals have.
         scales: that noise, in multiples of what odometry claims.
         covariance: (7, 7).
-        cost: robust chi-squared a pair, at the noise odometry claims; comparable between solutions.
+        cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
         outer_iterations: done.
         converged: the last step was short.
     """
 
     state: State
+    centre: State
     terms: list[HandEyeTerm]
     scales: NoiseScales
     covariance: FloatArray
@@ -118,21 +122,49 @@ def solve_motion(
     starts = motion_starts(steps, paths, guess, guess_offset_s, config.start)
     if not starts:
         raise EstimationError(_too_few(len(steps), config))
-    # 3. The graph from each of them.
-    solutions = []
+    # 3. The graph from each of them, a few steps; from those that differ and fit alike to the end.
+    translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
+    solutions: list[MotionSolution] = []
     for number, start in enumerate(starts):
-        translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
         cTl = gtsam.Pose3(start.cRl, translation)
         centre = State(guess_cTl or cTl, (guess_offset_s,))
-        solution = _solve(steps, paths, State(cTl, (start.offset_s,)), centre, config)
+        heat = replace(config, max_outer=config.heat_outer)
+        solution = _solve(steps, paths, State(cTl, (start.offset_s,)), centre, heat)
         if solution is not None:
             solutions.append(solution)
         if progress is not None:
             progress("motion", number + 1, len(starts))
     if not solutions:
         raise EstimationError("the time offset ran to where the drive has no LiDAR motion, from every start")
-    _LOG.info("motion: %d pairs, costs %s", len(steps), [round(s.cost, 1) for s in solutions])
-    return sorted(solutions, key=lambda solution: solution.cost)
+    finished = [_finished(steps, paths, s, config) for s in _different(solutions, config)]
+    _LOG.info("motion: %d pairs, costs %s", len(steps), [round(s.cost, 1) for s in finished])
+    return sorted(finished, key=lambda s: s.cost)
+
+
+def _different(solutions: Sequence[MotionSolution], config: MotionConfig) -> list[MotionSolution]:
+    """The cheapest, and those that cost little more and lie elsewhere; all before they were finished."""
+    first, *others = sorted(solutions, key=lambda s: s.cost)
+    kept = [first]
+    for other in others:
+        near = 2.0 * (other.cost - first.cost) < 3.0 * config.rival_chi2
+        if near and all(_apart(one, other) > config.rival_chi2 for one in kept):
+            kept.append(other)
+    return kept
+
+
+def _finished(
+    steps: Sequence[CameraStep], paths: Sequence[SensorPath], solution: MotionSolution, config: MotionConfig
+) -> MotionSolution:
+    """A solution with its outer loop run to the end."""
+    if solution.converged:
+        return solution
+    return _solve(steps, paths, solution.state, solution.centre, config) or solution
+
+
+def _apart(a: MotionSolution, b: MotionSolution) -> float:
+    """Chi-squared of 7 of the step between two solutions under the covariance of both."""
+    step = difference(a.state, b.state)
+    return float(step @ np.linalg.solve(a.covariance + b.covariance, step))
 
 
 def _solve(
@@ -164,7 +196,7 @@ def _solve(
         state = moved if outer <= config.full_steps else _between(state, step)
         converged = float(step @ np.linalg.solve(covariance, step)) < config.settled**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
-    return MotionSolution(state, terms, scales, covariance, float(misfit), outer, converged)
+    return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
 
 
 def difference(a: State, b: State) -> FloatArray:
@@ -195,8 +227,6 @@ def rival(solutions: Sequence[MotionSolution], config: MotionConfig) -> MotionSo
     """A solution that fits almost as well as the first and is another one by the covariance of both."""
     best, *others = solutions
     for other in others:
-        step = difference(best.state, other.state)
-        apart = float(step @ np.linalg.solve(best.covariance + other.covariance, step))
-        if 2.0 * (other.cost - best.cost) < config.rival_chi2 and apart > config.rival_chi2:
+        if 2.0 * (other.cost - best.cost) < config.rival_chi2 and _apart(best, other) > config.rival_chi2:
             return other
     return None

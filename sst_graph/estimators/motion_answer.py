@@ -29,10 +29,7 @@ def answer_motion(
         best.state.cTl,
         best.state.offsets_s[0],
         best.covariance,
-        tuple(
-            FrameId(drives[pair.camera.drive].name, drives[pair.camera.drive].images[pair.camera.image].index)
-            for pair in pairs
-        ),
+        tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs),
         doubts=_doubts(solutions, config.motion),
         diagnostics={
             "outer_iterations": best.outer_iterations,

@@ -35,7 +35,7 @@ class CameraStep:
 
     Attributes:
         drive: number of the drive.
-        image: position of the first image in it.
+        image: index of the frame that the first image is of.
         from_ns, to_ns: stamps of the images, camera clock [ns].
         motion: rotation, and direction where it is ok.
     """
@@ -85,9 +85,9 @@ class HandEyePriors:
 def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list[CameraStep]:
     """The camera's motion between consecutive images of all drives, where at least its rotation is known."""
     return [
-        CameraStep(number, position, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
+        CameraStep(number, image.index, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
         for number, drive in enumerate(drives)
-        for position, pair in enumerate(drive.image_pairs)
+        for image, pair in zip(drive.images, drive.image_pairs, strict=False)
         if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * max_rotation_sigma_rad**2
     ]
 

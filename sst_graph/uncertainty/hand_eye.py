@@ -21,7 +21,9 @@ from sst_graph.problem.state import EXTRINSIC, delay_key
 FloatArray = NDArray[np.float64]
 
 
-LEAST_GENUINE = 0.01
+FEIGNED_MARGIN = 2.0
+"""What noise feigns counts so many times: its own size is known from the same few motions."""
+LEAST_GENUINE = 1e-3
 """Of the information in any direction at least this part is taken for genuine, to keep it positive."""
 
 
@@ -56,7 +58,7 @@ def hand_eye_covariance(
     ordering.push_back(EXTRINSIC)
     ordering.push_back(delay_key())
     hessian = graph.linearize(values).hessian(ordering)[0]
-    feigned = np.sum([_feigned(term) for term in terms], axis=0)
+    feigned = FEIGNED_MARGIN * np.sum([_feigned(term) for term in terms], axis=0)
     bread = _inverse_of_genuine(hessian, feigned)
     blocks, scores, shared = [], [], np.zeros((7, 6))
     for term in terms:
