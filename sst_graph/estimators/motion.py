@@ -189,7 +189,7 @@ def _solve(
         # 2. Inner optimisation.
         graph = hand_eye_graph(terms, centre, config.priors)
         values = _optimise(graph, state_values(state), config.inner_iterations)
-        covariance = hand_eye_covariance(graph, values, terms, config.errors)
+        covariance = hand_eye_covariance(graph, values, terms, config.errors, config.priors)
         # 3. Move; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(delay_key())[0]),))
         step = difference(state, moved)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, drives, paper_table
+from sst_graph.experiments import accuracy, drives, motion, paper_table
 from sst_graph.problem.drive import Progress
 
 
@@ -36,6 +36,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "real drives from many wrong starts: one answer, and its distance from the reference",
         drives.DrivesConfig(),
         drives.run,
+    ),
+    "motion": Experiment(
+        "what motion alone tells on simulated streets, and what it adds to the joint method",
+        motion.MotionTableConfig(),
+        motion.run,
     ),
     "paper-table": Experiment(
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",

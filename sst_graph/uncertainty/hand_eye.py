@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.problem.hand_eye import HandEyeTerm
+from sst_graph.problem.hand_eye import HandEyePriors, HandEyeTerm
 from sst_graph.problem.state import EXTRINSIC, delay_key
 
 FloatArray = NDArray[np.float64]
@@ -47,8 +47,9 @@ def hand_eye_covariance(
     values: gtsam.Values,
     terms: Sequence[HandEyeTerm],
     errors: HandEyeErrors,
+    priors: HandEyePriors,
 ) -> FloatArray:
-    """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, never below the graph's own.
+    """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, at most the priors' own.
 
     Args:
         graph: the terms' factors and the priors, at its optimum ``values``.
@@ -73,7 +74,15 @@ def hand_eye_covariance(
             shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
     surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags)
     covariance = bread + bread @ (surplus + shared @ shared.T) @ bread
-    return np.asarray(0.5 * (covariance + covariance.T))
+    return _capped(covariance, priors)
+
+
+def _capped(covariance: FloatArray, priors: HandEyePriors) -> FloatArray:
+    """(7, 7) covariance, nowhere wider than the priors that stand in the graph."""
+    sigmas = np.append(np.repeat([priors.rotation_rad, priors.translation_m], 3), priors.offset_s)
+    both = np.outer(sigmas, sigmas)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) / both)
+    return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T * both)
 
 
 def _feigned(term: HandEyeTerm) -> FloatArray:

@@ -1,0 +1,140 @@
+"""What motion alone tells on simulated streets, and what it adds to the joint method."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.metrics import CalibrationErrors, calibration_errors
+from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.result import Status
+
+DRIVES: Mapping[str, Mapping[str, Any]] = {
+    "turning": {"motion": "turning"},
+    "no-stop": {"motion": "no_stop"},
+    "stop": {"motion": "mixed"},
+    "constant": {"motion": "constant"},
+}
+"""Changes to the simulator's settings, by name."""
+RUNS: Mapping[str, tuple[bool, Mapping[str, Any]]] = {
+    "motion, no guess": (False, {"method": "motion"}),
+    "joint": (True, {"method": "joint"}),
+    "joint with motion": (True, {"method": "joint", "use_motion": True}),
+}
+"""Whether it starts from a guess, and its settings, by name."""
+
+
+@dataclass(frozen=True)
+class MotionTableConfig:
+    """Streets, drives and starts.
+
+    Attributes:
+        streets: number of simulated streets of every drive.
+        seed: of the first street; the next ones follow.
+        drives: names; all of them by default.
+        frames: of each drive.
+        delay_s: true time offset; the first street's, the next ones have a quarter of a period more each [s].
+        start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
+        label_noise: of the simulator.
+        calibration: settings of the methods.
+    """
+
+    streets: int = 4
+    seed: int = 300
+    drives: tuple[str, ...] = tuple(DRIVES)
+    frames: int = 40
+    delay_s: float = 0.1
+    start_deg: float = 10.0
+    start_m: float = 0.1
+    label_noise: float = 1.0
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.drives if name not in DRIVES]
+        if unknown or not self.drives or self.streets < 1:
+            raise ValueError(f"drives: found {unknown or 'none'}, expected some of {', '.join(DRIVES)}")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One run: what was run, its errors against the truth, its status, the seconds of its estimate."""
+
+    run: str
+    errors: CalibrationErrors
+    status: Status
+    seconds: float
+
+
+def run(config: MotionTableConfig, progress: Progress | None = None) -> str:
+    """Every run on every street of every drive, as a Markdown table of medians and worst cases."""
+    rows = [_HEADER, _RULE]
+    for name in config.drives:
+        outcomes: list[Outcome] = []
+        for number in range(config.streets):
+            outcomes += street_outcomes(config, name, number)
+            if progress is not None:
+                progress(name, number + 1, config.streets)
+        rows += [_row(name, label, [o for o in outcomes if o.run == label]) for label in RUNS]
+    return "\n".join(rows) + "\n"
+
+
+def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
+    """All runs on one street; the data are prepared once."""
+    street = SimulationConfig(
+        seed=config.seed + number, frames=config.frames, label_noise=config.label_noise, **DRIVES[name]
+    )
+    delay_s = config.delay_s + 0.25 * number * street.period_s
+    source = simulate(dataclasses.replace(street, time_offset_s=delay_s))
+    drive = prepare_drive(source, config.calibration.classes, config.calibration.prepare)
+    rng = np.random.default_rng([street.seed, 9])
+    start = _start(source.truth.cTl, config, rng)
+    outcomes = []
+    for label, (guessed, settings) in RUNS.items():
+        calibration = dataclasses.replace(config.calibration, **settings)
+        result = calibrate_prepared([drive], start if guessed else None, calibration)
+        errors = calibration_errors(
+            result.T_camera_lidar, result.time_offset_s, source.truth, result.covariance
+        )
+        outcomes.append(Outcome(label, errors, result.status, result.diagnostics["seconds"]["estimate"]))
+    return outcomes
+
+
+def _start(cTl: gtsam.Pose3, config: MotionTableConfig, rng: np.random.Generator) -> gtsam.Pose3:
+    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
+    return cTl.retract(np.concatenate([turn, config.start_m * rng.uniform(-1.0, 1.0, 3)]))
+
+
+_HEADER = (
+    "| drive | run | rotation [deg] median / worst | ATD [cm] median / worst | delay [ms] median / worst "
+    "| NEES rotation, translation (of 3), all (of 7) | ok / unobservable / not converged | seconds |"
+)
+_RULE = "|---|---|---|---|---|---|---|---|"
+
+
+def _row(name: str, label: str, outcomes: Sequence[Outcome]) -> str:
+    errors = [outcome.errors for outcome in outcomes]
+    nees = [e.nees for e in errors if e.nees is not None]
+    means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
+    counts = [sum(o.status == s for o in outcomes) for s in ("ok", "unobservable", "not_converged")]
+    cells = [
+        name,
+        label,
+        _spread([e.qad_deg for e in errors], 3),
+        _spread([100.0 * e.atd_m for e in errors], 2),
+        _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2),
+        ", ".join(f"{mean:.1f}" for mean in means),
+        " / ".join(map(str, counts)),
+        f"{np.median([o.seconds for o in outcomes]):.1f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _spread(values: Sequence[float], digits: int) -> str:
+    return f"{np.median(values):.{digits}f} / {np.max(values):.{digits}f}"
