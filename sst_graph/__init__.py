@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.problem.align import align_frame
     from sst_graph.result import CalibrationResult
+    from sst_graph.uncertainty.inspection import inspect_result
 
 __all__ = [
     "CalibrationConfig",
@@ -19,6 +20,7 @@ __all__ = [
     "TrackerConfig",
     "align_frame",
     "calibrate",
+    "inspect_result",
     "open_source",
 ]
 
@@ -30,6 +32,7 @@ _HOMES = {
     "TrackerConfig": "sst_graph.estimators",
     "align_frame": "sst_graph.problem.align",
     "calibrate": "sst_graph.estimators",
+    "inspect_result": "sst_graph.uncertainty.inspection",
     "open_source": "sst_graph.data",
 }
 

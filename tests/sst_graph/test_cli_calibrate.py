@@ -61,6 +61,13 @@ def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest
     errors = json.loads(capsys.readouterr().out)
     assert errors["qad_deg"] < 0.3 and errors["atd_m"] < 0.03 and abs(errors["time_offset_s"]) < 0.02
 
+    assert main(["inspect", str(out), "--json"]) == 0
+    inspection = json.loads(capsys.readouterr().out)
+    told = [(frame["drive"], frame["frame"]) for frame in inspection["frames"]]
+    used = [(frame["drive"], frame["frame"]) for frame in document["frames_used"]]
+    assert set(told) <= set(used) and len(told) >= 0.9 * len(used)
+    assert inspection["frames"][-1]["sigma_ratio_so_far"] == [1.0] * 7
+
 
 def test_what_cannot_be_told_is_said(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -30,10 +30,10 @@ CONFIG = GraphConfig()
 
 @cache
 def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[ObjectId, int]]]:
-    """A small drive of four frames, matched at the truth."""
+    """A small drive of three frames, matched at the truth."""
     source = simulate(
         SimulationConfig(
-            seed=3, frames=4, width=621, height=188, motion=motion, time_offset_s=0.0, azimuth_step_deg=0.35
+            seed=3, frames=3, width=621, height=188, motion=motion, time_offset_s=0.0, azimuth_step_deg=0.35
         )
     )
     drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
@@ -67,9 +67,9 @@ def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
 def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
     covariance, _, frames = gains(motion)
     sigmas = np.sqrt(np.diag(covariance))[:7]
-    assert len(frames) == 4
+    assert len(frames) == 3
     for k, frame in enumerate(frames):
-        rest = covariance_of(motion, [i for i in range(4) if i != k])
+        rest = covariance_of(motion, [i for i in range(3) if i != k])
         np.testing.assert_allclose(frame.without, np.sqrt(np.diag(rest)) / sigmas, rtol=1e-6)
         bits = 0.5 * (np.linalg.slogdet(rest)[1] - np.linalg.slogdet(covariance[:7, :7])[1]) / np.log(2.0)
         assert frame.bits == pytest.approx(bits, abs=1e-5)
