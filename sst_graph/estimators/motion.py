@@ -38,6 +38,9 @@ from sst_graph.uncertainty.hand_eye import HandEyeErrors, hand_eye_covariance
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
+VAGUE_DEG, VAGUE_S = 5.0, 0.03
+"""A rotation or a time offset with a larger sigma than this is as good as unknown [deg], [s]."""
+
 
 @dataclass(frozen=True)
 class MotionConfig:
@@ -52,7 +55,8 @@ class MotionConfig:
         min_pairs: fewest pairs for an answer.
         max_outer: most times that the LiDAR's motion is looked up anew.
         heat_outer: outer steps from every start, before the best go on.
-        full_steps: outer steps after which only half of each is made.
+        full_steps: outer steps after which ever smaller parts of each are made: robust weights and look-ups
+            may go to and fro for ever.
         settled: an outer step shorter than this many standard deviations ends the outer loop.
         inner_iterations: most Levenberg-Marquardt iterations in between.
         least_scale: the odometry's sigmas are never made smaller by more than this factor.
@@ -193,7 +197,8 @@ def _solve(
         # 3. Move; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(delay_key())[0]),))
         step = difference(state, moved)
-        state = moved if outer <= config.full_steps else _between(state, step)
+        step /= 1 + max(0, outer - config.full_steps)
+        state = State(state.cTl.retract(step[:6]), (state.offsets_s[0] + float(step[6]),))
         converged = float(step @ np.linalg.solve(covariance, step)) < config.settled**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
@@ -202,11 +207,6 @@ def _solve(
 def difference(a: State, b: State) -> FloatArray:
     """(7,) step from one state to another, in the tangent space of the covariance."""
     return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
-
-
-def _between(state: State, step: FloatArray) -> State:
-    """Half of a step: robust weights and look-ups may go to and fro for ever."""
-    return State(state.cTl.retract(0.5 * step[:6]), (state.offsets_s[0] + 0.5 * float(step[6]),))
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
@@ -224,8 +224,14 @@ def _too_few(pairs: int, config: MotionConfig) -> str:
 
 
 def rival(solutions: Sequence[MotionSolution], config: MotionConfig) -> MotionSolution | None:
-    """A solution that fits almost as well as the first and is another one by the covariance of both."""
+    """A solution that fits almost as well as the first and is another one by the covariance of both.
+
+    None where the first is so vague that it claims nothing that another could contradict.
+    """
     best, *others = solutions
+    sigmas = np.sqrt(np.diag(best.covariance))
+    if np.degrees(sigmas[:3].max()) > VAGUE_DEG or sigmas[6] > VAGUE_S:
+        return None
     for other in others:
         if 2.0 * (other.cost - best.cost) < config.rival_chi2 and _apart(best, other) > config.rival_chi2:
             return other
