@@ -1,0 +1,57 @@
+"""The motion experiment: a row by hand, settings that make no sense."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.experiments import motion
+from sst_graph.experiments.motion import MotionTableConfig, Outcome
+from sst_graph.experiments.registry import EXPERIMENTS
+from sst_graph.metrics import CalibrationErrors, Nees
+
+
+def outcome(run: str, qad_deg: float, offset_s: float, status: str = "ok") -> Outcome:
+    return Outcome(
+        run, CalibrationErrors(qad_deg, qad_deg, 0.02, offset_s, Nees(6.0, 3.0, 2.0, 1.0)), status, 1.5
+    )
+
+
+def test_a_row_by_hand() -> None:
+    row = motion._row(
+        "turning", "joint", [outcome("joint", 0.1, -0.002), outcome("joint", 0.3, 0.004, "unobservable")]
+    )
+    assert (
+        row
+        == "| turning | joint | 0.200 / 0.300 | 2.00 / 2.00 | 3.00 / 4.00 | 3.0, 2.0, 6.0 | 1 / 1 / 0 | 1.5 |"
+    )
+
+
+def test_every_drive_and_run_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[tuple[str, int]] = []
+
+    def outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
+        seen.append((name, number))
+        return [outcome(label, 0.1 * (number + 1), 0.001) for label in motion.RUNS]
+
+    monkeypatch.setattr(motion, "street_outcomes", outcomes)
+    steps: list[tuple[str, int, int]] = []
+    table = motion.run(MotionTableConfig(streets=2), lambda *step: steps.append(step))
+    assert len(table.splitlines()) == 2 + len(motion.DRIVES) * len(motion.RUNS)
+    assert len(seen) == len(steps) == 2 * len(motion.DRIVES)
+    assert {line.count("|") for line in table.splitlines()} == {9}
+
+
+@pytest.mark.parametrize("wrong", [{"drives": ("flying",)}, {"drives": ()}, {"streets": 0}])
+def test_settings_that_make_no_sense(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="drives"):
+        MotionTableConfig(**wrong)
+
+
+def test_starts_are_seeded_and_within_bounds() -> None:
+    config = EXPERIMENTS["motion"].config
+    poses = [motion._start(gtsam.Pose3(), config, np.random.default_rng(3)) for _ in range(2)]
+    assert poses[0].equals(poses[1], 1e-12)
+    log = gtsam.Rot3.Logmap(poses[0].rotation())
+    assert 0.0 < np.degrees(np.abs(log).max()) <= config.start_deg
