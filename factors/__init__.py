@@ -47,6 +47,7 @@ from .alignment import (
     weighted_residuals,
 )
 from .camera import MIN_DEPTH_M, PinholeCamera
+from .camera_motion import Between, camera_motion_factor
 from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
 from .condensed import condense
 from .custom import custom_factor
@@ -70,6 +71,7 @@ from .velocity import (
 __all__ = [
     "MIN_DEPTH_M",
     "Alignment",
+    "Between",
     "FactorError",
     "GroupedBias",
     "JacobianBlock",
@@ -82,6 +84,7 @@ __all__ = [
     "RobustKernel",
     "alignment_cost",
     "beta_regularizer",
+    "camera_motion_factor",
     "check_gradient",
     "check_jacobians",
     "condense",

@@ -12,6 +12,7 @@ camera-LiDAR calibration, 2020.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gtsam
@@ -22,6 +23,9 @@ from .custom import ResidualFunction, custom_factor
 from .errors import FactorError, checked_array, checked_covariance
 
 FloatArray = NDArray[np.float64]
+
+MotionError = Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]
+"""Of a predicted motion of the camera: error (6,) and derivative (6, 6) by its right perturbation."""
 
 LOW_TRANSLATION_M = 0.02
 """Below this length [m] of the predicted translation its direction says less and less."""
@@ -56,27 +60,14 @@ def hand_eye_factor(
         scale_known: see above.
     """
     motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, offset_0)
-    measured_covariance = checked_covariance("covariance of the hand-eye error", covariance, 6)
-    if not scale_known:
-        t = np.asarray(c1Tc2.translation())
-        length = float(np.linalg.norm(t))
-        if length == 0.0:
-            raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
-        noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, measured_covariance))
-        return _factor(
-            E, D, _direction_function(motion, c1Tc2.rotation(), t / length, D is not None), noise, 6
-        )
+    motion_error, noise = camera_motion_error(c1Tc2, covariance, scale_known)
 
     def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
         predicted, P_H = motion.in_camera(cTl, offset)
-        difference = c1Tc2.between(predicted)
-        error = gtsam.Pose3.Logmap(difference)
-        if not jacobians:
-            return error, None
-        Log_H = gtsam.Pose3.LogmapDerivative(error)
-        return error, [Log_H @ H for H in P_H]
+        error, error_H_P = motion_error(predicted)
+        return error, [error_H_P @ H for H in P_H] if jacobians else None
 
-    return _factor(E, D, function, gtsam.noiseModel.Gaussian.Covariance(measured_covariance), 6)
+    return _factor(E, D, function, noise, 6)
 
 
 def rotation_hand_eye(
@@ -139,24 +130,44 @@ class _LidarMotion:
         return cTl * moved * cTl.inverse(), H
 
 
-def _direction_function(
-    motion: _LidarMotion, c1Rc2: gtsam.Rot3, direction: FloatArray, with_offset: bool
-) -> ResidualFunction:
-    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
-        predicted, P_H = motion.in_camera(cTl, offset)
+def camera_motion_error(
+    c1Tc2: gtsam.Pose3, covariance: ArrayLike, scale_known: bool
+) -> tuple[MotionError, gtsam.noiseModel.Base]:
+    """Error of a predicted c1Tc2 against the measured one, with its derivative, and the noise of it.
+
+    The equation and the arguments are those of :func:`hand_eye_factor`.
+    """
+    measured_covariance = checked_covariance("covariance of the hand-eye error", covariance, 6)
+    if scale_known:
+        return _pose_error(c1Tc2), gtsam.noiseModel.Gaussian.Covariance(measured_covariance)
+    t = np.asarray(c1Tc2.translation())
+    length = float(np.linalg.norm(t))
+    if length == 0.0:
+        raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
+    noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, measured_covariance))
+    return _direction_error(c1Tc2.rotation(), t / length), noise
+
+
+def _pose_error(c1Tc2: gtsam.Pose3) -> MotionError:
+    def error_of(predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+        error = np.asarray(gtsam.Pose3.Logmap(c1Tc2.between(predicted)))
+        return error, np.asarray(gtsam.Pose3.LogmapDerivative(error))
+
+    return error_of
+
+
+def _direction_error(c1Rc2: gtsam.Rot3, direction: FloatArray) -> MotionError:
+    def error_of(predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
         log = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
         t = np.asarray(predicted.translation())
         length = np.sqrt(t @ t + LOW_TRANSLATION_M**2)
-        error = np.concatenate([log, t / length - direction])
-        if not jacobians:
-            return error, None
-        P = np.zeros((6, 6))
-        P[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
+        H = np.zeros((6, 6))
+        H[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
         # t of P Exp([w, v]) is t + R v
-        P[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
-        return error, [P @ H for H in P_H]
+        H[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
+        return np.concatenate([log, t / length - direction]), H
 
-    return function
+    return error_of
 
 
 def _direction_covariance(c1Tc2: gtsam.Pose3, covariance: FloatArray) -> FloatArray:

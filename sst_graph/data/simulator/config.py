@@ -7,8 +7,9 @@ from typing import Literal, get_args
 
 from sst_graph.errors import ConfigError
 
-Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning"]
-"""Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed."""
+Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning", "there_and_back"]
+"""Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed;
+``there_and_back`` goes forward for half of the drive and returns in reverse."""
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,9 @@ def speed_profile(config: SimulationConfig, t: FloatArray) -> FloatArray:
         return np.full_like(t, v)
     if config.motion == "turning":
         return _smoothed(v * (0.75 + 0.1 * np.sin(2 * np.pi * t / 7.0)))
+    if config.motion == "there_and_back":
+        knots, speeds = [0, 0.05, 0.2, 0.3, 0.47, 0.53, 0.7, 0.8, 0.95, 1], [0, 0, 1, 1, 0, 0, -1, -1, 0, 0]
+        return _smoothed(min(v, 0.45 * duration) * np.interp(t / duration, knots, speeds))
     if config.motion == "no_stop":
         return _smoothed(v * (0.85 + 0.35 * np.sign(np.sin(2 * np.pi * (t + 0.4) / 5.0)) * _ramp(t, 5.0)))
     cycle = duration if config.motion == "mixed" and duration < 14.0 else 12.0
@@ -136,7 +139,7 @@ def random_path(config: SimulationConfig, rng: np.random.Generator, start: float
     """A centre line from arc length ``start`` to ``end`` [m] with bends and gentle slopes."""
     s = np.arange(start, end, 0.25)
     curvature = np.zeros_like(s)
-    if config.motion in ("mixed", "turning", "no_stop", "stop_and_go"):
+    if config.motion in ("mixed", "turning", "no_stop", "stop_and_go", "there_and_back"):
         tight = config.motion == "turning"
         side = float(rng.choice([-1.0, 1.0]))
         at = float(rng.uniform(6.0, 12.0)) if tight else float(rng.uniform(12.0, 22.0))

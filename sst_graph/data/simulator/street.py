@@ -162,7 +162,7 @@ def build_street(config: SimulationConfig) -> Street:
     t = time_table(config)
     s = np.cumsum(speed_profile(config, t)) * STEP_S
     s -= np.interp(0.0, t, s)
-    start, end = float(s[0]) - BEHIND_M, float(s[-1]) + AHEAD_M
+    start, end = float(s.min()) - BEHIND_M, float(s.max()) + AHEAD_M
     path = random_path(config, np.random.default_rng([config.seed, 2]), start, end)
     profile, angled = _profile(root)
     sun_azimuth, sun_height = root.uniform(-np.pi, np.pi), root.uniform(0.5, 1.1)

@@ -1,0 +1,129 @@
+"""Visual odometry in somebody else's graph: the camera's motion between two images on his own poses.
+
+    c1Tc2 = cTl . lTb . wTb(t_1 + D)^-1 . wTb(t_2 + D) . bTl . cTl^-1
+    wTb(t) = X_a Exp(s Log(X_a^-1 X_b)),      s = (t - t_a) / (t_b - t_a)
+
+Each image falls between two poses of the trajectory, stamped by the LiDAR's clock, between which the body
+moves with one twist. The camera's motion so corrects the trajectory through the calibration, and the
+trajectory the calibration: a hand-eye constraint (:mod:`factors.hand_eye`) with both sides unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .custom import custom_factor
+from .errors import FactorError, checked_positive
+from .hand_eye import camera_motion_error
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Between:
+    """Where an image falls in a trajectory.
+
+    Attributes:
+        X_a, X_b: keys of the poses wTb before and after (Pose3), distinct.
+        seconds: from X_a to X_b, in the LiDAR's clock [s].
+        image_after_a_s: image stamp minus stamp of X_a [s]; the offset is added to it. The image may fall
+            beyond X_a or X_b: the twist then goes on.
+    """
+
+    X_a: int
+    X_b: int
+    seconds: float
+    image_after_a_s: float
+
+    def __post_init__(self) -> None:
+        if self.X_a == self.X_b:
+            raise FactorError("poses around an image", "one key for both", "two distinct keys")
+        checked_positive("seconds between the poses", self.seconds)
+
+
+def camera_motion_factor(
+    first: Between,
+    second: Between,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float,
+    c1Tc2: gtsam.Pose3,
+    covariance: ArrayLike,
+    *,
+    bTl: gtsam.Pose3 | None = None,
+    scale_known: bool = True,
+) -> gtsam.CustomFactor:
+    """Log(measured^-1 . predicted) of the camera's motion c1Tc2 [rad, m]; the equation is the module's.
+
+    Args:
+        first, second: where the two images fall; they may share poses.
+        cTl: key of the extrinsic, or a fixed pose.
+        offset_s: key of the time offset, or a fixed offset [s].
+        c1Tc2: measured pose of the camera at image 2 in the camera at image 1; any length where the scale
+            is unknown.
+        covariance: (6, 6) of it [rot, trans], right perturbation; see
+            :func:`factors.hand_eye.hand_eye_factor` for an unknown scale.
+        bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
+        scale_known: False where the translation's direction alone was measured.
+
+    Returns:
+        A factor of 6 rows on the distinct keys: poses of the first, of the second, cTl, offset_s.
+
+    Raises:
+        FactorError: one key for two variables, or a covariance that is none.
+    """
+    error_of, noise = camera_motion_error(c1Tc2, covariance, scale_known)
+    poses = list(dict.fromkeys((first.X_a, first.X_b, second.X_a, second.X_b)))
+    E = None if isinstance(cTl, gtsam.Pose3) else int(cTl)
+    D = int(offset_s) if isinstance(offset_s, int | np.integer) else None
+    keys = poses + [key for key in (E, D) if key is not None]
+    dims = [6] * len(poses) + [6] * (E is not None) + [1] * (D is not None)
+    if len(set(keys)) != len(keys):
+        raise FactorError("keys of a camera motion", "one key for two variables", "distinct keys")
+    lTb = gtsam.Pose3() if bTl is None else bTl.inverse()
+
+    def function(*values: Any, jacobians: bool) -> Any:
+        named = dict(zip(keys, values, strict=True))
+        extrinsic = cTl if isinstance(cTl, gtsam.Pose3) else named[cTl]
+        offset = offset_s if D is None else float(named[D][0])
+        wTl_1, H_1 = _lidar_at(first, named, offset, lTb)
+        wTl_2, H_2 = _lidar_at(second, named, offset, lTb)
+        l1Tl2 = wTl_1.between(wTl_2)
+        error, error_H_P = error_of(extrinsic * l1Tl2 * extrinsic.inverse())
+        if not jacobians:
+            return error, None
+        # right perturbations: of c1Tc2 = cTl M cTl^-1 by M and cTl, of M = wTl_1^-1 wTl_2 by both
+        cAd, back = extrinsic.AdjointMap(), l1Tl2.inverse().AdjointMap()
+        by_motion = error_H_P @ cAd
+        H = {key: np.zeros((6, dim)) for key, dim in zip(keys, dims, strict=True)}
+        for where, L_H, lead in ((first, H_1, -by_motion @ back), (second, H_2, by_motion)):
+            H[where.X_a] += lead @ L_H[0]
+            H[where.X_b] += lead @ L_H[1]
+            if D is not None:
+                H[D] += (lead @ L_H[2]).reshape(6, 1)
+        if E is not None:
+            H[E] = error_H_P @ cAd @ (back - np.eye(6))
+        return error, [H[key] for key in keys]
+
+    return custom_factor(noise, keys, function, dims, 6)
+
+
+def _lidar_at(
+    where: Between, named: dict[int, Any], offset_s: float, lTb: gtsam.Pose3
+) -> tuple[gtsam.Pose3, tuple[FloatArray, FloatArray, FloatArray]]:
+    """wTl at an image's instant, and its right derivatives by X_a (6, 6), X_b (6, 6) and the offset (6,)."""
+    X_a, X_b = named[where.X_a], named[where.X_b]
+    xi = np.asarray(gtsam.Pose3.Logmap(X_a.between(X_b)))
+    s = (where.image_after_a_s + offset_s) / where.seconds
+    part = gtsam.Pose3.Expmap(s * xi)
+    # Log(X_a^-1 X_b Exp(d)) = xi + Jr^-1(xi) d, and by X_a with Jl^-1(xi) = Jr^-1(-xi)
+    stretch = s * np.asarray(gtsam.Pose3.ExpmapDerivative(s * xi))
+    by_b = stretch @ gtsam.Pose3.LogmapDerivative(xi)
+    by_a = part.inverse().AdjointMap() - stretch @ gtsam.Pose3.LogmapDerivative(-xi)
+    lAd = lTb.AdjointMap()
+    wTl = X_a * part * lTb.inverse()
+    return wTl, (lAd @ by_a, lAd @ by_b, lAd @ xi / where.seconds)

@@ -1,0 +1,179 @@
+"""Visual odometry on the poses of a trajectory: sign, derivatives, an independent oracle, a solver."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import Between, FactorError, camera_motion_factor, check_jacobians, hand_eye_factor
+
+E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)
+X = [gtsam.symbol("x", k) for k in range(8)]
+BTL = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))
+OPTICAL = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+CTL = gtsam.Pose3(OPTICAL, np.array([0.1, -0.2, -0.3])).retract(np.full(6, 0.03))
+COVARIANCE = np.diag([1e-6] * 3 + [1e-4] * 3)
+PERIOD_S = 0.1
+
+
+def values_of(poses, cTl=None, offset_s=None):
+    values = gtsam.Values()
+    for key, pose in zip(X, poses, strict=False):
+        values.insert(key, pose)
+    if cTl is not None:
+        values.insert(E, cTl)
+    if offset_s is not None:
+        values.insert(D, np.array([offset_s]))
+    return values
+
+
+def wandering(seed, number=4):
+    rng = np.random.default_rng(seed)
+    poses = [gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6))]
+    while len(poses) < number:
+        poses.append(poses[-1] * gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6) * [0.1, 0.1, 0.2, 1.0, 0.3, 0.3]))
+    return poses
+
+
+def test_by_hand():
+    # 1 m, then 2 m forward, 0.1 s each; images 0.05 s after X0 and X1, so 0.5 + 1 m apart. Measured 1.4 m.
+    # The LiDAR's x is the camera's z.
+    poses = [gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, 3.0)]
+    seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.4]))
+    first, second = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
+    factor = camera_motion_factor(first, second, gtsam.Pose3(OPTICAL, np.zeros(3)), D, seen, COVARIANCE)
+    error = factor.unwhitenedError(values_of(poses, offset_s=0.03))
+    np.testing.assert_allclose(error, [0, 0, 0, 0, 0, 0.1], atol=1e-12)
+
+
+@pytest.mark.parametrize("scale_known", [True, False])
+def test_jacobians_at_100_states(scale_known):
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        poses = wandering(seed)
+        measured = gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6) * [0.1, 0.1, 0.1, 0.5, 0.3, 1.0])
+        second = [(1, 2), (2, 3), (0, 1), (1, 0)][seed % 4]
+        factor = camera_motion_factor(
+            Between(X[0], X[1], 0.12, rng.uniform(-0.05, 0.15)),
+            Between(X[second[0]], X[second[1]], 0.1, rng.uniform(-0.05, 0.15)),
+            CTL if seed % 5 == 0 else E,
+            0.03 if seed % 7 == 0 else D,
+            measured,
+            COVARIANCE,
+            bTl=BTL if seed % 3 else None,
+            scale_known=scale_known,
+        )
+        values = values_of(poses, CTL.retract(rng.normal(0.0, 0.3, 6)), 0.02)
+        # the direction of a short translation turns fast: a short step there
+        check_jacobians(factor, values, 1e-6, step=1e-3 if scale_known else 2e-4)
+
+
+def test_camera_poses_worked_out_one_by_one_say_the_same():
+    poses, offset_s = wandering(3), 0.04
+    measured = gtsam.Pose3.Expmap(np.array([0.02, -0.1, 0.05, 0.1, 0.2, 0.9]))
+    places = Between(X[0], X[1], 0.12, 0.01), Between(X[2], X[3], 0.1, 0.05)
+    factor = camera_motion_factor(*places, E, D, measured, COVARIANCE, bTl=BTL)
+    cameras = []
+    for (a, b), place in zip(((0, 1), (2, 3)), places, strict=True):
+        s = (place.image_after_a_s + offset_s) / place.seconds
+        wTb = poses[a] * gtsam.Pose3.Expmap(s * gtsam.Pose3.Logmap(poses[a].between(poses[b])))
+        cameras.append(wTb * BTL * CTL.inverse())
+    graph = gtsam.NonlinearFactorGraph()
+    noise = gtsam.noiseModel.Gaussian.Covariance(COVARIANCE)
+    graph.add(gtsam.BetweenFactorPose3(1, 2, measured, noise))
+    expected = gtsam.Values()
+    expected.insert(1, cameras[0])
+    expected.insert(2, cameras[1])
+    assert factor.error(values_of(poses, CTL, offset_s)) == pytest.approx(graph.error(expected), rel=1e-9)
+
+
+def test_is_the_hand_eye_factor_where_the_trajectory_is_known():
+    # one twist throughout: carried by the delay at both ends, or interpolated, is the same
+    twist = np.array([0.1, -0.05, 0.4, 8.0, 0.3, 0.1])
+    poses = [gtsam.Pose3.Expmap(k * PERIOD_S * twist) for k in range(4)]
+    measured = CTL * gtsam.Pose3.Expmap(1.03 * PERIOD_S * twist) * CTL.inverse()
+    ours = camera_motion_factor(
+        Between(X[0], X[1], PERIOD_S, 0.0), Between(X[1], X[2], PERIOD_S, 0.0), E, D, measured, COVARIANCE
+    )
+    known = hand_eye_factor(
+        E, D, measured, poses[0].between(poses[1]), twist, twist, 0.0, COVARIANCE, scale_known=True
+    )
+    for offset_s in (0.0, 0.03, -0.06):
+        values = values_of(poses, CTL.retract(np.full(6, 0.01)), offset_s)
+        assert ours.error(values) == pytest.approx(known.error(values), rel=1e-9)
+        np.testing.assert_allclose(
+            ours.linearize(values).jacobian()[0][:, -7:],
+            known.linearize(values).jacobian()[0],
+            atol=1e-6 * np.abs(known.linearize(values).jacobian()[0]).max(),
+        )
+
+
+def weaving(count, period_s=PERIOD_S):
+    """Poses of a drive, piecewise of one twist, that turns and changes its speed."""
+    poses = [gtsam.Pose3()]
+    for k in range(count - 1):
+        t = k * period_s
+        twist = np.array(
+            [0.2 * np.sin(3 * t), 0.3 * np.cos(4 * t), 0.6 * np.sin(5 * t), 5 + 3 * np.sin(4 * t)]
+        )
+        poses.append(poses[-1] * gtsam.Pose3.Expmap(period_s * np.append(twist, [0.2, 0.1])))
+    return poses
+
+
+def test_improves_a_trajectory_and_finds_the_delay():
+    # LiDAR odometry of 5 cm and 0.3 deg, a camera of 0.5 cm and 0.03 deg
+    count, offset_s, rng = 40, 0.04, np.random.default_rng(0)
+    poses = weaving(count)
+    keys = [gtsam.symbol("p", k) for k in range(count)]
+    rough = np.repeat([np.radians(0.3), 0.05], 3)
+    fine = np.repeat([np.radians(0.03), 0.005], 3)
+    alone, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    alone.add(gtsam.PriorFactorPose3(keys[0], poses[0], gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)))
+    values.insert(keys[0], poses[0])
+    for k in range(count - 1):
+        step = poses[k].between(poses[k + 1]).retract(rng.normal(0.0, rough))
+        alone.add(
+            gtsam.BetweenFactorPose3(keys[k], keys[k + 1], step, gtsam.noiseModel.Diagonal.Sigmas(rough))
+        )
+        values.insert(keys[k + 1], values.atPose3(keys[k]) * step)
+    both = gtsam.NonlinearFactorGraph(alone)
+
+    def camera(k):
+        s = offset_s / PERIOD_S
+        xi = gtsam.Pose3.Logmap(poses[k].between(poses[k + 1]))
+        return poses[k] * gtsam.Pose3.Expmap(s * xi) * CTL.inverse()
+
+    for k in range(count - 2):
+        measured = camera(k).between(camera(k + 1)).retract(rng.normal(0.0, fine))
+        places = [Between(keys[i], keys[i + 1], PERIOD_S, 0.0) for i in (k, k + 1)]
+        both.add(camera_motion_factor(*places, E, D, measured, np.diag(fine**2)))
+    about = CTL.retract(np.repeat([0.001, -0.01], 3))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.002, 0.02], 3))
+    both.add(gtsam.PriorFactorPose3(E, about, noise))
+    both.add(gtsam.PriorFactorVector(D, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1.0)))
+    start = gtsam.Values(values)
+    start.insert(E, about)
+    start.insert(D, np.zeros(1))
+    found = gtsam.LevenbergMarquardtOptimizer(both, start).optimize()
+
+    def drift(estimate):
+        ends = [
+            estimate.atPose3(key).translation() - p.translation() for key, p in zip(keys, poses, strict=True)
+        ]
+        return float(np.sqrt(np.mean(np.square(ends))))
+
+    assert drift(found) < 0.3 * drift(values)
+    assert abs(found.atVector(D)[0] - offset_s) < 0.005
+
+
+def test_refuses_what_makes_no_factor():
+    with pytest.raises(FactorError, match="two distinct keys"):
+        Between(X[0], X[0], 0.1, 0.0)
+    with pytest.raises(FactorError, match="seconds"):
+        Between(X[0], X[1], 0.0, 0.0)
+    places = Between(X[0], X[1], 0.1, 0.0), Between(X[1], X[2], 0.1, 0.0)
+    with pytest.raises(FactorError, match="one key for two variables"):
+        camera_motion_factor(*places, X[0], D, gtsam.Pose3(), COVARIANCE)
+    with pytest.raises(FactorError, match="direction"):
+        camera_motion_factor(*places, E, D, gtsam.Pose3(), COVARIANCE, scale_known=False)
