@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import Protocol
 
 import gtsam
@@ -147,7 +148,7 @@ class RelativeMotion:
         """Length of the interval [s]."""
         return (self.to_ns - self.from_ns) * 1e-9
 
-    @property
+    @cached_property
     def mean_twist(self) -> FloatArray:
         """(6,) mean twist [rad/s, m/s] over the interval, in the sensor's own frame."""
         return np.asarray(gtsam.Pose3.Logmap(self.aTb)) / self.seconds

@@ -124,22 +124,30 @@ def _rank_by_elevation(labels: NDArray[np.integer], elevation: FloatArray) -> tu
 
 
 def _cone_heights(z: FloatArray, rho: FloatArray, ring: IntArray, rings: int) -> FloatArray:
-    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell."""
+    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell.
+
+    The points come ring by ring.
+    """
+    counts = np.bincount(ring, minlength=rings)
+    some = np.flatnonzero(counts)
+    starts = (np.cumsum(counts) - counts)[some]
+    terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho])
     weight = 1.0 / np.maximum(rho, 1.0)
     base = weight
     height = np.zeros(rings)
     for _ in range(_ROUNDS):
         w2 = weight**2
-        s = [np.bincount(ring, w2 * a, rings) for a in (np.ones_like(rho), rho, rho**2, z, z * rho)]
+        s = np.zeros((5, rings))
+        s[:, some] = np.add.reduceat(w2 * terms, starts, axis=1) if len(some) else 0.0
         det = s[0] * s[2] - s[1] ** 2
         safe = np.where(det > 1e-9 * np.maximum(s[0] * s[2], 1e-12), det, np.inf)
         slope = (s[0] * s[4] - s[1] * s[3]) / safe
         height = (s[2] * s[3] - s[1] * s[4]) / safe
         error = z - slope[ring] * rho - height[ring]
         weight = base / (1.0 + np.square(error / _CONE_NOISE_M))
-    counts = np.bincount(ring, minlength=rings)
     nearest, farthest = np.full(rings, np.inf), np.zeros(rings)
-    np.minimum.at(nearest, ring, rho)
-    np.maximum.at(farthest, ring, rho)
+    if len(some):
+        nearest[some] = np.minimum.reduceat(rho, starts)
+        farthest[some] = np.maximum.reduceat(rho, starts)
     trusted = (counts >= _MIN_RING_POINTS) & (farthest > _MIN_RHO_RATIO * nearest) & (np.abs(height) < 0.6)
     return np.where(trusted, height, 0.0)

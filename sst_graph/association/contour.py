@@ -15,6 +15,8 @@ FloatMap = NDArray[np.float32]
 
 _REMAP_LIMIT = 30_000
 _SMOOTHING_PX = 1.0
+REACH_PX = 64
+"""The field ends this far from the class [px]: beyond every gate (``gate`` times the widest kernel)."""
 _MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
 
@@ -41,7 +43,8 @@ class ContourMap:
     """Signed distance field of one class in one mask.
 
     Attributes:
-        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed [px].
+        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, and flat from
+            :data:`REACH_PX` on [px].
         unknown: (h, w) 1 near ``IGNORE`` pixels, where a contour is not the object's.
     """
 
@@ -54,10 +57,17 @@ class ContourMap:
         inside = (mask == semantic_class).astype(np.uint8)
         if not inside.any() or inside.all():
             return None
-        distance = signed_distance(inside)
-        unknown = cv2.dilate((mask == SemanticClass.IGNORE).astype(np.uint8), np.ones((5, 5), np.uint8))
-        smooth = np.asarray(cv2.GaussianBlur(distance, (0, 0), _SMOOTHING_PX), np.float32)
-        return cls(smooth, unknown.astype(np.float32))
+        # Only near the class: elsewhere nothing is matched, and the transform is what an image costs.
+        x, y, width, height = cv2.boundingRect(inside)
+        rows = slice(max(0, y - REACH_PX), y + height + REACH_PX)
+        columns = slice(max(0, x - REACH_PX), x + width + REACH_PX)
+        distance = np.full(mask.shape, float(REACH_PX), np.float32)
+        near = signed_distance(np.ascontiguousarray(inside[rows, columns]))
+        distance[rows, columns] = np.minimum(cv2.GaussianBlur(near, (0, 0), _SMOOTHING_PX), REACH_PX)
+        unknown = (mask == SemanticClass.IGNORE).astype(np.uint8)
+        if unknown.any():
+            unknown = np.asarray(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), np.uint8)
+        return cls(distance, unknown.astype(np.float32))
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
@@ -88,9 +98,15 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
 
     The border runs half way between an inside pixel's centre and its outside neighbour's.
     """
-    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.where(inside > 0, 0.5 - inner, outer - 0.5).astype(np.float32)
+    outside = 1 - inside
+    distance = np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+    x, y, width, height = cv2.boundingRect(inside)
+    box = (slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1))
+    region = np.ascontiguousarray(inside[box])
+    inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance -= 0.5
+    distance[box] = np.where(region > 0, 0.5 - inner, distance[box])
+    return distance
 
 
 def sample(field: FloatMap, uvs: FloatArray) -> FloatArray:

@@ -36,6 +36,8 @@ FloatArray = NDArray[np.float64]
 
 _UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
+_FRESH_SIGMAS = 0.02
+"""A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
 
 class Tracker:
@@ -170,7 +172,7 @@ class Tracker:
         newest = self.window.last_stamp_ns
         if newest is not None and scan.stamp_ns <= newest:
             raise DataError("tracker", f"a scan of stamp {scan.stamp_ns} ns", f"one after {newest} ns")
-        prepare = self.config.calibration.prepare
+        prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
         self.last_scan = scan
@@ -265,7 +267,8 @@ class Tracker:
         stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
         some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
         judged = sorted(self.window.judged_anew & set(known))[: self.config.renew_most]
-        return {number, *waiting[-4:], *numbers[:1], *some, *judged} | (set(numbers[-2:]) & set(known))
+        leaving = [n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS]
+        return {number, *waiting[-4:], *leaving, *some, *judged} | (set(numbers[-2:]) & set(known))
 
     def _staleness(self, smoother: WindowSmoother) -> dict[int, float]:
         """How far the estimate has moved since each pair was matched, in standard deviations."""
@@ -342,7 +345,8 @@ class Tracker:
         self.guess = Guess(point.cTl, point.offset_s, search=False)
         self.smoother, self.alarmed = None, True
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
-        self.window.keep_scans(self.config.alarm.frames + self.config.alarm.confirmations - 1)
+        # Frames before the first that was past the threshold may be from before the change.
+        self.window.keep_scans(self.config.alarm.confirmations)
         self.waited = len(self.window.scans)
         self.entered.clear()
         self.history_store.cut()

@@ -28,7 +28,8 @@ from sst_graph.uncertainty.covariance import SIDE_FLOOR, SIDE_FRAME_FLOOR, Error
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-_SIDES = 3
+_SIDES = 4
+"""More than there are sides of an object."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ _RELINEARIZE = {
     "E": np.repeat([2e-4, 1e-3], 3),
     "D": np.array([5e-4]),
     "B": np.array([0.02]),
-    "O": np.array([0.02]),
+    "O": np.array([0.1]),
     "V": np.repeat([0.005, 0.03], 3),
 }
 """Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below what a frame tells."""

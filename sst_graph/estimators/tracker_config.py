@@ -50,7 +50,7 @@ class AlarmConfig:
     enabled: bool = True
     kernel_px: float = 12.0
     frames: int = 4
-    chi2: float = 60.0
+    chi2: float = 25.0
     confirmations: int = 3
     baseline: int = 300
     warm_up: int = 15
@@ -101,7 +101,7 @@ class TrackerConfig:
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     window: int = 60
-    renew: int = 2
+    renew: int = 1
     renew_most: int = 6
     stale_sigmas: float = 0.2
     start_scans: int = 12

@@ -112,23 +112,35 @@ class Window:
                 self._judge_track(seen, stamp_ns - reach_ns, reach_ns)
 
     def _judge_track(self, seen: Sequence[Sighting], since_ns: int, reach_ns: int) -> None:
-        """Speeds of one object in its sightings since a stamp, each from those around it."""
+        """Speeds of one object in its sightings since a stamp, each from those around it.
+
+        A sighting is judged when it is new, when all that is around it has been seen, and when the newest
+        one is judged otherwise than the one before.
+        """
         centres = np.stack([sighting.centre for sighting in seen])
         stamps = np.array([sighting.stamp_ns for sighting in seen], dtype=np.int64)
         # A line fitted to n places rises by less than 1.5 times their spread.
         never = 1.5 * float(np.linalg.norm(np.ptp(centres, axis=0))) < MOVING.min_travel_m
-        for sighting in seen:
-            if sighting.stamp_ns < since_ns:
-                continue
-            near = np.abs(stamps - sighting.stamp_ns) <= reach_ns
-            times = np.asarray((stamps[near] - sighting.stamp_ns) * 1e-9, np.float64)
-            speed = 0.0 if never else speed_of(times, centres[near], MOVING)
-            speeds = self.moving.setdefault(sighting.scan, {})
-            before = speeds.pop(sighting.name, 0.0)
-            if speed > 0.0:
-                speeds[sighting.name] = speed
-            if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
-                self.judged_anew.add(sighting.scan)
+        recent = [i for i, sighting in enumerate(seen) if sighting.stamp_ns >= since_ns]
+        before = self._speed(seen[recent[-2]]) if len(recent) > 1 else 0.0
+        for i in (recent[-1], recent[0], *recent[1:-1]):
+            near = np.abs(stamps - stamps[i]) <= reach_ns
+            times = np.asarray((stamps[near] - stamps[i]) * 1e-9, np.float64)
+            self._decide(seen[i], 0.0 if never else speed_of(times, centres[near], MOVING))
+            if i == recent[0] and (before > 0.0) == (self._speed(seen[-1]) > 0.0):
+                break
+
+    def _speed(self, sighting: Sighting) -> float:
+        return self.moving.get(sighting.scan, {}).get(sighting.name, 0.0)
+
+    def _decide(self, sighting: Sighting, speed: float) -> None:
+        before = self._speed(sighting)
+        speeds = self.moving.setdefault(sighting.scan, {})
+        speeds.pop(sighting.name, None)
+        if speed > 0.0:
+            speeds[sighting.name] = speed
+        if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
+            self.judged_anew.add(sighting.scan)
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, float]]:
         """Tracks of the objects of some scans, and speeds of the moving ones, by the scan's position."""

@@ -93,6 +93,7 @@ class LidarOdometry:
         self._covariance = np.zeros((6, 6))
         self._voxel_m = self.config.voxel_m
         self._lost = True
+        self._cached: tuple[Scan, _Points] | None = None
 
     @property
     def pose(self) -> gtsam.Pose3:
@@ -239,13 +240,17 @@ class LidarOdometry:
     def _points(self, scan: Scan, twist: FloatArray | None) -> _Points:
         """The scan's points at its stamp; what may move counts as still where too little else is left."""
         config = self.config
+        if self._cached is not None and self._cached[0] is scan and scan.offsets_s is None:
+            return self._cached[1]
         points, classes, offsets = usable_points(scan, config.near_m, config.far_m, config.max_points)
         if offsets is not None and twist is not None:
             points = compensate_sweep(points, offsets, twist)
         movable = np.isin(classes, MOVABLE_CLASSES)
         if np.count_nonzero(~movable) < config.min_points:
             movable[:] = False
-        return _Points(points[~movable], points[movable])
+        found = _Points(points[~movable], points[movable])
+        self._cached = (scan, found)
+        return found
 
 
 def lidar_odometry(scans: Iterable[Scan], config: LidarOdometryConfig | None = None) -> list[RelativeMotion]:

@@ -69,12 +69,10 @@ def _at_rest(motion: RelativeMotion, config: StandingConfig) -> bool:
         return False
     twist = motion.mean_twist
     turn, speed = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
+    if speed >= config.max_speed_mps or turn >= config.max_turn_radps:
+        return False
     sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / motion.seconds
-    return (
-        speed < config.max_speed_mps
-        and turn < config.max_turn_radps
-        and speed + config.certainty * sigma < 2.0 * config.max_speed_mps
-    )
+    return speed + config.certainty * sigma < 2.0 * config.max_speed_mps
 
 
 def _run_lengths(flags: NDArray[np.bool_]) -> NDArray[np.int64]:

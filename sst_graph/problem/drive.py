@@ -53,7 +53,8 @@ class ScanFeatures:
         stamp_ns: LiDAR-clock stamp.
         boundaries: boundary points of each class.
         lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
-        depth_lPs, depth_offsets_s: points for depth of image features (all classes) [m], [s].
+        depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
+            features are not tracked [m], [s].
     """
 
     index: int
@@ -157,7 +158,10 @@ def scan_features(
     """Boundaries of a scan and a sample of its points."""
     offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
     chosen = _sample(scan, config.sample_points)
-    depth = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)[:: max(1, len(scan.points) // 30_000)]
+    depth = np.zeros(0, dtype=np.intp)
+    if config.use_visual_odometry:
+        near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
+        depth = near[:: max(1, len(scan.points) // 30_000)]
     return ScanFeatures(
         index,
         scan.stamp_ns,

@@ -207,7 +207,7 @@ def test_a_step_raises_the_alarm_and_is_learnt(
     street: SimulatedDrive, frames: list[Frame], kind: str
 ) -> None:
     """The camera is knocked, or its clock jumps: noticed within ten frames, though little is known yet."""
-    tracker = _tracker(street, dataclasses.replace(CONFIG, alarm=AlarmConfig(warm_up=4, chi2=25.0)))
+    tracker = _tracker(street, dataclasses.replace(CONFIG, alarm=AlarmConfig(warm_up=4)))
     alarms = []
     for frame in frames:
         image = frame.image
