@@ -30,6 +30,7 @@ class Edge(IntEnum):
 
     SIDE = 0
     TOP = 1
+    BOTTOM = 2
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,9 @@ class BoundaryConfig:
         max_elevation_gap_deg: largest gap between neighbouring rings [deg].
         max_range_m: farthest object [m].
         min_points: objects with fewer points are left out.
+        bottom_edges: find edges towards the ground too. They sharpen roll and height where both sides
+            label the underside alike; hand-drawn outlines often cover the gaps between the wheels.
+        ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
         max_slope_m: most that the range is carried on from the last return to the edge [m].
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
@@ -53,6 +57,8 @@ class BoundaryConfig:
     max_elevation_gap_deg: float = 0.9
     max_range_m: float = 60.0
     min_points: int = 15
+    bottom_edges: bool = False
+    ground_margin_m: float = 0.3
     max_slope_m: float = 1.0
     cell_m: float = 0.3
 
@@ -108,8 +114,10 @@ def find_boundaries(
         parts = [
             _side_edges(points, mask, beams, config, +1),
             _side_edges(points, mask, beams, config, -1),
-            _top_edges(points, mask, beams, config),
+            _ring_edges(points, mask, beams, config),
         ]
+        if config.bottom_edges:
+            parts.append(_ring_edges(points, mask, beams, config, _ground_heights(points, objects)))
         found[c] = _collect(parts, offsets, objects, config)
     return {c: b for c, b in found.items() if len(b)}
 
@@ -165,27 +173,55 @@ def _turn(points: FloatArray, angle: float) -> FloatArray:
     return np.stack([c * x - s * y, s * x + c * y, points[:, 2]], axis=1)
 
 
-def _top_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config: BoundaryConfig) -> _Edges:
+def _ring_edges(
+    points: FloatArray,
+    mask: NDArray[np.bool_],
+    beams: Beams,
+    config: BoundaryConfig,
+    ground: FloatArray | None = None,
+) -> _Edges:
     """Edges towards the ring above: half way, at the object's range, to that ring's cone.
 
-    The one return of the ring above that is nearest in azimuth decides. To ask two of them to miss the
-    object would prefer edges far below that ring, and so lift the mean by a tenth of the gap.
+    The one return of that ring that is nearest in azimuth decides. To ask two of them to miss the
+    object would prefer edges far from that ring, and so shift the mean by a tenth of the gap.
+
+    With the height (n,) [m] of the ground that each point's object stands on, edges towards the ring
+    below: the object ends where that ring meets the ground, no matter how far before or behind.
     """
-    i = np.flatnonzero(mask & (beams.ring + 1 < len(beams.height)))
-    above, near = _nearest_in_ring(beams, i, beams.ring[i] + 1)
-    ok = near & ~mask[above] & _is_behind(beams.rho, i, above, config)
-    i, above = i[ok], above[ok]
-    rho, tip = beams.rho[i], beams.height[beams.ring[i] + 1]
-    rise = (tip + (points[above, 2] - tip) * rho / beams.rho[above] - points[i, 2]) / rho
-    ok = (rise > 0.0) & (rise < np.radians(config.max_elevation_gap_deg))
+    up = 1 if ground is None else -1
+    ring = beams.ring + up
+    i = np.flatnonzero(mask & (ring >= 0) & (ring < len(beams.height)))
+    following, near = _nearest_in_ring(beams, i, ring[i])
+    ok = near & ~mask[following]
+    if ground is None:
+        ok &= _is_behind(beams.rho, i, following, config)
+    else:
+        ok &= points[following, 2] < ground[i] + config.ground_margin_m
+    i, following = i[ok], following[ok]
+    rho, tip = beams.rho[i], beams.height[ring[i]]
+    rise = (tip + (points[following, 2] - tip) * rho / beams.rho[following] - points[i, 2]) / rho
+    ok = (up * rise > 0.0) & (up * rise < np.radians(config.max_elevation_gap_deg))
     i, rise = i[ok], rise[ok]
-    below, known = _nearest_in_ring(beams, i, beams.ring[i] - 1)
-    edge = _carried_on(points[i], beams.rho[i], beams.rho[below], known & mask[below], config)
+    before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
+    edge = _carried_on(points[i], beams.rho[i], beams.rho[before], known & mask[before], config)
     half = 0.5 * rise * np.hypot(edge[:, 0], edge[:, 1])
     lPs, outward = edge.copy(), edge.copy()
     lPs[:, 2] += half
     outward[:, 2] += 3.0 * half
-    return _Edges(i, lPs, outward, Edge.TOP)
+    return _Edges(i, lPs, outward, Edge.TOP if up > 0 else Edge.BOTTOM)
+
+
+def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:
+    """(n,) height of the lowest points of each point's object [m], few stray ones aside; -inf without one."""
+    heights = np.full(len(points), -np.inf)
+    some = np.flatnonzero(objects >= 0)
+    order = some[np.lexsort((points[some, 2], objects[some]))]
+    if len(order) == 0:
+        return heights
+    _, first, counts = np.unique(objects[order], return_index=True, return_counts=True)
+    lowest = points[order[first + (0.03 * counts).astype(np.intp)], 2]
+    heights[order] = np.repeat(lowest, counts)
+    return heights
 
 
 def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:

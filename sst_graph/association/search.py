@@ -63,7 +63,7 @@ class SearchConfig:
     free_translation_m: float = 2.0
     delay_s: float = 0.5
     blurs_px: tuple[float, ...] = (45.0, 22.0, 10.0, 4.0)
-    candidates: tuple[int, ...] = (40, 20, 10, 5)
+    candidates: tuple[int, ...] = (80, 40, 20, 12)
     free_breadth: int = 4
     shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
     population: int = 64

@@ -19,6 +19,11 @@ from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
+SIDES = 4
+"""An object has a left, a right, a top and a bottom side."""
+_SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
+"""Side by kind of edge and whether the way out of the object runs to the right."""
+
 
 @dataclass(frozen=True)
 class MatchConfig:
@@ -55,14 +60,16 @@ class SilhouetteMatches:
     Attributes:
         alignment: the frozen matches.
         objects: (n,) object of each match, within its scan.
-        sides: (n,) 0 left, 1 right, 2 top: which side of the object the match lies on.
+        sides: (n,) 0 left, 1 right, 2 top, 3 bottom: which side of the object the match lies on.
         index: (n,) which boundary point each match is.
+        seen: how many boundary points fall into the image, matched or not.
     """
 
     alignment: Alignment
     objects: NDArray[np.intp]
     sides: NDArray[np.intp]
     index: NDArray[np.intp]
+    seen: int
 
     def __len__(self) -> int:
         return len(self.alignment)
@@ -98,14 +105,13 @@ def match_silhouettes(
         cosine = (way * feet.normals).sum(axis=1)
         residuals = feet.distances + biases_px.get(c, 0.0)
         ok = feet.valid & (cosine > config.min_cosine) & (np.abs(residuals) < config.gate * kernel.scale)
-        if not config.top_edges:
-            ok &= points.edges != Edge.TOP
-        index = np.flatnonzero(ok)
+        used = np.full(len(ok), True) if config.top_edges else points.edges != Edge.TOP
+        index = np.flatnonzero(ok & used)
         if len(index) == 0:
             continue
         beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
         sigmas = np.hypot(config.mask_sigma_px, beam_sigma)
-        sides = np.where(points.edges[index] == Edge.TOP, 2, (way[index, 0] > 0).astype(np.intp))
+        sides = _SIDE_OF[points.edges[index], (way[index, 0] > 0).astype(np.intp)]
         alignment = Alignment(
             camera=camera,
             lPs=points.lPs[index],
@@ -115,9 +121,10 @@ def match_silhouettes(
             normals=feet.normals[index],
             kernel=kernel,
             c_acceleration=motion.c_acceleration,
-            weights=_shared_weights(points.objects[index] * 3 + sides, sigmas, config.side_sigma_px),
+            weights=_shared_weights(points.objects[index] * SIDES + sides, sigmas, config.side_sigma_px),
         )
-        found[c] = SilhouetteMatches(alignment, points.objects[index], sides, index)
+        seen = np.count_nonzero(used & camera.in_image(uvs))
+        found[c] = SilhouetteMatches(alignment, points.objects[index], sides, index, int(seen))
     return found
 
 

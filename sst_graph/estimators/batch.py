@@ -16,7 +16,7 @@ from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, solve_joint, support
+from sst_graph.estimators.joint import JointSolution, agreement, solve_joint
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
 from sst_graph.estimators.start import find_start
@@ -119,7 +119,7 @@ def answer_joint(
     objects = [object_tracks(drive) for drive in drives]
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
-    solution = max(_finals(drives, tracks, contest, guess, config, progress), key=support)
+    solution = max(_finals(drives, tracks, contest, guess, config, progress), key=agreement)
     # 4. What the motion alone says, where it is asked.
     heard = WithMotion(solution)
     if config.use_motion:

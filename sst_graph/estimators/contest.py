@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.association.search import Candidate
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint, support
+from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
 from sst_graph.estimators.start import StartConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
@@ -57,48 +57,33 @@ def hold_contest(
         State(candidate.cTl, (candidate.offset_s,))
         for candidate in _with_offsets(candidates[:contenders], guess_offset_s)
     ]
-    solutions: list[JointSolution] = []
-    for heat in _heats(joint):
-        solutions, failures = [], []
-        for start in starts:
-            centre = prior_centre(start, guess_cTl, guess_offset_s)
-            try:
-                solution = solve_joint(few, start, heat, None, centre, tracks)
-            except EstimationError as error:
-                failures.append(error)
-                continue
-            if _is_within(solution, guess_cTl, config):
-                solutions.append(solution)
-        if not solutions:
-            raise (
-                failures[0] if failures else EstimationError("no candidate of the search leads to a solution")
-            )
-        solutions.sort(key=support, reverse=True)
+    for heat in _heats(_simple(joint)):
+        contestants = [(start, prior_centre(start, guess_cTl, guess_offset_s)) for start in starts]
+        solutions = _solve_all(few, contestants, heat, tracks)
         starts = _survivors(solutions, config)
+    solutions = [solution for solution in solutions if _is_within(solution, guess_cTl, config)]
+    if not solutions:
+        raise EstimationError("no candidate of the search leads to a solution near the guess")
     return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config))
 
 
-def _heats(joint: JointConfig) -> list[JointConfig]:
-    """Settings of the two rounds: the wide kernels for all, the narrow ones for those that are left."""
-    simple = replace(
-        joint,
-        graph=replace(joint.graph, object_bias_sigma_px=0.0),
-        min_matches=1,
-        inner_iterations=min(2, joint.inner_iterations),
-    )
-    half = (len(joint.kernel_px) + 1) // 2
-    wide = replace(simple, kernel_px=joint.kernel_px[:half], max_outer=min(half, joint.max_outer))
-    return [wide, replace(simple, kernel_px=joint.kernel_px[half:] or joint.kernel_px[-1:])]
+def _solve_all(
+    drives: Sequence[Drive], starts: Sequence[tuple[State, State]], joint: JointConfig, tracks: Tracks
+) -> list[JointSolution]:
+    """Solutions from (start, what the weak priors are centred on), the best supported first.
 
-
-def _survivors(solutions: Sequence[JointSolution], config: StartConfig) -> list[State]:
-    """Where solutions ended that differ and that enough matches support, the best first."""
-    least = config.survivor_ratio * support(solutions[0])
-    kept: list[State] = []
-    for solution in solutions:
-        if support(solution) >= least and not any(_alike(solution.state, s, 3.0) for s in kept):
-            kept.append(solution.state)
-    return kept
+    Raises:
+        EstimationError: none leads anywhere.
+    """
+    solutions, failures = [], []
+    for start, centre in starts:
+        try:
+            solutions.append(solve_joint(drives, start, joint, None, centre, tracks))
+        except EstimationError as error:
+            failures.append(error)
+    if not solutions:
+        raise failures[0]
+    return sorted(solutions, key=agreement, reverse=True)
 
 
 def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
@@ -107,6 +92,28 @@ def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> lis
         return list(candidates)
     others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
     return [*candidates, *others]
+
+
+def _simple(joint: JointConfig) -> JointConfig:
+    """Settings good enough to compare with: one mask bias a class."""
+    return replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
+
+
+def _heats(joint: JointConfig) -> list[JointConfig]:
+    """Two kernels a heat while they are wide, the rest in the last one."""
+    kernels, half = joint.kernel_px, (len(joint.kernel_px) + 1) // 2
+    wide = [kernels[i : min(i + 2, half)] for i in range(0, half, 2)]
+    heats = [replace(joint, kernel_px=some, max_outer=len(some)) for some in wide]
+    return [*heats, replace(joint, kernel_px=kernels[half:] or kernels[-1:])]
+
+
+def _survivors(solutions: Sequence[JointSolution], config: StartConfig) -> list[State]:
+    """The better half of what differs; ``config.survivors`` or more."""
+    kept: list[State] = []
+    for solution in solutions:
+        if not any(_alike(solution.state, state, 3.0) for state in kept):
+            kept.append(solution.state)
+    return kept[: max(config.survivors, (len(solutions) + 1) // 2)]
 
 
 def _finalists(solutions: Sequence[JointSolution], most: int) -> tuple[tuple[gtsam.Pose3, float], ...]:
@@ -155,9 +162,10 @@ def _doubt(solutions: Sequence[JointSolution], config: StartConfig) -> str | Non
     for other in others:
         turn = best.state.cTl.between(other.state.cTl).rotation()
         degrees = float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turn))))
-        if degrees > _SAME_DEG and support(other) > config.rival_ratio * support(best):
+        share = agreement(other) / max(agreement(best), 1e-9)
+        if degrees > _SAME_DEG and share > config.rival_ratio:
             return (
-                f"a pose {degrees:.0f} deg away explains the labels almost as well ({support(other):.0f} "
-                f"against {support(best):.0f} matches): record more varied scenes or give a closer guess"
+                f"a pose {degrees:.0f} deg away explains the labels almost as well (score {share:.2f} of the "
+                "best one's): record more varied scenes or give a closer guess"
             )
     return None

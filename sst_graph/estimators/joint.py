@@ -138,6 +138,16 @@ def support(solution: JointSolution) -> float:
     return total
 
 
+def agreement(solution: JointSolution) -> float:
+    """How well a solution explains what it sees: its :func:`support` times the share of the boundary
+    points in the image that it stands for.
+
+    The support alone prefers poses that bring many objects into view.
+    """
+    seen = sum(matches.seen for pair in solution.pairs for matches in pair.matches.values())
+    return support(solution) ** 2 / max(1, seen)
+
+
 def _check_matches(pairs: Sequence[PairMatches], config: JointConfig) -> None:
     matches = sum(len(pair) for pair in pairs)
     if matches < config.min_matches:

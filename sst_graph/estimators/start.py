@@ -31,20 +31,19 @@ class StartConfig:
             a guess.
         finalists: most different solutions of the contest that are solved on all frames.
         contest_scans: scans of each drive that they are compared on.
-        survivor_ratio: solutions under the wide kernels that this fraction of the best one's matches
-            supports go on to the narrow ones.
-        rival_ratio: a different solution that at least this fraction of the best one's matches supports
-            makes the answer ambiguous.
+        survivors: fewest different solutions that go on from one heat of the contest to the next.
+        rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
+            best one's makes the answer ambiguous.
         min_class_points: fewest points of the searched classes that make a frame worth looking at.
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
     enabled: bool = True
-    contenders: int = 8
-    free_contenders: int = 12
+    contenders: int = 16
+    free_contenders: int = 48
     finalists: int = 2
     contest_scans: int = 10
-    survivor_ratio: float = 0.6
+    survivors: int = 3
     rival_ratio: float = 0.9
     min_class_points: int = 30
 

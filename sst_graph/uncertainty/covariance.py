@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.alignment import weighted_residuals
+from sst_graph.association.silhouettes import SIDES
 from sst_graph.problem.graph import PairMatches, bias_groups, tracked_objects
 from sst_graph.problem.objects import ObjectId
 from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key
@@ -95,7 +96,7 @@ def match_table(
             weights.append(root)
             residuals.append(r)
             track = [tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects]
-            side = (np.array(track) * 3 + matches.sides) * 64 + pair.drive
+            side = (np.array(track) * SIDES + matches.sides) * 64 + pair.drive
             sides.append(side)
             frames.append(side + number * 1_000_000_000)
     return MatchTable(
