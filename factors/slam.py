@@ -20,7 +20,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import FrameResidual, frame_residual
+from .alignment import FrameResidual, GroupedBias, frame_residual
 from .condensed import condense, cost_rows
 from .custom import custom_factor
 from .errors import FactorError, checked_positive
@@ -40,7 +40,7 @@ def pose_alignment_factor(
     *,
     X_scan: int | None = None,
     bTl: gtsam.Pose3 | None = None,
-    biases_px: Sequence[int | float | None] | int | float | None = None,
+    biases_px: Sequence[int | float | GroupedBias | None] | int | float | GroupedBias | None = None,
     image_after_middle_s: float | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, drives, motion, paper_table
+from sst_graph.experiments import accuracy, drives, motion, paper_table, slam
 from sst_graph.problem.drive import Progress
 
 
@@ -46,6 +46,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
         paper_table.PaperTableConfig(),
         paper_table.run,
+    ),
+    "slam": Experiment(
+        "SLAM and calibration in one graph against either alone, on simulated streets",
+        slam.SlamConfig(),
+        slam.run,
     ),
 }
 

@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig, lidar_odometry
+from sst_graph.odometry.registration import (
+    LoopClosure,
+    LoopConfig,
+    RegisteredScan,
+    RegistrationConfig,
+    loop_closures,
+    scan_to_scan,
+)
 from sst_graph.odometry.standing import StandingConfig, standing_frames
 from sst_graph.odometry.visual import (
     ImagePair,
@@ -17,12 +25,18 @@ __all__ = [
     "ImagePair",
     "LidarOdometry",
     "LidarOdometryConfig",
+    "LoopClosure",
+    "LoopConfig",
+    "RegisteredScan",
+    "RegistrationConfig",
     "StandingConfig",
     "VisualOdometry",
     "VisualOdometryConfig",
     "image_pairs",
     "lidar_odometry",
+    "loop_closures",
     "metric_motions",
+    "scan_to_scan",
     "standing_frames",
     "visual_odometry",
 ]

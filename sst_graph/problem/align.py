@@ -38,10 +38,13 @@ class FrameAlignments:
     Attributes:
         classes: semantic class of each alignment, for the keys of their mask biases.
         alignments: for :func:`factors.frame_factor` or :func:`factors.pose_alignment_factor`.
+        objects: of each alignment, (n,) number of the object within its scan that each match lies on, for
+            mask biases by object (:class:`factors.GroupedBias`).
     """
 
     classes: tuple[SemanticClass, ...]
     alignments: tuple[Alignment, ...]
+    objects: tuple[NDArray[np.intp], ...]
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -105,7 +108,11 @@ def align_frame(
         kernel,
         config,
     )
-    return FrameAlignments(tuple(found), tuple(matches.alignment for matches in found.values()))
+    return FrameAlignments(
+        tuple(found),
+        tuple(matches.alignment for matches in found.values()),
+        tuple(matches.objects for matches in found.values()),
+    )
 
 
 def _camera_motion(cTl: gtsam.Pose3, l_twist: ArrayLike, l_acceleration: ArrayLike | None) -> Motion:

@@ -107,8 +107,9 @@ def speed_profile(config: SimulationConfig, t: FloatArray) -> FloatArray:
     if config.motion == "turning":
         return _smoothed(v * (0.75 + 0.1 * np.sin(2 * np.pi * t / 7.0)))
     if config.motion == "there_and_back":
-        knots, speeds = [0, 0.05, 0.2, 0.3, 0.47, 0.53, 0.7, 0.8, 0.95, 1], [0, 0, 1, 1, 0, 0, -1, -1, 0, 0]
-        return _smoothed(min(v, 0.6 * duration) * np.interp(t / duration, knots, speeds))
+        ends = [0.05, 0.2, 0.3, 0.47, 0.53, 0.7, 0.8, 0.95]
+        ways = [0, 1, 1, 0, 0, -1, -1, 0]
+        return _smoothed(min(v, 0.6 * duration) * np.interp(t / duration, ends, ways))
     if config.motion == "no_stop":
         return _smoothed(v * (0.85 + 0.35 * np.sign(np.sin(2 * np.pi * (t + 0.4) / 5.0)) * _ramp(t, 5.0)))
     cycle = duration if config.motion == "mixed" and duration < 14.0 else 12.0

@@ -1,0 +1,223 @@
+"""Pose3 SLAM and calibration in one graph against either alone, on simulated streets.
+
+The vehicle drives forward and returns in reverse. LiDAR odometry from scan to scan and loop closures by
+scan registration make a pose graph; silhouettes (:func:`factors.pose_alignment_factor`) and visual odometry
+(:func:`factors.camera_motion_factor`) join the camera to it through extrinsic and time offset.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.errors import ConfigError
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.experiments.slam_graph import (
+    DELAY,
+    EXTRINSIC,
+    CameraGraphConfig,
+    pose_graph,
+    pose_key,
+    with_camera,
+)
+from sst_graph.odometry import LoopConfig, RegisteredScan, RegistrationConfig, loop_closures, scan_to_scan
+from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.types import Frame
+
+FloatArray = NDArray[np.float64]
+
+WEATHERS: Mapping[str, Mapping[str, Any]] = {
+    "fog": {"max_range_m": 20.0, "range_noise_m": 0.08, "drop_out": 0.5},
+    "clear": {},
+}
+"""What the LiDAR suffers, by name: changes to the simulator's settings."""
+ROWS = ("odometry", "SLAM alone", "calibration alone", "both")
+MEASURES = {
+    "position [cm]": 3,
+    "step rotation [deg]": 4,
+    "step translation [cm]": 3,
+    "rotation [deg]": 4,
+    "translation [cm]": 3,
+    "delay [ms]": 3,
+}
+"""Errors, the trajectory's first, and the digits that the table shows."""
+
+
+@dataclass(frozen=True)
+class SlamConfig:
+    """Streets and settings.
+
+    Attributes:
+        streets: number of simulated streets of each weather.
+        seed: of the first street; the next ones follow.
+        weathers: names; all of them by default.
+        frames: of each drive.
+        delay_s: true time offset [s].
+        street: further settings of the simulator.
+        registration, loops: LiDAR odometry and loop closures.
+        camera: what the camera adds to the pose graph.
+        calibration: of the calibration alone, from whose answer both together start.
+    """
+
+    streets: int = 5
+    seed: int = 1
+    weathers: tuple[str, ...] = tuple(WEATHERS)
+    frames: int = 60
+    delay_s: float = 0.05
+    street: SimulationConfig = field(
+        default_factory=lambda: SimulationConfig(
+            width=621,
+            height=188,
+            motion="there_and_back",
+            speed_mps=6.0,
+            azimuth_step_deg=0.4,
+            vehicle_density=0.25,
+            moving_fraction=0.0,
+        )
+    )
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    loops: LoopConfig = field(default_factory=LoopConfig)
+    camera: CameraGraphConfig = field(default_factory=CameraGraphConfig)
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.weathers if name not in WEATHERS]
+        if unknown or not self.weathers or self.streets < 1:
+            found = f"{unknown or 'none'} and {self.streets} streets"
+            raise ConfigError(f"weathers: found {found}, expected some of {', '.join(WEATHERS)} and streets")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A drive held in memory (satisfies :class:`sst_graph.types.Source`), for two passes."""
+
+    source: SimulatedDrive
+    frames: tuple[Frame, ...]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.source, name)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, position: int) -> Frame:
+        return self.frames[position]
+
+
+@dataclass(frozen=True)
+class Street:
+    """One street's outcome.
+
+    Attributes:
+        weather, seed: which.
+        closures: number of loop closures.
+        errors: of each of :data:`ROWS`, by the names of :data:`MEASURES`; those that apply.
+    """
+
+    weather: str
+    seed: int
+    closures: int
+    errors: Mapping[str, Mapping[str, float]]
+
+
+def run(config: SlamConfig, progress: Progress | None = None) -> str:
+    """Medians over the streets as a Markdown table, and how often both together are better."""
+    streets: list[Street] = []
+    for weather in config.weathers:
+        for number in range(config.streets):
+            streets.append(solve_street(config, weather, config.seed + number))
+            if progress is not None:
+                progress(weather, number + 1, config.streets)
+    return markdown(config, streets)
+
+
+def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
+    """SLAM alone, calibration alone, and both, on one street."""
+    street = dataclasses.replace(config.street, seed=seed, frames=config.frames, **WEATHERS[weather])
+    source = simulate(dataclasses.replace(street, time_offset_s=config.delay_s))
+    frames = tuple(source)
+    drive = prepare_drive(Recording(source, frames), config.calibration.classes, config.calibration.prepare)
+    scans = [RegisteredScan(frame.scan, config.registration) for frame in frames if frame.scan is not None]
+    # 1. SLAM alone: LiDAR odometry, loop closures.
+    graph, odometry = pose_graph(scan_to_scan(scans))
+    poses = [odometry.atPose3(pose_key(k)) for k in range(len(scans))]
+    closures = loop_closures(scans, poses, config.loops)
+    graph, _ = pose_graph(scan_to_scan(scans), closures)
+    slam = gtsam.LevenbergMarquardtOptimizer(graph, odometry).optimize()
+    # 2. Calibration alone.
+    alone = calibrate_prepared([drive], source.nominal, config.calibration)
+    # 3. Both in one graph.
+    start = alone.T_camera_lidar, alone.time_offset_s
+    both = with_camera(graph, slam, drive, start, source.nominal, config.camera)
+    found = both.atPose3(EXTRINSIC), float(both.atVector(DELAY)[0])
+    errors = {
+        "odometry": trajectory_errors(odometry, source),
+        "SLAM alone": trajectory_errors(slam, source),
+        "calibration alone": calibration_errors(*start, source),
+        "both": trajectory_errors(both, source) | calibration_errors(*found, source),
+    }
+    return Street(weather, seed, len(closures), errors)
+
+
+def trajectory_errors(values: gtsam.Values, source: SimulatedDrive) -> dict[str, float]:
+    """RMS errors of the positions, the first pose held, and of the motions from scan to scan."""
+    true = [source.wTl(stamp * 1e-9) for stamp in source.stamps_ns]
+    true = [true[0].between(pose) for pose in true]
+    found = [values.atPose3(pose_key(k)) for k in range(len(true))]
+    off = [f.translation() - t.translation() for f, t in zip(found, true, strict=True)]
+    steps = np.array(
+        [
+            true[k].between(true[k + 1]).localCoordinates(found[k].between(found[k + 1]))
+            for k in range(len(true) - 1)
+        ]
+    )
+    sizes = 100.0 * _rms(off), np.degrees(_rms(steps[:, :3])), 100.0 * _rms(steps[:, 3:])
+    return dict(zip(list(MEASURES)[:3], map(float, sizes), strict=True))
+
+
+def calibration_errors(cTl: gtsam.Pose3, offset_s: float, source: SimulatedDrive) -> dict[str, float]:
+    """Sizes of the errors of extrinsic and time offset."""
+    d = source.truth.cTl.localCoordinates(cTl)
+    sizes = (
+        np.degrees(np.linalg.norm(d[:3])),
+        100.0 * np.linalg.norm(d[3:]),
+        1e3 * abs(offset_s - source.config.time_offset_s),
+    )
+    return dict(zip(list(MEASURES)[3:], map(float, sizes), strict=True))
+
+
+def markdown(config: SlamConfig, streets: Sequence[Street]) -> str:
+    """The table: a row for each weather and way, and one of how often both together are better."""
+    rows = ["| weather | | " + " | ".join(MEASURES) + " |", "|---" * (2 + len(MEASURES)) + "|"]
+    for weather in config.weathers:
+        chosen = [street for street in streets if street.weather == weather]
+        for row in ROWS:
+            cells = [_median(chosen, row, name, digits) for name, digits in MEASURES.items()]
+            rows.append(" | ".join([f"| {weather}", row, *cells]) + " |")
+        cells = [_better(chosen, name) for name in MEASURES]
+        rows.append(" | ".join([f"| {weather}", "both better", *cells]) + " |")
+    return "\n".join(rows) + "\n"
+
+
+def _median(streets: Sequence[Street], row: str, name: str, digits: int) -> str:
+    values = [street.errors[row][name] for street in streets if name in street.errors[row]]
+    return f"{np.median(values):.{digits - 1}f}" if values else ""
+
+
+def _better(streets: Sequence[Street], name: str) -> str:
+    """In how many streets both together have the smaller error than the one alone that tells it."""
+    alone = "SLAM alone" if name in list(MEASURES)[:3] else "calibration alone"
+    count = sum(street.errors["both"][name] < street.errors[alone][name] for street in streets)
+    return f"{count} of {len(streets)}"
+
+
+def _rms(vectors: Any) -> float:
+    """Root of the mean squared length of vectors (n, d)."""
+    return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=1))))

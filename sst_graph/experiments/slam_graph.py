@@ -1,0 +1,269 @@
+"""The graph of :mod:`sst_graph.experiments.slam`: a pose graph, and what the camera adds to it."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors import (
+    Between,
+    GroupedBias,
+    RobustKernel,
+    camera_motion_factor,
+    delay_prior,
+    pose_alignment_factor,
+)
+from sst_graph.association.silhouettes import MatchConfig
+from sst_graph.odometry import LoopClosure, metric_motions
+from sst_graph.problem.align import align_frame
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.objects import ObjectId, object_tracks
+from sst_graph.problem.trajectory import TwistTrack
+from sst_graph.types import RelativeMotion, SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+EXTRINSIC, DELAY, BIAS = (int(gtsam.symbol(letter, 0)) for letter in "EDB")
+"""Keys of the extrinsic, the time offset and the vehicles' common mask bias."""
+VEHICLE = SemanticClass.VEHICLE
+
+
+@dataclass(frozen=True)
+class CameraGraphConfig:
+    """What the camera adds to a pose graph.
+
+    Attributes:
+        kernel_px: scales of the silhouettes' robust kernel, one for each renewal of the matches [px].
+        match: how boundary points meet contours.
+        bias_sigma_px: prior deviation of the mask bias from 0 [px].
+        object_bias_sigma_px: deviation of an object's mask bias from the common one [px].
+        nominal_rad, nominal_m: prior deviation of the extrinsic from the nominal one [rad], [m].
+        delay_sigma_s: prior deviation of the time offset from 0 [s].
+        between_rad, between_m: how far the body's motion is from one twist between two poses [rad], [m];
+            added to the sigmas of visual odometry.
+        silhouettes, visual_odometry: which of the camera's factors there are.
+    """
+
+    kernel_px: tuple[float, ...] = (5.0, 4.0, 3.0, 3.0, 3.0)
+    match: MatchConfig = field(default_factory=MatchConfig)
+    bias_sigma_px: float = 3.0
+    object_bias_sigma_px: float = 0.5
+    nominal_rad: float = 0.2
+    nominal_m: float = 0.5
+    delay_sigma_s: float = 1.0
+    between_rad: float = 3.5e-4
+    between_m: float = 4e-3
+    silhouettes: bool = True
+    visual_odometry: bool = True
+
+
+def pose_key(scan: int) -> int:
+    """Key of wTl at a scan."""
+    return int(gtsam.symbol("X", scan))
+
+
+def pose_graph(
+    motions: Sequence[RelativeMotion], closures: Sequence[LoopClosure] = ()
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """Odometry and loop closures on the LiDAR's poses, the first held at the origin; the odometry's poses."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    held = gtsam.noiseModel.Isotropic.Sigma(6, 1e-4)
+    graph.add(gtsam.PriorFactorPose3(pose_key(0), gtsam.Pose3(), held))
+    values.insert(pose_key(0), gtsam.Pose3())
+    for k, motion in enumerate(motions):
+        noise = gtsam.noiseModel.Gaussian.Covariance(motion.covariance)
+        graph.add(gtsam.BetweenFactorPose3(pose_key(k), pose_key(k + 1), motion.aTb, noise))
+        values.insert(pose_key(k + 1), values.atPose3(pose_key(k)) * motion.aTb)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(1.5)
+    for closure in closures:
+        noise = gtsam.noiseModel.Gaussian.Covariance(closure.motion.covariance)
+        robust = gtsam.noiseModel.Robust.Create(huber, noise)
+        ends = pose_key(closure.first), pose_key(closure.second)
+        graph.add(gtsam.BetweenFactorPose3(*ends, closure.motion.aTb, robust))
+    return graph, values
+
+
+def with_camera(
+    graph: gtsam.NonlinearFactorGraph,
+    poses: gtsam.Values,
+    drive: Drive,
+    start: tuple[gtsam.Pose3, float],
+    nominal: gtsam.Pose3,
+    config: CameraGraphConfig,
+) -> gtsam.Values:
+    """Poses, extrinsic and time offset together: match, optimise, match again under a narrower kernel.
+
+    Args:
+        graph, poses: :func:`pose_graph`, and where its poses are.
+        drive: of the same scans; poses and scans correspond one to one.
+        start: extrinsic and time offset [s] where the first matches are made.
+        nominal: what the weak prior on the extrinsic is centred on.
+        config: settings.
+    """
+    tracks = object_tracks(drive)
+    values = gtsam.Values(poses)
+    values.insert(EXTRINSIC, start[0])
+    values.insert(DELAY, np.array([start[1]]))
+    values.insert(BIAS, np.zeros(1))
+    for kernel_px in config.kernel_px:
+        places = _places(drive, values)
+        whole = gtsam.NonlinearFactorGraph(graph)
+        _add_priors(whole, nominal, config)
+        if config.silhouettes:
+            values = _add_silhouettes(whole, values, drive, places, tracks, kernel_px, config)
+        if config.visual_odometry:
+            _add_visual_odometry(whole, values, drive, places, config)
+        values = gtsam.LevenbergMarquardtOptimizer(whole, values).optimize()
+    return values
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an image falls in the trajectory.
+
+    Attributes:
+        scan: position of the scan before it.
+        between: the poses around it.
+        twist, acceleration: (6,) of the LiDAR at its instant [rad/s, m/s], [rad/s^2, m/s^2].
+    """
+
+    scan: int
+    between: Between
+    twist: FloatArray
+    acceleration: FloatArray
+
+    @property
+    def image_after_middle_s(self) -> float:
+        return self.between.image_after_a_s - 0.5 * self.between.seconds
+
+
+def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
+    """Every image's place under the present estimate."""
+    stamps = drive.scan_stamps_ns
+    poses = [values.atPose3(pose_key(k)) for k in range(len(stamps))]
+    motions = [
+        RelativeMotion(stamps[k], stamps[k + 1], a.between(b), np.eye(6))
+        for k, (a, b) in enumerate(itertools.pairwise(poses))
+    ]
+    track, offset_ns = TwistTrack(motions), round(1e9 * float(values.atVector(DELAY)[0]))
+    places = []
+    for stamp_ns in drive.image_stamps_ns:
+        true_ns = stamp_ns + offset_ns
+        scan = int(np.clip(np.searchsorted(stamps, true_ns, "right") - 1, 0, len(stamps) - 2))
+        seconds = (stamps[scan + 1] - stamps[scan]) * 1e-9
+        between = Between(pose_key(scan), pose_key(scan + 1), seconds, (stamp_ns - stamps[scan]) * 1e-9)
+        sample = track.at(true_ns)
+        places.append(_Place(scan, between, sample.twist, sample.acceleration))
+    return places
+
+
+def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config: CameraGraphConfig) -> None:
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([config.nominal_rad, config.nominal_m], 3))
+    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, nominal, noise))
+    graph.add(delay_prior(DELAY, 0.0, config.delay_sigma_s))
+    graph.add(delay_prior(BIAS, 0.0, config.bias_sigma_px))
+
+
+def _add_silhouettes(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    drive: Drive,
+    places: Sequence[_Place],
+    tracks: Mapping[ObjectId, int],
+    kernel_px: float,
+    config: CameraGraphConfig,
+) -> gtsam.Values:
+    """Every image aligned with the scan before it, with a mask bias for each object; the values then."""
+    seen: set[int] = set()
+    for image, place in zip(drive.images, places, strict=True):
+        found = align_frame(
+            drive.scans[place.scan],
+            image,
+            drive.camera,
+            values.atPose3(EXTRINSIC),
+            float(values.atVector(DELAY)[0]),
+            place.twist,
+            l_acceleration=place.acceleration,
+            biases_px={VEHICLE: float(values.atVector(BIAS)[0])},
+            kernel=RobustKernel("geman_mcclure", kernel_px),
+            config=config.match,
+        )
+        if not len(found):
+            continue
+        of_match = [_object_key(tracks[place.scan, VEHICLE, int(number)]) for number in found.objects[0]]
+        keys, groups = np.unique(np.array(of_match, dtype=np.uint64), return_inverse=True)
+        objects = [int(key) for key in keys]
+        seen.update(objects)
+        b = place.between
+        graph.add(
+            pose_alignment_factor(
+                found.alignments,
+                b.X_a,
+                b.X_b,
+                EXTRINSIC,
+                DELAY,
+                b.seconds,
+                biases_px=GroupedBias(tuple(objects), groups),
+                image_after_middle_s=place.image_after_middle_s,
+            )
+        )
+    return _with_object_biases(graph, values, seen, config)
+
+
+def _with_object_biases(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, seen: set[int], config: CameraGraphConfig
+) -> gtsam.Values:
+    """Tie every object's bias to the common one; values of the objects that are seen, and of no other."""
+    kept = gtsam.Values(values)
+    letter = gtsam.Symbol(_object_key(0)).chr()
+    for key in values.keys():  # noqa: SIM118  (gtsam, no dict)
+        if gtsam.Symbol(key).chr() == letter and key not in seen:
+            kept.erase(key)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, config.object_bias_sigma_px)
+    for key in sorted(seen):
+        graph.add(gtsam.BetweenFactorVector(BIAS, key, np.zeros(1), noise))
+        if not kept.exists(key):
+            kept.insert(key, values.atVector(BIAS))
+    return kept
+
+
+def _object_key(track: int) -> int:
+    return int(gtsam.symbol("o", track))
+
+
+def _add_visual_odometry(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    drive: Drive,
+    places: Sequence[_Place],
+    config: CameraGraphConfig,
+) -> None:
+    """Motions of the camera, metric by the depth that the present calibration gives to its features."""
+    cTl, offset_s = values.atPose3(EXTRINSIC), float(values.atVector(DELAY)[0])
+
+    def depth(position: int) -> FloatArray:
+        place = places[position]
+        tau = place.between.image_after_a_s + offset_s
+        cTscan = cTl * gtsam.Pose3.Expmap(-tau * place.twist)
+        lPs = drive.scans[place.scan].depth_lPs.astype(np.float64)
+        return np.asarray(cTscan.transformFrom(lPs.T)).T
+
+    motions = metric_motions(drive.image_pairs, drive.camera, depth)
+    between = np.diag(np.repeat([config.between_rad, config.between_m], 3) ** 2)
+    for (first, second), motion in zip(itertools.pairwise(places), motions, strict=True):
+        if motion.ok:
+            graph.add(
+                camera_motion_factor(
+                    first.between,
+                    second.between,
+                    EXTRINSIC,
+                    DELAY,
+                    motion.aTb,
+                    motion.covariance + between,
+                )
+            )
