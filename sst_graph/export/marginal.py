@@ -147,15 +147,28 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
 
 
 def marginal_of_graph(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, E_key: int, D_key: int
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    E_key: int = EXTRINSIC,
+    D_key: int = DELAY,
+    *,
+    at: tuple[gtsam.Pose3, float] | None = None,
 ) -> CalibrationMarginal:
-    """A graph's cost on (E, D), everything else eliminated at the linearization point ``values``.
+    """A graph's cost on (E, D), everything else eliminated.
 
-    Exact to second order; as sure as the graph's noise models say.
+    Exact to second order about its point; as sure as the graph's noise models say.
+
+    Args:
+        graph, values: the problem, and where it is linearized: its optimum, as a rule.
+        E_key, D_key: keys of extrinsic and time offset in it.
+        at: another point of (cTl, offset [s]) to expand about, such as the fused estimate of several
+            drives. Extrinsic and offset are held there, and the other variables optimised.
 
     Raises:
         EstimationError: the other variables are not determined even when E and D are given.
     """
+    if at is not None:
+        values = _others_at(graph, values, E_key, D_key, at)
     others = [key for key in values.keys() if key not in (E_key, D_key)]  # noqa: SIM118  (gtsam, no dict)
     ordering = gtsam.Ordering()
     for key in (E_key, D_key, *others):
@@ -173,6 +186,70 @@ def marginal_of_graph(
         g[:7] - coupling @ g[7:],
         f - float(g[7:] @ inner @ g[7:]),
     )
+
+
+def _others_at(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    E_key: int,
+    D_key: int,
+    at: tuple[gtsam.Pose3, float],
+) -> gtsam.Values:
+    """Values with (E, D) at a point and the others at their optimum given that."""
+    there = gtsam.Values(values)
+    there.update(E_key, at[0])
+    there.update(D_key, np.array([at[1]]))
+    if there.size() == 2:
+        return there
+    held = gtsam.NonlinearFactorGraph(graph)
+    held.add(gtsam.NonlinearEqualityPose3(E_key, at[0]))
+    held.add(gtsam.PriorFactorVector(D_key, np.array([at[1]]), gtsam.noiseModel.Constrained.All(1)))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setAbsoluteErrorTol(0.0)
+    try:
+        return gtsam.LevenbergMarquardtOptimizer(held, there, params).optimize()
+    except RuntimeError as error:
+        raise EstimationError(f"variables to eliminate: not determined ({error})") from error
+
+
+def fuse_graphs(
+    graphs: Sequence[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]],
+    E_key: int = EXTRINSIC,
+    D_key: int = DELAY,
+    *,
+    tolerance_sigmas: float = 1e-4,
+    max_rounds: int = 20,
+) -> tuple[CalibrationMarginal, list[CalibrationMarginal]]:
+    """Drives fused through their marginals until that equals one graph of all of them.
+
+    Marginals taken each at its own drive's optimum miss that by some thousandths to hundredths of a sigma,
+    for no drive's cost is quadratic. So every drive's marginal is taken anew at the fused estimate
+    (:func:`marginal_of_graph` with ``at``), and fused again, until the estimate stands still. Only
+    seven-vectors travel between the drives' machines.
+
+    Args:
+        graphs: each drive's own graph and its values; they share nothing but E and D.
+        E_key, D_key: keys of extrinsic and time offset, the same in all.
+        tolerance_sigmas: the fused estimate stands still when it moves by less [sigma].
+        max_rounds: most rounds.
+
+    Returns:
+        The fused marginal, and those of the drives about the fused estimate.
+
+    Raises:
+        EstimationError: a direction that no drive tells, or no standstill.
+    """
+    parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
+    fused = fuse_marginals(parts)
+    for _ in range(max_rounds):
+        point = fused.cTl, fused.offset_s
+        parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
+        fused = fuse_marginals(parts)
+        step = np.append(fused.cTl.localCoordinates(point[0]), fused.offset_s - point[1])
+        if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
+            return fused, parts
+    raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
 
 
 def fuse_marginals(marginals: Sequence[CalibrationMarginal]) -> CalibrationMarginal:
