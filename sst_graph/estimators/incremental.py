@@ -36,6 +36,8 @@ FloatArray = NDArray[np.float64]
 
 _UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
+_WHOLE_STEPS = 5
+"""Steps under the last kernel before they are shortened."""
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
@@ -283,20 +285,21 @@ class Tracker:
         """Solve the whole window again as the batch does, as at the end of a drive.
 
         The kernel begins wide and narrows: matches made frame by frame hold the estimate within a standard
-        deviation or two of where the batch would end.
+        deviation or two of where the batch would end. Where matches come and go in turn, so that the
+        estimate goes round in a circle, the steps are shortened and end in the middle of it.
 
         Returns:
-            Whether it rests: the last step was below 0.02 standard deviations.
+            Whether it rests: the last whole step was below 0.02 standard deviations.
         """
         smoother = self.smoother
         if smoother is None:
             return False
+        self.window.judge_all()
         scales = self.config.calibration.joint.kernel_px
-        for scale in (*scales, *[scales[-1]] * most):
-            before = smoother.point
+        at = smoother.point
+        for i, scale in enumerate((*scales, *[scales[-1]] * most)):
             kernel = RobustKernel("geman_mcclure", scale)
-            found, missing = self.matcher.match(before, None, kernel, self._share)
-            found = {scan: pair for scan, pair in found.items() if scan in smoother.entries}
+            found, missing = self.matcher.match(at, None, kernel, self._share)
             try:
                 smoother.update(found, missing, 0, self.window.objects.live)
                 smoother.polish()
@@ -304,9 +307,12 @@ class Tracker:
             except EstimationError as error:
                 _LOG.warning("tracker: not settled: %s", error)
                 return False
-            step = before.core().local(smoother.point.core())
-            if scale == scales[-1] and step @ np.linalg.solve(self.covariance, step) < 0.02**2:
+            left = smoother.point.core().local(at.core())
+            if i + 1 >= len(scales) and left @ np.linalg.solve(self.covariance, left) < 0.02**2:
                 return True
+            share = 1.0 / max(1, i + 1 - len(scales) - _WHOLE_STEPS)
+            at = smoother.point.moved(np.append((1.0 - share) * left, np.zeros(len(smoother.point.tracks))))
+        smoother.rest_at(at)
         return False
 
     @property

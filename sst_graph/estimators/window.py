@@ -26,6 +26,7 @@ OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
 MOVING = MovingConfig()
 """What counts as an object that moves by itself, as in the batch."""
+_REACH_NS = round(MOVING.window_s * 1e9)
 
 
 @dataclass(frozen=True)
@@ -102,32 +103,38 @@ class Window:
         for name, track in self.tracks[number].items():
             centre = self.objects.live[track][1][:2]
             self.sightings.setdefault(track, []).append(Sighting(number, name, stamp_ns, centre))
-        reach_ns = round(MOVING.window_s * 1e9)
         for track, seen in list(self.sightings.items()):
-            seen = [sighting for sighting in seen if stamp_ns - sighting.stamp_ns <= 2 * reach_ns]
+            seen = [sighting for sighting in seen if stamp_ns - sighting.stamp_ns <= 2 * _REACH_NS]
             self.sightings[track] = seen
             if not seen:
                 del self.sightings[track]
-            elif seen[-1].scan == number:
-                self._judge_track(seen, stamp_ns - reach_ns, reach_ns)
+            elif seen[-1].scan >= number - 1:
+                self._judge_track(seen, stamp_ns - _REACH_NS, whole=seen[-1].scan < number)
 
-    def _judge_track(self, seen: Sequence[Sighting], since_ns: int, reach_ns: int) -> None:
+    def judge_all(self) -> None:
+        """Judge all latest sightings by what is around them, as at the end of a drive."""
+        for seen in self.sightings.values():
+            self._judge_track(seen, self.scans[-1][1].stamp_ns - _REACH_NS, whole=True)
+
+    def _judge_track(self, seen: Sequence[Sighting], since_ns: int, whole: bool) -> None:
         """Speeds of one object in its sightings since a stamp, each from those around it.
 
         A sighting is judged when it is new, when all that is around it has been seen, and when the newest
-        one is judged otherwise than the one before.
+        one is judged otherwise than the one before; with ``whole``, now.
         """
+        recent = [i for i, sighting in enumerate(seen) if sighting.stamp_ns >= since_ns]
+        if not recent:
+            return
         centres = np.stack([sighting.centre for sighting in seen])
         stamps = np.array([sighting.stamp_ns for sighting in seen], dtype=np.int64)
         # A line fitted to n places rises by less than 1.5 times their spread.
         never = 1.5 * float(np.linalg.norm(np.ptp(centres, axis=0))) < MOVING.min_travel_m
-        recent = [i for i, sighting in enumerate(seen) if sighting.stamp_ns >= since_ns]
         before = self._speed(seen[recent[-2]]) if len(recent) > 1 else 0.0
         for i in (recent[-1], recent[0], *recent[1:-1]):
-            near = np.abs(stamps - stamps[i]) <= reach_ns
+            near = np.abs(stamps - stamps[i]) <= _REACH_NS
             times = np.asarray((stamps[near] - stamps[i]) * 1e-9, np.float64)
             self._decide(seen[i], 0.0 if never else speed_of(times, centres[near], MOVING))
-            if i == recent[0] and (before > 0.0) == (self._speed(seen[-1]) > 0.0):
+            if not whole and i == recent[0] and (before > 0.0) == (self._speed(seen[-1]) > 0.0):
                 break
 
     def _speed(self, sighting: Sighting) -> float:

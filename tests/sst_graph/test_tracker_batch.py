@@ -12,11 +12,14 @@ from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators.joint import solve_joint
 from sst_graph.problem.drive import prepare_drive
+from sst_graph.problem.objects import moving_objects, object_tracks
 from sst_graph.problem.state import State
+from sst_graph.uncertainty.covariance import robust_covariance
 
 
-def test_the_tracker_ends_where_the_batch_does() -> None:
-    """With one mask bias a class on both sides: the tracker has no biases of single objects."""
+@pytest.mark.parametrize("by_object", [True, False])
+def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
+    """With a mask bias for each object and moving cars left out, and with one bias a class."""
     street = simulate(
         SimulationConfig(
             seed=5,
@@ -26,29 +29,44 @@ def test_the_tracker_ends_where_the_batch_does() -> None:
             azimuth_limit_deg=50.0,
             azimuth_step_deg=0.3,
             vehicle_density=0.3,
-            time_offset_s=0.02,
+            time_offset_s=0.04,
             speed_mps=6.0,
-            moving_fraction=0.0,
+            moving_fraction=0.3 if by_object else 0.0,
         )
     )
-    frames = [street[i] for i in range(len(street))]
     default = TrackerConfig(start_scans=10)
     start = dataclasses.replace(default.calibration.start, enabled=False)
     joint = default.calibration.joint
-    graph = dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
+    graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
     joint = dataclasses.replace(joint, graph=graph)
     calibration = dataclasses.replace(default.calibration, start=start, joint=joint)
-    tracker = Tracker(
-        street.camera, dataclasses.replace(default, calibration=calibration), street.truth.cTl, 0.02
-    )
-    for frame in frames:
+    config = dataclasses.replace(default, calibration=calibration)
+    tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
+    for frame in street:
         tracker.add(frame)
     tracker.settle()
+    assert bool(tracker.point.tracks) == by_object
     # The batch from the same start, run until it rests.
     drive = prepare_drive(street, calibration.classes, calibration.prepare)
     joint = dataclasses.replace(calibration.joint, step_sigmas=0.02, max_outer=80)
-    state = solve_joint([drive], State(street.truth.cTl, (0.02,)), joint).state
+    solution = solve_joint([drive], State(street.truth.cTl, (0.04,)), joint)
+    state = solution.state
     turn = gtsam.Pose3.Logmap(tracker.point.cTl.between(state.cTl))
     step = np.append(turn, state.offset_s(0) - tracker.point.offset_s)
     sigmas = np.sqrt(np.diag(tracker.covariance)[:7])
     assert np.abs(step / sigmas).max() == pytest.approx(0.0, abs=0.3), np.round(step / sigmas, 2)
+    if not by_object:
+        return
+    # The same objects are left out, and each object's bias and the uncertainty agree.
+    positions = [number for number, _ in tracker.window.scans]
+    tracks = object_tracks(drive)
+    moving = moving_objects(drive, tracks)
+    found, found_moving = tracker.window.objects_of(positions)
+    assert found == tracks
+    assert moving and found_moving == pytest.approx(moving)
+    ours = dict(zip(tracker.point.tracks, tracker.point.object_biases_px, strict=True))
+    theirs = {track: bias for (_, track), bias in state.object_biases_px.items()}
+    assert len(theirs) > 5 and {track: ours[track] for track in theirs} == pytest.approx(theirs, abs=0.2)
+    expected, *_ = robust_covariance(solution.graph, solution.values, solution.pairs, state, [tracks])
+    ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)

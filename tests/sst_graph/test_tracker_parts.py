@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm, chi_square
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
-from sst_graph.estimators.scores import PairScore, SideSums, fit_sides
-from sst_graph.estimators.tracker_config import AlarmConfig, TrackerConfig
+from sst_graph.estimators.scores import PairScore, ScoreSums, SideSums, fit_sides
+from sst_graph.estimators.tracker_config import AdoptionConfig, AlarmConfig, TrackerConfig
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FloatArray = NDArray[np.float64]
@@ -143,3 +144,73 @@ def test_a_direction_without_information_raises_nothing() -> None:
         score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
     )
     assert chi_square([still], Joint(1e-6 * np.eye(N), (), N), _model()) < 40.0
+
+
+def test_objects_come_and_go_without_loss() -> None:
+    """Marginalized out one by one, objects leave what the whole problem says, and how surely."""
+    rng, belief, sigma = np.random.default_rng(4), _belief(6), 0.5
+    whole = belief.with_objects({40: 0, 41: 1, 42: 0}, sigma)
+    assert whole.point.tracks == (40, 41, 42) and whole.point.size == N + 3
+    np.testing.assert_allclose(whole.core().information, belief.information, atol=1e-9)
+    np.testing.assert_allclose(whole.core().vector, belief.vector, atol=1e-9)
+    A = rng.standard_normal((30, N + 2))
+    seen = belief.point.seen({42: 0, 40: 0})
+    whole = whole.plus(Gaussian(seen, A.T @ A, rng.standard_normal(N + 2)))
+    S = np.cov(rng.standard_normal((N + 3, 50)))
+    rows = np.linalg.inv(whole.information)
+    first, T = whole.without([41])
+    last, U = first.without([42, 40])
+    assert last.point.tracks == ()
+    np.testing.assert_allclose(np.linalg.inv(last.information), rows[:N, :N], atol=1e-9)
+    expected = (rows @ whole.vector)[:N]
+    np.testing.assert_allclose(np.linalg.solve(last.information, last.vector), expected, atol=1e-9)
+    robust = np.linalg.inv(last.information)
+    robust = robust @ (U @ T @ S @ T.T @ U.T) @ robust
+    np.testing.assert_allclose(robust, (rows @ S @ rows)[:N, :N], atol=1e-9)
+
+
+def test_score_sums_follow_the_objects() -> None:
+    rng = np.random.default_rng(5)
+    score, sums, model = _score(rng, np.zeros(N), 0), ScoreSums.empty(N), ErrorModel(0.25, 0.1, 2.0)
+    columns = np.arange(N)
+    sums.add(score, columns, 0)
+    expected = sums.surplus([], [], model)
+    sums.grow(N + 2)
+    grown = sums.surplus([], [], model)
+    np.testing.assert_allclose(grown[:N, :N], expected)
+    assert not grown[N:].any()
+    # A pair counts the same in the window as when it has left it.
+    again = _score(rng, np.zeros(N), 2)
+    both = sums.surplus([again], [columns], model)
+    sums.add(again, columns, 1)
+    np.testing.assert_allclose(sums.surplus([], [], model), both, rtol=1e-9)
+    T = rng.standard_normal((N, N + 2))
+    sums.transform(T)
+    np.testing.assert_allclose(sums.surplus([], [], model), T @ both @ T.T, rtol=1e-9)
+
+
+def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
+    P = np.diag(np.arange(1.0, N + 3.0))
+    found = Joint(P, (7, 9), N).seeing({9: 0, 12: 1}, 0.5)
+    assert found.shape == (N + 2, N + 2)
+    assert found[N, N] == P[N + 1, N + 1]
+    assert found[N + 1, N + 1] == P[8, 8] + 0.25 and found[8, N + 1] == P[8, 8]
+
+
+def test_a_worse_candidate_is_refused() -> None:
+    """A covariance within the limits, and held-out costs that are no worse, over enough frames."""
+    good, bad = _belief(1).point, _belief(2).point
+    adoption = Adoption(AdoptionConfig(held_out=5, margin=0.02))
+    for _ in range(4):
+        adoption.compare(1.0, 2.0)
+    assert not adoption.offer(good, trusted=True)  # too few frames
+    adoption.compare(1.0, 2.0)
+    assert not adoption.offer(good, trusted=False)  # a covariance past the limits
+    assert adoption.offer(good, trusted=True) and adoption.adopted is good
+    adoption.restart()
+    for _ in range(5):
+        adoption.compare(1.1, 1.0)  # a confident candidate that explains held-out frames worse
+    assert not adoption.offer(bad, trusted=True) and adoption.adopted is good
+    for _ in range(5):
+        adoption.compare(1.01, 1.0)
+    assert adoption.offer(bad, trusted=True) and adoption.adopted is bad
