@@ -1,12 +1,9 @@
 """Global search for the extrinsic: no local step before a start that sees the whole problem.
 
-Every labelled point votes with the log-likelihood ratio of its class at the pixel it falls on,
-
-    score(T) = sum_i w_i log( P(class_i | blurred mask at uv_i) / P(class_i) ),
-
-0 off the image. Points are spread evenly over the sphere (a scan's own angular grid), so the score is a
-cross-correlation of two labelled panoramas. A grid of rotations is scored on strongly blurred, coarse
-masks; the best are refined in pose and time offset by the cross-entropy method on ever sharper ones.
+Labelled points are scored on blurred masks (:mod:`~sst_graph.association.votes`); they are spread evenly
+over the sphere (a scan's own angular grid), so the score is a cross-correlation of two labelled
+panoramas. A grid of rotations is scored on strongly blurred, coarse masks; the best are refined in pose and
+time offset by the cross-entropy method on ever sharper ones.
 """
 
 from __future__ import annotations
@@ -20,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from sst_graph.association.votes import CELLS, Level, SearchFrame, States, Votes
+from sst_graph.association.votes import CELLS, Judge, Level, SearchFrame, States, Votes
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -44,6 +41,7 @@ class SearchConfig:
         free_translation_m: half width of the translations without a guess [m].
         delay_s: half width of the time offsets [s].
         blurs_px: widths of the mask's blur, coarse to fine, at an image width of 1242 [px].
+        judges: scores that candidates are found by, each on its own.
         candidates: poses refined at the first, second, ... blur.
         free_breadth: so many times more of them where nothing is known.
         shares: share of the points that votes at the first, second, ... blur.
@@ -63,6 +61,7 @@ class SearchConfig:
     free_translation_m: float = 2.0
     delay_s: float = 0.5
     blurs_px: tuple[float, ...] = (45.0, 22.0, 10.0, 4.0)
+    judges: tuple[Judge, ...] = ("votes", "dependence")
     candidates: tuple[int, ...] = (80, 40, 20, 12)
     free_breadth: int = 4
     shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
@@ -88,7 +87,9 @@ def search_start(
     offset_s: float = 0.0,
     config: SearchConfig | None = None,
 ) -> list[Candidate]:
-    """Refined candidates of two families in turn, best first in each: translation held, and free.
+    """Refined candidates of several families in turn, best first in each.
+
+    A family is one score with the translation held or free.
 
     Args:
         guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
@@ -99,7 +100,24 @@ def search_start(
     config = config or SearchConfig()
     rng = np.random.default_rng(config.seed)
     votes = Votes.gather(frames, camera, classes, config.points_per_class, rng)
-    levels = [votes.level(*pair) for pair in zip(config.blurs_px, config.shares, strict=True)]
+    families = []
+    for judge in config.judges:
+        levels = [votes.level(*pair, judge) for pair in zip(config.blurs_px, config.shares, strict=True)]
+        families += _families(levels, guess, offset_s, votes.moving, config, rng)
+    found = [c for several in itertools.zip_longest(*families) for c in several if c is not None]
+    cells = len(frames) * CELLS[0] * CELLS[1]
+    return [replace(candidate, score=candidate.score / cells) for candidate in found]
+
+
+def _families(
+    levels: Sequence[Level],
+    guess: gtsam.Pose3 | None,
+    offset_s: float,
+    moving: bool,
+    config: SearchConfig,
+    rng: np.random.Generator,
+) -> list[list[Candidate]]:
+    """Candidates under one score: with the translation held near the guess, and free."""
     # 1. A grid of rotations on the most blurred masks.
     rotations, translation = _grid(guess, config)
     states = States(rotations, np.tile(translation, (len(rotations), 1)), np.full(len(rotations), offset_s))
@@ -112,12 +130,10 @@ def search_start(
     free_t = config.free_translation_m if guess is None else config.translation_m
     families = []
     for spread_t in (config.held_translation_m, free_t):
-        scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s * votes.moving])
+        scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s * moving])
         limits = _Limits(translation, spread_t, offset_s, config.delay_s)
         families.append(_refined(best, levels, guess, scale, limits, config, rng))
-    found = [c for pair in itertools.zip_longest(*families) for c in pair if c is not None]
-    cells = len(frames) * CELLS[0] * CELLS[1]
-    return [replace(candidate, score=candidate.score / cells) for candidate in found]
+    return families
 
 
 def _refined(

@@ -1,9 +1,16 @@
-"""Votes of labelled points for a pose: log-likelihood ratios of their classes on blurred masks."""
+"""How well labelled points and blurred masks agree under a pose: two scores with different blind spots.
+
+*Votes* adds log-likelihood ratios of each point's class at its pixel. It is sharp, but prefers poses that
+bring many points of a class onto a large mask. *Dependence* is the likelihood-ratio statistic (G-test) of
+the table of point class against mask class over what the image shows: a pose that shows one class
+only says nothing, however well it fits.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -59,9 +66,12 @@ class States:
         return len(self.offsets)
 
 
+Judge = Literal["votes", "dependence"]
+
+
 @dataclass(frozen=True)
 class Level:
-    """Log-likelihood ratios of all frames at one blur, ready to be looked up.
+    """All points and masks at one blur, ready to be scored.
 
     Attributes:
         camera: full-sized; masks are ``shrink`` times smaller, ``shape`` rows and columns.
@@ -70,8 +80,11 @@ class Level:
         starts: (n,) where the table of the point's frame and class begins in ``tables``.
         cells: (rows * columns,) cell of a pixel within its image.
         first_cells: (n,) number of the first cell of the point's image.
+        tables: of all frames and classes: log-likelihood ratios for votes, shares for dependence.
         weights: (n,) of the votes.
+        classes: (n,) number of each point's class; ``class_count`` for the rest.
         cell_count: cells of all images.
+        judge: which score.
     """
 
     camera: PinholeCamera
@@ -82,9 +95,12 @@ class Level:
     first_cells: IntArray
     tables: Float32
     weights: Float32
+    classes: IntArray
+    class_count: int
     cell_count: int
     shrink: float
     shape: tuple[int, int]
+    judge: Judge
 
     @property
     def voice(self) -> float:
@@ -105,12 +121,32 @@ class Level:
         Without this a pose gains by crowding all points into one large mask.
         """
         state, point, pixel = self._seen(states)
-        votes = self.tables[self.starts[point] + pixel]
         weights = self.weights[point]
         cell = state * self.cell_count + self.first_cells[point] + self.cells[pixel]
         crowd = np.bincount(cell, weights, len(states) * self.cell_count)[cell]
-        scores = np.bincount(state, votes * weights / (self.voice + crowd), len(states))
-        return scores.astype(np.float64, copy=False)
+        weights = weights / (self.voice + crowd)
+        first = self.starts[point] + pixel
+        if self.judge == "dependence":
+            return self._dependence(state, point, first, weights, len(states))
+        votes = self.tables[first + self.classes[point] * self._size]
+        return np.bincount(state, votes * weights, len(states)).astype(np.float64, copy=False)
+
+    def _dependence(
+        self, state: IntArray, point: IntArray, first: IntArray, weights: FloatArray, states: int
+    ) -> FloatArray:
+        """(states,) sum over the classes of the signed G statistic of (is the class, shows the class)."""
+        total = np.zeros(states)
+        for c in range(self.class_count):
+            share = self.tables[first + c * self._size]
+            own = self.classes[point] == c
+            hit = weights * share
+            sums = [np.bincount(state, w, states) for w in (hit * own, weights * own, hit, weights)]
+            total += _g_statistic(*(part.astype(np.float64, copy=False) for part in sums))
+        return total
+
+    @property
+    def _size(self) -> int:
+        return self.shape[0] * self.shape[1]
 
     def _seen(self, states: States) -> tuple[IntArray, IntArray, IntArray]:
         """State, point and pixel of the shrunk mask of every projection that falls into its image."""
@@ -132,6 +168,21 @@ class Level:
         pixel = v[inside].astype(np.intp) * cols + u[inside].astype(np.intp)
         state, point = np.divmod(ahead[inside], len(self.lPs))
         return state, point, pixel
+
+
+def _g_statistic(both: FloatArray, rows: FloatArray, columns: FloatArray, total: FloatArray) -> FloatArray:
+    """Likelihood-ratio statistic of 2x2 tables with margins; negative where the two avoid each other."""
+    tiny = 1e-9
+    score = np.zeros_like(total)
+    for count, row, column in (
+        (both, rows, columns),
+        (rows - both, rows, total - columns),
+        (columns - both, total - rows, columns),
+        (total - rows - columns + both, total - rows, total - columns),
+    ):
+        safe = np.maximum(count, tiny)
+        score += safe * np.log(safe * np.maximum(total, tiny) / np.maximum(row * column, tiny))
+    return np.where(both * total > rows * columns, score, -score)
 
 
 def _reach(centre: float, width: int, focal: float) -> np.float32:
@@ -189,16 +240,16 @@ class Votes:
             np.concatenate(weights).astype(np.float32),
         )
 
-    def level(self, blur_px: float, share: float) -> Level:
+    def level(self, blur_px: float, share: float, judge: Judge = "votes") -> Level:
         """A share of the votes, on masks blurred by a width [px at 1242 px image width]."""
         some = np.arange(len(self.lPs)) % round(1.0 / share) == 0
         blur = blur_px * self.camera.width / 1242.0
         shrink = max(1.0, blur / 3.0)
         size = (max(8, round(self.camera.width / shrink)), max(8, round(self.camera.height / shrink)))
         shrink = self.camera.width / size[0]
-        tables = [_vote_tables(frame.mask, self.classes, size, blur / shrink) for frame in self.frames]
-        channels = len(self.classes) + 1
-        starts = (self.frame_of * channels + self.class_of) * (size[0] * size[1])
+        table_of = _vote_tables if judge == "votes" else _share_tables
+        tables = [table_of(frame.mask, self.classes, size, blur / shrink) for frame in self.frames]
+        starts = self.frame_of * ((len(self.classes) + 1) * size[0] * size[1])
         velocities = self._velocities()
         taus = np.array([frame.base_tau_s for frame in self.frames])[self.frame_of, None]
         down, across = (np.arange(n) * c // n for n, c in zip(size[::-1], CELLS, strict=True))
@@ -211,9 +262,12 @@ class Votes:
             self.frame_of[some].astype(np.intp) * (CELLS[0] * CELLS[1]),
             np.concatenate([table.reshape(-1) for table in tables]),
             self.weights[some],
+            self.class_of[some].astype(np.intp),
+            len(self.classes),
             len(self.frames) * CELLS[0] * CELLS[1],
             shrink,
             (size[1], size[0]),
+            judge,
         )
 
     def _velocities(self) -> FloatArray:
@@ -231,21 +285,34 @@ def _channels(labels: NDArray[np.uint8], classes: Sequence[SemanticClass]) -> In
     return np.asarray(table[labels])
 
 
+def _share_tables(
+    mask: NDArray[np.uint8], classes: Sequence[SemanticClass], size: tuple[int, int], blur: float
+) -> Float32:
+    """(classes + 1, h, w) share of each class, of the rest last, on a shrunk, blurred mask."""
+    channel = _channels(mask, classes)
+    known = _blurred(channel >= 0, size, blur)
+    shares = []
+    for c in range(len(classes) + 1):
+        share = _blurred(channel == c, size, blur)
+        mean = float(share.mean() / max(float(known.mean()), 1e-6))
+        shares.append(np.where(known > 0.05, share / np.maximum(known, 0.05), mean))
+    return np.stack(shares).astype(np.float32)
+
+
+def _blurred(inside: NDArray[np.bool_], size: tuple[int, int], blur: float) -> Float32:
+    small = cv2.resize(inside.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    return np.asarray(
+        cv2.GaussianBlur(small, (0, 0), max(blur, 0.3), borderType=cv2.BORDER_REPLICATE), np.float32
+    )
+
+
 def _vote_tables(
     mask: NDArray[np.uint8], classes: Sequence[SemanticClass], size: tuple[int, int], blur: float
 ) -> Float32:
     """(classes + 1, h, w) log-likelihood ratios of each class on a shrunk, blurred mask."""
-    channel = _channels(mask, classes)
-    known = cv2.resize((channel >= 0).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    known = cv2.GaussianBlur(known, (0, 0), max(blur, 0.3), borderType=cv2.BORDER_REPLICATE)
     tables = []
-    for c in range(len(classes) + 1):
-        share = cv2.resize((channel == c).astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        share = cv2.GaussianBlur(share, (0, 0), max(blur, 0.3), borderType=cv2.BORDER_REPLICATE)
-        prior = float(share.mean() / max(float(known.mean()), 1e-6))
-        p = np.where(known > 0.05, share / np.maximum(known, 0.05), prior)
-        prior = max(prior, 0.02)
-        votes = np.log(_DOUBT + (1.0 - _DOUBT) * p / prior)
+    for c, p in enumerate(_share_tables(mask, classes, size, blur)):
+        votes = np.log(_DOUBT + (1.0 - _DOUBT) * p / max(float(p.mean()), 0.02))
         # Background on background is no evidence: a pose must not gain by seeing more of it.
         tables.append(np.minimum(votes, 0.0) if c == len(classes) else votes)
     return np.stack(tables).astype(np.float32)

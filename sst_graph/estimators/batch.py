@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import gtsam
 import numpy as np
@@ -14,12 +14,11 @@ from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
-from sst_graph.estimators.contest import Contest, hold_contest, prior_centre
+from sst_graph.estimators.contest import Contest, choose_start, prior_centre
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, agreement, solve_joint
+from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained, solve_joint
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
-from sst_graph.estimators.start import find_start
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.objects import object_tracks
@@ -32,6 +31,9 @@ from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
 
 FloatArray = NDArray[np.float64]
+
+_FAR_SIGMAS = 6.0
+"""Two answers farther apart than this contradict each other."""
 
 
 def calibrate(
@@ -112,21 +114,26 @@ def answer_joint(
     """The default: a global start, then silhouettes over the whole drive."""
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
-    candidates = find_start(drives, tracks, config.classes, guess.cTl, guess.offset_s, config.start)
-    # 2. Where the best candidates lead to on a few frames; the best supported wins.
-    contest = hold_contest(drives, tracks, candidates, guess.cTl, guess.offset_s, config.joint, config.start)
-    # 3. Silhouettes over all frames, from the winner and from a runner-up that differs from it.
+    contest = choose_start(
+        drives, tracks, config.classes, guess.cTl, guess.offset_s, config.joint, config.start
+    )
+    # 2. Silhouettes over all frames, from the winner and from a runner-up that differs from it.
     objects = [object_tracks(drive) for drive in drives]
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
-    solution = max(_finals(drives, tracks, contest, guess, config, progress), key=agreement)
-    # 4. What the motion alone says, where it is asked.
+    finals = _finals(drives, tracks, contest, guess, config, progress)
+    solution = finals[0]
+    # 3. What the motion alone says, where it is asked.
     heard = WithMotion(solution)
     if config.use_motion:
         centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
         heard = with_motion(drives, tracks, objects, solution, centre, config, progress)
         solution = heard.solution
-    # 5. How sure, and in which directions not at all.
+    evidence = {
+        "explained": explained(solution),
+        "concentration": concentration(solution, drives, tracks, config.joint),
+    }
+    # 4. How sure, and in which directions not at all.
     frozen = (solution.graph, solution.values, solution.pairs, solution.state, objects)
     covariance, model, _ = robust_covariance(*frozen)
     return Answer(
@@ -134,13 +141,14 @@ def answer_joint(
         solution.state.offsets_s[0],
         covariance[:7, :7],
         _frames_used(drives, solution),
-        doubts=(*_doubts(solution, contest), *heard.doubts),
+        doubts=(*_doubts(solution, finals[1:], covariance, contest, evidence, config), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
             "matches": sum(len(pair) for pair in solution.pairs),
             "pairs": len(solution.pairs),
-            "start_score": candidates[0].score,
+            "start_score": contest.score,
+            **evidence,
             "mask_bias_px": {
                 f"{drives[d].name}:{c.name.lower()}": bias
                 for (d, c), bias in solution.state.biases_px.items()
@@ -160,7 +168,7 @@ def _finals(
     config: CalibrationConfig,
     progress: Progress | None,
 ) -> list[JointSolution]:
-    """Solutions of the whole problem from every finalist.
+    """Solutions of the whole problem from every finalist, the one that agrees best with the labels first.
 
     Raises:
         EstimationError: none of them leads anywhere.
@@ -176,14 +184,42 @@ def _finals(
             failures.append(error)
     if not found:
         raise failures[0]
-    return found
+    return sorted(found, key=agreement, reverse=True)
 
 
-def _doubts(solution: JointSolution, contest: Contest) -> tuple[str, ...]:
+def _doubts(
+    solution: JointSolution,
+    others: Sequence[JointSolution],
+    covariance: FloatArray,
+    contest: Contest,
+    evidence: Mapping[str, float],
+    config: CalibrationConfig,
+) -> tuple[str, ...]:
     """Why the joint estimate may be wrong altogether."""
     doubts = [] if contest.doubt is None else [contest.doubt]
     if not solution.converged:
         doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+    for share, least, what in (
+        (evidence["explained"], config.start.min_explained, "of the boundary points in view meet a contour"),
+        (evidence["concentration"], config.start.min_concentration, "of the matches are close ones"),
+    ):
+        if config.start.enabled and share < least:
+            doubts.append(
+                f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
+                "the pose may be wrong altogether"
+            )
+    for other in others:
+        step = np.append(
+            gtsam.Pose3.Logmap(solution.state.cTl.between(other.state.cTl)),
+            other.state.offsets_s[0] - solution.state.offsets_s[0],
+        )
+        sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
+        if sigmas > _FAR_SIGMAS and agreement(other) > config.start.rival_ratio * agreement(solution):
+            doubts.append(
+                f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
+                f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "
+                "that explains the labels almost as well"
+            )
     return tuple(doubts)
 
 

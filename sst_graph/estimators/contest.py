@@ -11,10 +11,11 @@ import numpy as np
 from sst_graph.association.search import Candidate
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
-from sst_graph.estimators.start import StartConfig
+from sst_graph.estimators.start import StartConfig, find_start
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.state import State
+from sst_graph.types import SemanticClass
 
 _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
 """Solutions on a few frames that are closer than all of these lead to one answer."""
@@ -29,10 +30,38 @@ class Contest:
     Attributes:
         finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first.
         doubt: why the winner may be the wrong one; None where nothing speaks for another.
+        score: of the search's best candidate.
     """
 
     finalists: tuple[tuple[gtsam.Pose3, float], ...]
     doubt: str | None
+    score: float
+
+
+def choose_start(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    joint: JointConfig,
+    config: StartConfig,
+) -> Contest:
+    """Search for a start and let the candidates compete.
+
+    Without a guess a second search looks closer around the winner of the first.
+
+    Raises:
+        EstimationError: no candidate leads anywhere.
+    """
+    candidates = find_start(drives, tracks, classes, guess_cTl, guess_offset_s, config)
+    contest = hold_contest(drives, tracks, candidates, guess_cTl, guess_offset_s, joint, config)
+    if guess_cTl is not None:
+        return contest
+    cTl, offset_s = contest.finalists[0]
+    closer = find_start(drives, tracks, classes, cTl, guess_offset_s, config)
+    closer = [Candidate(cTl, offset_s, contest.score), *closer]
+    return hold_contest(drives, tracks, closer, None, guess_offset_s, joint, config)
 
 
 def hold_contest(
@@ -50,7 +79,7 @@ def hold_contest(
         EstimationError: no candidate leads anywhere.
     """
     if not config.enabled:
-        return Contest(((candidates[0].cTl, candidates[0].offset_s),), None)
+        return Contest(((candidates[0].cTl, candidates[0].offset_s),), None, candidates[0].score)
     few = [_thinned(drive, config.contest_scans) for drive in drives]
     contenders = config.free_contenders if guess_cTl is None else config.contenders
     starts = [
@@ -64,7 +93,7 @@ def hold_contest(
     solutions = [solution for solution in solutions if _is_within(solution, guess_cTl, config)]
     if not solutions:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
-    return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config))
+    return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config), candidates[0].score)
 
 
 def _solve_all(

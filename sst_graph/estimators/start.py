@@ -34,6 +34,9 @@ class StartConfig:
         survivors: fewest different solutions that go on from one heat of the contest to the next.
         rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
             best one's makes the answer ambiguous.
+        min_explained: least share of the boundary points in view that must meet a contour ...
+        min_concentration: ... and of the matches that must be close
+            (:func:`~sst_graph.estimators.joint.concentration`); an answer with less may be wrong altogether.
         min_class_points: fewest points of the searched classes that make a frame worth looking at.
     """
 
@@ -45,6 +48,8 @@ class StartConfig:
     contest_scans: int = 10
     survivors: int = 3
     rival_ratio: float = 0.9
+    min_explained: float = 0.2
+    min_concentration: float = 0.6
     min_class_points: int = 30
 
 
