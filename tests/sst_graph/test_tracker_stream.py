@@ -16,6 +16,8 @@ from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.epochs import Found
+from sst_graph.estimators.history import HistoryEntry
+from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
 from sst_graph.problem.graph import Tracks, associate, joint_graph, state_from
 from sst_graph.problem.objects import object_tracks
@@ -152,6 +154,35 @@ def test_images_and_scans_at_their_own_rates(street: SimulatedDrive, frames: lis
     assert _distance(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
 
 
+def test_gaps_and_half_as_many_scans(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Scans at half the images' rate, and a second in which nothing comes."""
+    tracker = _tracker(street, dataclasses.replace(CONFIG, start_scans=6, restart_scans=6))
+    for frame in frames:
+        if 20 <= frame.index < 29:
+            continue
+        scan = frame.scan if frame.index % 2 == 0 else None
+        update = tracker.add(Frame(frame.index, scan, frame.image))
+    assert tracker.started and update.status in ("ok", "unobservable")
+    assert _distance(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+
+
+def test_what_comes_too_late_or_out_of_order_is_refused(running: Path, frames: list[Frame]) -> None:
+    """An image that is late but not too late is sorted in; older ones, and any older scan, are refused."""
+    tracker = load_checkpoint(running)
+    before, images = tracker.point, [image.stamp_ns for image in tracker.window.images]
+    old = frames[1].image
+    assert old is not None and frames[10].scan is not None and frames[19].image is not None
+    update = tracker.add_image(dataclasses.replace(old, stamp_ns=old.stamp_ns + 7))
+    assert not update.accepted and "behind the newest scan" in update.reason and "1.5 s" in update.reason
+    update = tracker.add_scan(frames[10].scan)
+    assert not update.accepted and "one after" in update.reason
+    assert tracker.point is before and [image.stamp_ns for image in tracker.window.images] == images
+    between = dataclasses.replace(frames[19].image, stamp_ns=frames[19].image.stamp_ns - 30_000_000)
+    assert tracker.add_image(between).accepted
+    stamps = [image.stamp_ns for image in tracker.window.images]
+    assert between.stamp_ns in stamps and stamps == sorted(stamps)
+
+
 def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]) -> None:
     tracker = load_checkpoint(running)
     smoother = tracker.smoother
@@ -245,3 +276,37 @@ def test_drift_mode_tells_the_history(street: SimulatedDrive, frames: list[Frame
     for frame in frames:
         steady.add(frame)
     assert np.diag(tracker.covariance)[:7].sum() > np.diag(steady.covariance)[:7].sum()
+
+
+def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The camera yaws by 0.25 deg/s: the history follows within its sigmas, one calibration cannot."""
+    drift = DriftConfig(enabled=True, epoch_s=0.5, rotation_deg=0.2)
+    follows = _tracker(street, dataclasses.replace(CONFIG, window=10, drift=drift))
+    steady = _tracker(street, dataclasses.replace(CONFIG, alarm=AlarmConfig(enabled=False)))
+    start_ns = frames[0].scan.stamp_ns if frames[0].scan is not None else 0
+    for frame in frames:
+        assert frame.image is not None and frame.scan is not None
+        yaw_deg = 0.25e-9 * (frame.scan.stamp_ns - start_ns)
+        for tracker in (follows, steady):
+            assert not tracker.add(
+                dataclasses.replace(frame, image=_knocked(frame.image, street, yaw_deg))
+            ).alarm
+    errors = [_yaw_error(street, entry, 0.25e-9 * (entry.stamp_ns - start_ns)) for entry in follows.history()]
+    assert len(errors) >= 5
+    off, sigmas = np.array(errors).T
+    assert np.abs(off).max() < 0.25 and np.mean(np.abs(off) < 2.5 * sigmas) > 0.8
+    last_deg = 0.25e-9 * ((follows.window.last_stamp_ns or 0) - start_ns)
+    at_end = [_yaw_error(street, tracker.current(), last_deg)[0] for tracker in (follows, steady)]
+    assert abs(at_end[0]) < 0.5 * abs(at_end[1])
+
+
+def _yaw_error(
+    street: SimulatedDrive, found: HistoryEntry | TrackUpdate, yaw_deg: float
+) -> tuple[float, float]:
+    """Error about the camera's vertical axis, and its sigma [deg]."""
+    cTl = found.cTl if isinstance(found, HistoryEntry) else found.T_camera_lidar
+    truth = gtsam.Rot3.Ry(np.radians(yaw_deg)) * street.truth.cTl.rotation()
+    axis = truth.matrix().T @ np.array([0.0, 1.0, 0.0])
+    error = float(axis @ gtsam.Rot3.Logmap(truth.between(cTl.rotation())))
+    sigma = float(np.sqrt(axis @ found.covariance[:3, :3] @ axis))
+    return float(np.degrees(error)), float(np.degrees(sigma))
