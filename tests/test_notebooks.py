@@ -36,15 +36,15 @@ def test_calibrate_in_five_lines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 
 
 def test_slam_and_calibration_are_better_together(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    table = run("02_slam_fusion.py", monkeypatch, tmp_path)["table"]
-    both = table["both"]
-    for name in ("ate_cm", "step_deg", "step_cm"):
-        assert both[name] < 0.9 * table["SLAM alone"][name]
-        assert both[name] < 0.9 * table["odometry"][name]
-    for name in ("rotation_deg", "translation_cm", "offset_ms"):
+    found = run("02_slam_fusion.py", monkeypatch, tmp_path)
+    table, both = found["table"], found["table"]["both"]
+    assert len(found["closures"]) >= 10
+    assert table["SLAM alone"]["position_cm"] < 0.6 * table["odometry"]["position_cm"]
+    for name, share in (("position_cm", 0.85), ("step_deg", 0.95), ("step_cm", 0.8)):
+        assert both[name] < share * table["SLAM alone"][name]
+    for name in ("rotation_deg", "translation_cm"):
         assert both[name] < table["calibration alone"][name]
-    assert both["translation_cm"] < 0.8 * table["calibration alone"]["translation_cm"]
-    assert both["ate_cm"] < 15.0 and both["rotation_deg"] < 0.2 and both["offset_ms"] < 6.0
+    assert both["rotation_deg"] < 0.25 and both["offset_ms"] < 3.0
 
 
 def test_two_drives_know_more_than_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -53,8 +53,8 @@ class RegistrationConfig:
     max_iterations: int = 40
     min_inlier_ratio: float = 0.3
     inflation: float = 2.0
-    floor_rad: float = 2e-4
-    floor_m: float = 4e-3
+    floor_rad: float = 1e-4
+    floor_m: float = 2e-3
     failed_rad: float = 0.1
     failed_m: float = 2.0
 

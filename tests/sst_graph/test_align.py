@@ -152,3 +152,16 @@ def test_refuses_half_an_argument() -> None:
         sst_graph.align_frame(*arguments, np.zeros(6), lTs=gtsam.Pose3())
     with pytest.raises(DataError, match="6 finite numbers"):
         sst_graph.align_frame(*arguments, np.zeros(3))
+
+
+def test_objects_name_the_vehicle_of_each_match() -> None:
+    scan, image = frame(2)
+    found = sst_graph.align_frame(
+        scan, image, drive().camera, drive().truth.cTl, drive().config.time_offset_s, l_twist(2)
+    )
+    (objects,), (alignment,) = found.objects, found.alignments
+    assert objects.shape == (len(alignment),) and len(np.unique(objects)) > 1
+    # matches of one object lie close together, as a vehicle does
+    for number in np.unique(objects):
+        size = np.ptp(alignment.lPs[objects == number], axis=0)
+        assert np.linalg.norm(size) < 12.0
