@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from factors import FactorError, check_jacobians
+from sst_graph.export import CalibrationMarginal
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
@@ -20,6 +21,17 @@ def code_of(name: str) -> str:
     blocks = re.findall(r"```python\n(.*?)```", (DOCS / name).read_text(encoding="utf-8"), re.DOTALL)
     assert blocks
     return "\n".join(blocks)
+
+
+@pytest.fixture(autouse=True)
+def _a_marginal_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The file that extending.md reads: a calibration 1 deg, 5 cm, 5 ms sure."""
+    forward = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+    pose = gtsam.Pose3(forward, np.array([0.06, -0.08, -0.27]))
+    sigmas = np.array([*np.radians([1.0] * 3), 0.05, 0.05, 0.05, 0.005])
+    known = CalibrationMarginal(pose, 0.05, np.diag(sigmas**-2), np.zeros(7))
+    (tmp_path / "marginal.json").write_text(known.to_json())
+    monkeypatch.chdir(tmp_path)
 
 
 def test_a_factor_of_your_own() -> None:
@@ -36,6 +48,10 @@ def test_a_factor_of_your_own() -> None:
     graph.add(factor)
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
     graph.add(gtsam.PriorFactorPose3(E, values.atPose3(E), noise))
+    known, sharper = found["known"], found["sharper"]
+    gain = np.diag(sharper.covariance()) / np.diag(known.covariance())
+    # a spot in the image tells where the camera looks, and nothing of time
+    assert gain.min() < 0.2 and gain[6] == pytest.approx(1.0, rel=1e-6)
     solved = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert np.abs(factor.unwhitenedError(solved)).max() < 0.5 < np.abs(factor.unwhitenedError(values)).max()
 
