@@ -71,7 +71,8 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument(
         "--delay", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
     )
-    simulate.add_argument("--motion", metavar="NAME", help="mixed, standing, constant, stop_and_go, no_stop, turning")
+    motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
+    simulate.add_argument("--motion", metavar="NAME", help=motions)
     simulate.add_argument("--label-noise", type=float, metavar="LEVEL", help="0: exact, 1: usual, 2: poor")
     simulate.add_argument(
         "--rolling", action="store_true", default=None, help="measure each point at its own time"
