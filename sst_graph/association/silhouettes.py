@@ -35,6 +35,7 @@ class MatchConfig:
             bounds what a side may claim, however many points it has.
         gate: farthest match, in units of the kernel's scale.
         min_cosine: least agreement between the contour's normal and the way out of the object.
+        min_object_share: an object of whose boundary in view less than this share finds a match is left out.
         top_edges: use boundaries towards the ring above.
     """
 
@@ -42,6 +43,7 @@ class MatchConfig:
     side_sigma_px: float = 0.7
     gate: float = 3.0
     min_cosine: float = 0.5
+    min_object_share: float = 0.1
     top_edges: bool = True
 
 
@@ -106,7 +108,8 @@ def match_silhouettes(
         residuals = feet.distances + biases_px.get(c, 0.0)
         ok = feet.valid & (cosine > config.min_cosine) & (np.abs(residuals) < config.gate * kernel.scale)
         used = np.full(len(ok), True) if config.top_edges else points.edges != Edge.TOP
-        index = np.flatnonzero(ok & used)
+        used &= camera.in_image(uvs)
+        index = np.flatnonzero(ok & used & _has_a_mask(points.objects, ok & used, used, config))
         if len(index) == 0:
             continue
         beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
@@ -123,9 +126,23 @@ def match_silhouettes(
             c_acceleration=motion.c_acceleration,
             weights=_shared_weights(points.objects[index] * SIDES + sides, sigmas, config.side_sigma_px),
         )
-        seen = np.count_nonzero(used & camera.in_image(uvs))
-        found[c] = SilhouetteMatches(alignment, points.objects[index], sides, index, int(seen))
+        found[c] = SilhouetteMatches(
+            alignment, points.objects[index], sides, index, int(np.count_nonzero(used))
+        )
     return found
+
+
+def _has_a_mask(
+    objects: NDArray[np.intp], matched: NDArray[np.bool_], seen: NDArray[np.bool_], config: MatchConfig
+) -> NDArray[np.bool_]:
+    """(n,) whether enough of the boundary of each point's object meets a contour.
+
+    An object that the image's labels miss crosses the contours of others here and there.
+    """
+    if len(objects) == 0:
+        return np.zeros(0, dtype=bool)
+    meets = np.bincount(objects, matched)
+    return np.asarray((meets >= config.min_object_share * np.bincount(objects, seen))[objects])
 
 
 def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: float) -> FloatArray:

@@ -130,10 +130,15 @@ def _simple(joint: JointConfig) -> JointConfig:
 
 def _heats(joint: JointConfig) -> list[JointConfig]:
     """Two kernels a heat while they are wide, the rest in the last one."""
-    kernels, half = joint.kernel_px, (len(joint.kernel_px) + 1) // 2
-    wide = [kernels[i : min(i + 2, half)] for i in range(0, half, 2)]
-    heats = [replace(joint, kernel_px=some, max_outer=len(some)) for some in wide]
-    return [*heats, replace(joint, kernel_px=kernels[half:] or kernels[-1:])]
+    half = (len(joint.kernel_px) + 1) // 2
+    wide = [joint.kernel_px[i : min(i + 2, half)] for i in range(0, half, 2)]
+    return [*(replace(joint, kernel_px=some, max_outer=len(some)) for some in wide), narrowed(joint)]
+
+
+def narrowed(joint: JointConfig) -> JointConfig:
+    """Settings from a start that is nearly right: wide kernels would only lead away from it."""
+    half = (len(joint.kernel_px) + 1) // 2
+    return replace(joint, kernel_px=joint.kernel_px[half:] or joint.kernel_px[-1:])
 
 
 def _survivors(solutions: Sequence[JointSolution], config: StartConfig) -> list[State]:
