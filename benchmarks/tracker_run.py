@@ -1,7 +1,7 @@
 """A long run of the tracker: cost of a frame, its growth, memory, alarms. Prints one JSON document.
 
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000
-    python benchmarks/tracker_run.py --frames 400 --step knock --step-at 300
+    python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
 
 A short simulated drive (no time offset) is played forth and back under rising stamps: a drive reversed in
 time is a drive. Times are CPU seconds of this process, for a busy machine must not count.
@@ -26,6 +26,7 @@ from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.types import CameraImage, Frame
 
 PERIOD_NS = 100_000_000
+KNOCK = gtsam.Rot3.Ry(np.radians(1.0))
 
 
 def endless(frames: list[Frame], total: int) -> Iterator[Frame]:
@@ -46,7 +47,7 @@ def changed(image: CameraImage, drive: SimulatedDrive, step: str) -> CameraImage
     if step == "clock":
         return dataclasses.replace(image, stamp_ns=image.stamp_ns + 30_000_000)
     K = drive.camera.matrix
-    H = K @ gtsam.Rot3.Ry(np.radians(1.0)).matrix() @ np.linalg.inv(K)
+    H = K @ KNOCK.matrix() @ np.linalg.inv(K)
     size = (drive.camera.width, drive.camera.height)
     mask = cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
     return dataclasses.replace(image, mask=mask)
@@ -87,7 +88,10 @@ def main() -> None:
             chi2.append(update.chi2)
     settled = np.array(costs[100:])
     block = min(500, len(settled) // 2)
-    error = drive.truth.cTl.between(tracker.point.cTl)
+    truth = drive.truth.cTl
+    if args.step == "knock":
+        truth = gtsam.Pose3(KNOCK, np.zeros(3)) * truth
+    error = truth.between(tracker.point.cTl)
     report = {
         "frames": args.frames,
         "ms_median": float(np.median(settled)),
