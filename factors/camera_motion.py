@@ -84,32 +84,51 @@ def camera_motion_factor(
     dims = [6] * len(poses) + [6] * (E is not None) + [1] * (D is not None)
     if len(set(keys)) != len(keys):
         raise FactorError("keys of a camera motion", "one key for two variables", "distinct keys")
-    lTb = gtsam.Pose3() if bTl is None else bTl.inverse()
+    chain = _Chain(first, second, cTl, offset_s, gtsam.Pose3() if bTl is None else bTl.inverse())
 
     def function(*values: Any, jacobians: bool) -> Any:
         named = dict(zip(keys, values, strict=True))
-        extrinsic = cTl if isinstance(cTl, gtsam.Pose3) else named[cTl]
-        offset = offset_s if D is None else float(named[D][0])
-        wTl_1, H_1 = _lidar_at(first, named, offset, lTb)
-        wTl_2, H_2 = _lidar_at(second, named, offset, lTb)
-        l1Tl2 = wTl_1.between(wTl_2)
-        error, error_H_P = error_of(extrinsic * l1Tl2 * extrinsic.inverse())
-        if not jacobians:
-            return error, None
-        # right perturbations: of c1Tc2 = cTl M cTl^-1 by M and cTl, of M = wTl_1^-1 wTl_2 by both
-        cAd, back = extrinsic.AdjointMap(), l1Tl2.inverse().AdjointMap()
-        by_motion = error_H_P @ cAd
-        H = {key: np.zeros((6, dim)) for key, dim in zip(keys, dims, strict=True)}
-        for where, L_H, lead in ((first, H_1, -by_motion @ back), (second, H_2, by_motion)):
-            H[where.X_a] += lead @ L_H[0]
-            H[where.X_b] += lead @ L_H[1]
-            if D is not None:
-                H[D] += (lead @ L_H[2]).reshape(6, 1)
-        if E is not None:
-            H[E] = error_H_P @ cAd @ (back - np.eye(6))
-        return error, [H[key] for key in keys]
+        predicted, P_H = chain.motion(named, jacobians)
+        error, error_H_P = error_of(predicted)
+        return error, [error_H_P @ P_H[key] for key in keys] if jacobians else None
 
     return custom_factor(noise, keys, function, dims, 6)
+
+
+@dataclass(frozen=True)
+class _Chain:
+    """From poses, extrinsic and offset to the camera's motion; attributes as in the factor's arguments."""
+
+    first: Between
+    second: Between
+    cTl: int | gtsam.Pose3
+    offset_s: int | float
+    lTb: gtsam.Pose3
+
+    def motion(self, named: dict[int, Any], jacobians: bool) -> tuple[gtsam.Pose3, dict[int, FloatArray]]:
+        """c1Tc2, and its right derivatives (6, dim) by the variables, where they are asked for."""
+        cTl, offset_s = self.cTl, self.offset_s
+        extrinsic = cTl if isinstance(cTl, gtsam.Pose3) else named[cTl]
+        offset = named[offset_s][0] if isinstance(offset_s, int | np.integer) else offset_s
+        wTl_1, H_1 = _lidar_at(self.first, named, offset, self.lTb)
+        wTl_2, H_2 = _lidar_at(self.second, named, offset, self.lTb)
+        l1Tl2 = wTl_1.between(wTl_2)
+        predicted = extrinsic * l1Tl2 * extrinsic.inverse()
+        if not jacobians:
+            return predicted, {}
+        # right perturbations: of cTl M cTl^-1 by M and cTl, of M = wTl_1^-1 wTl_2 by both
+        cAd, back = extrinsic.AdjointMap(), l1Tl2.inverse().AdjointMap()
+        H = {key: np.zeros((6, 6)) for p in (self.first, self.second) for key in (p.X_a, p.X_b)}
+        by_offset = np.zeros((6, 1))
+        for where, L_H, lead in ((self.first, H_1, -cAd @ back), (self.second, H_2, cAd)):
+            H[where.X_a] += lead @ L_H[0]
+            H[where.X_b] += lead @ L_H[1]
+            by_offset[:, 0] += lead @ L_H[2]
+        if isinstance(offset_s, int | np.integer):
+            H[int(offset_s)] = by_offset
+        if not isinstance(cTl, gtsam.Pose3):
+            H[int(cTl)] = cAd @ (back - np.eye(6))
+        return predicted, H
 
 
 def _lidar_at(

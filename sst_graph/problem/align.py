@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.alignment import Alignment
 from factors.camera import PinholeCamera
 from factors.robust import RobustKernel
-from sst_graph.association.silhouettes import MatchConfig, Motion, match_silhouettes
+from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import (
     ImageFeatures,
@@ -108,6 +108,10 @@ def align_frame(
         kernel,
         config,
     )
+    return _frame_alignments(found)
+
+
+def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> FrameAlignments:
     return FrameAlignments(
         tuple(found),
         tuple(matches.alignment for matches in found.values()),
