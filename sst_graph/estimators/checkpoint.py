@@ -216,7 +216,7 @@ def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
     arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"] = sums.JJ, sums.frames, sums.closed
     arrays["sums/live"] = np.array([row for row, _ in sums.live.values()])
     arrays["sums/sides"] = np.array([[side, last] for side, (_, last) in sums.live.items()], np.int64)
-    arrays["sums/recent"] = np.concatenate([np.zeros((0, 5)), *sums.recent])
+    arrays["sums/recent"] = np.concatenate([np.zeros((0, 6)), *sums.recent])
     return {
         "start_ns": smoother.epochs[0].start_ns,
         "entries": sorted(smoother.entries),

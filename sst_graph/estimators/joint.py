@@ -38,6 +38,9 @@ class JointConfig:
         max_outer: most outer iterations.
         step_sigmas: an outer step, at the last kernel scale, shorter than this many standard deviations of
             the frozen problem ends the outer loop.
+        full_steps: outer steps at the last kernel scale before they are shortened: matches that come and
+            go in turn would lead round in a circle, and the middle of it is the answer ...
+        circle_sigmas: ... if a full step there is shorter than this many standard deviations.
         inner_iterations: most Levenberg-Marquardt iterations on frozen matches.
         min_matches: fewest matches in all for an answer.
     """
@@ -46,6 +49,8 @@ class JointConfig:
     kernel_px: tuple[float, ...] = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
     max_outer: int = 40
     step_sigmas: float = 0.2
+    full_steps: int = 6
+    circle_sigmas: float = 1.5
     inner_iterations: int = 4
     min_matches: int = 30
 
@@ -105,17 +110,18 @@ def solve_joint(
         if belief is not None:
             graph.add(belief)
         values = _optimise(graph, values, config.inner_iterations)
-        # 3. Move; stop when the step is small at the last scale.
-        moved = state_from(values, state, pairs)
-        last, state = state, moved
+        # 3. Move, by less and less of the step when matches come and go in turn.
+        rested = outer + 1 - len(config.kernel_px)
+        share = 1.0 / (1.0 + max(0, rested - config.full_steps))
+        last, state = state, state.towards(state_from(values, state, pairs), share)
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
-        if (
-            outer + 1 >= len(config.kernel_px)
-            and _step_sigmas(last, pairs, graph, values) < config.step_sigmas
-        ):
-            converged = True
-            break
+        # 4. Stop when the step is small at the last scale.
+        if rested >= 0:
+            step = _step_sigmas(last, pairs, graph, values)
+            if share * step < config.step_sigmas:
+                converged = step < config.circle_sigmas
+                break
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, len(pairs))
     return JointSolution(state, pairs, graph, values, outer + 1, converged)
 

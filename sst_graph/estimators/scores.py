@@ -23,7 +23,7 @@ from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.state import object_bias_key
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import SIDE_FLOOR, SIDE_FRAME_FLOOR, ErrorModel, spread_beyond
+from sst_graph.uncertainty.covariance import ErrorModel, spread_beyond, with_floors
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -42,6 +42,7 @@ class SideSums:
         means: (k,) weighted mean of the whitened residuals.
         weights, weights2: (k,) sums of the weights and of their squares.
         within: (k,) weighted sum of squares around the mean.
+        moved: whether the LiDAR moved: sides seen while it stands are one view.
     """
 
     sides: IntArray
@@ -50,6 +51,7 @@ class SideSums:
     weights: FloatArray
     weights2: FloatArray
     within: FloatArray
+    moved: bool = True
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,8 @@ def score_pair(
         np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp) * _SIDES + m.sides
         for c, m in pair.matches.items()
     ]
-    sides = _side_sums(J, r, roots, np.concatenate(side), share)
+    moved = pair.l_twist is not None and bool(pair.l_twist.twist.any())
+    sides = replace(_side_sums(J, r, roots, np.concatenate(side), share), moved=moved)
     return PairScore(belief, share * (J.T @ J), sides, sides.scores.T @ sides.scores, len(pair), places)
 
 
@@ -214,7 +217,7 @@ class ScoreSums:
     Attributes:
         JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side.
         live: running score of each side seen lately, and the scan that saw it last.
-        recent: (k, 5) [side, mean, weights, weights2, within] of the latest sides, for the error model.
+        recent: (k, 6) [side, mean, weights, weights2, within, moved] of the latest sides.
     """
 
     JJ: FloatArray
@@ -292,13 +295,14 @@ class ScoreSums:
 
 
 def _recent_rows(sides: SideSums) -> FloatArray:
-    return np.column_stack([sides.sides, sides.means, sides.weights, sides.weights2, sides.within])
+    moved = np.full(len(sides.sides), float(sides.moved))
+    return np.column_stack([sides.sides, sides.means, sides.weights, sides.weights2, sides.within, moved])
 
 
 def fit_sides(rows: FloatArray) -> ErrorModel:
-    """The batch's error model from the rows of sides, (k, 5) as in :class:`ScoreSums`."""
+    """The batch's error model from the rows of sides, (k, 6) as in :class:`ScoreSums`."""
     sides = np.unique(rows[:, 0], return_inverse=True)[1].reshape(-1)
-    means, weights, weights2, within = rows[:, 1:].T
+    means, weights, weights2, within, moved = rows[:, 1:].T
     freedom = float((weights - weights2 / np.maximum(weights, 1e-12)).sum())
     match = max(0.05, float(within.sum()) / max(freedom, 1e-9))
     count = weights**2 / np.maximum(weights2, 1e-12)
@@ -307,4 +311,6 @@ def fit_sides(rows: FloatArray) -> ErrorModel:
     total = np.bincount(sides, v)
     side_means = np.bincount(sides, v * means) / np.maximum(total, 1e-12)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(total), dtype=np.intp), centre=0.0)
-    return ErrorModel(max(side, SIDE_FLOOR), max(side_frame, SIDE_FRAME_FLOOR), match)
+    views = np.bincount(sides, moved) + (np.bincount(sides, 1.0 - moved) > 0)
+    seen = float(weights.sum() / (weights / views[sides]).sum())
+    return with_floors(side, side_frame, match, seen)

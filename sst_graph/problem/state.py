@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import gtsam
 
@@ -33,6 +34,9 @@ def bias_key(drive: int, semantic_class: SemanticClass) -> int:
 def object_bias_key(drive: int, track: int) -> int:
     """Key of the mask bias of one object, by its track (``Vector(1)``, px)."""
     return int(gtsam.symbol("O", drive * _IMAGES_PER_DRIVE + track))
+
+
+_Key = TypeVar("_Key")
 
 
 @dataclass(frozen=True)
@@ -67,3 +71,19 @@ class State:
     def biases_of(self, drive: int) -> dict[SemanticClass, float]:
         """Mask biases of a drive by class [px]."""
         return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}
+
+    def towards(self, other: State, share: float) -> State:
+        """The state this share of the way to another one, which knows every bias that this one does."""
+        if share >= 1.0:
+            return other
+        step = share * gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        return State(
+            self.cTl.compose(gtsam.Pose3.Expmap(step)),
+            tuple(a + share * (b - a) for a, b in zip(self.offsets_s, other.offsets_s, strict=True)),
+            _between(self.biases_px, other.biases_px, share),
+            _between(self.object_biases_px, other.object_biases_px, share),
+        )
+
+
+def _between(mine: Mapping[_Key, float], its: Mapping[_Key, float], share: float) -> dict[_Key, float]:
+    return {key: (1.0 - share) * mine.get(key, value) + share * value for key, value in its.items()}

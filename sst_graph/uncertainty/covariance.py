@@ -49,6 +49,7 @@ class MatchTable:
         r: (m,) whitened residuals, unweighted.
         sides: (m,) number of the object's side over all frames.
         side_frames: (m,) number of the object's side in its frame.
+        views: from how many different places a side was seen: weighted harmonic mean over the matches.
     """
 
     J: FloatArray
@@ -56,6 +57,7 @@ class MatchTable:
     r: FloatArray
     sides: IntArray
     side_frames: IntArray
+    views: float
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ def match_table(
     unknowns: Unknowns,
 ) -> MatchTable:
     """All matches of the frozen graph at a state, with the clusters they belong to."""
-    blocks, weights, residuals, sides, frames = [], [], [], [], []
+    blocks, weights, residuals, sides, frames, moving = [], [], [], [], [], []
     for number, pair in enumerate(pairs):
         for c, matches in pair.matches.items():
             block, root, r = _rows(pair, c, state, unknowns)
@@ -99,12 +101,15 @@ def match_table(
             side = (np.array(track) * SIDES + matches.sides) * 64 + pair.drive
             sides.append(side)
             frames.append(side + number * 1_000_000_000)
+            moving.append(np.full(len(side), pair.l_twist is not None and bool(pair.l_twist.twist.any())))
+    side_of, frame_of = _numbered(np.concatenate(sides)), _numbered(np.concatenate(frames))
     return MatchTable(
         np.concatenate(blocks),
         np.concatenate(weights),
         np.concatenate(residuals),
-        _numbered(np.concatenate(sides)),
-        _numbered(np.concatenate(frames)),
+        side_of,
+        frame_of,
+        _views(side_of, frame_of, np.concatenate(moving), np.concatenate(weights) ** 2),
     )
 
 
@@ -132,15 +137,31 @@ def _rows(
     return block, roots, residuals
 
 
+def _views(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
+    """Weighted harmonic mean of the number of views of their side; all standing frames are one."""
+    first = np.unique(frames, return_index=True)[1]
+    moved = np.bincount(sides[first], moving[first])
+    stood = np.bincount(sides[first], ~moving[first]) > 0
+    return float(weights.sum() / (weights / (moved + stood)[sides]).sum())
+
+
 def _numbered(labels: IntArray) -> IntArray:
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
-SIDE_FLOOR, SIDE_FRAME_FLOOR = 0.3, 0.1
-"""Least variances of a side, over all frames and in one, in whitened units: about 0.7 px and 0.4 px.
+_SIDE, _VIEW, _SIDE_FRAME = 0.17, 0.42, 0.17
+"""Least variances as shares of a match's own: of a side for good, of a side while it is seen from one place
+(beams and mask are then the same in every frame), of a side in one frame.
 
 The mask biases of the objects are fitted to the same residuals and swallow most of what a side has in
-common, so the residuals alone would make a short drive far too sure."""
+common, so the residuals alone would make a short drive far too sure. Where contours are rough within a
+side, they are rough as a whole too: hence shares."""
+
+
+def with_floors(side: float, side_frame: float, match: float, views: float) -> ErrorModel:
+    """The error model with each variance at its least or above; sides were seen from so many places."""
+    least = (_SIDE + _VIEW / max(views, 1.0)) * match
+    return ErrorModel(max(side, least), max(side_frame, _SIDE_FRAME * match), match)
 
 
 def fit_error_model(table: MatchTable) -> ErrorModel:
@@ -158,7 +179,7 @@ def fit_error_model(table: MatchTable) -> ErrorModel:
     v = 1.0 / (match / count + side_frame)
     side_mean, side_w, _ = _means(frame_mean, v, side_of_frame)
     side = spread_beyond(side_mean, 1.0 / side_w, np.zeros(len(side_mean), dtype=np.intp), centre=0.0)
-    return ErrorModel(max(side, SIDE_FLOOR), max(side_frame, SIDE_FRAME_FLOOR), match)
+    return with_floors(side, side_frame, match, table.views)
 
 
 def _means(values: FloatArray, w: FloatArray, groups: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -230,5 +230,3 @@ def test_bad_ground_truth_is_refused(drive: Path, content: str, message: str) ->
 def test_bad_ranges_are_refused(drive: Path, frames: str | slice) -> None:
     with pytest.raises(ConfigError, match=r"^frames .*(the drive has frames 0:5|expected)"):
         open_source(drive, frames=frames)
-
-

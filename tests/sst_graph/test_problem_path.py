@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -25,7 +26,7 @@ def weaving(t: float) -> gtsam.Pose3:
 def motions(pose: Callable[[float], gtsam.Pose3], stamps_ns: list[int]) -> list[RelativeMotion]:
     return [
         RelativeMotion(a, b, pose(a * 1e-9).between(pose(b * 1e-9)), COVARIANCE)
-        for a, b in zip(stamps_ns, stamps_ns[1:], strict=False)
+        for a, b in itertools.pairwise(stamps_ns)
     ]
 
 

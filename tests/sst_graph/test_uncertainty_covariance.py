@@ -11,8 +11,6 @@ import pytest
 from sst_graph.problem.state import EXTRINSIC, bias_key, delay_key, twist_key
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
-    SIDE_FLOOR,
-    SIDE_FRAME_FLOOR,
     ErrorModel,
     MatchTable,
     Unknowns,
@@ -20,6 +18,7 @@ from sst_graph.uncertainty.covariance import (
     marginal_covariance,
     score_variance,
     spread_beyond,
+    with_floors,
 )
 
 VEHICLE = SemanticClass.VEHICLE
@@ -32,7 +31,7 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
     frames = sides * 3 + rng.integers(0, 3, m)
     roots = rng.uniform(0.1, 1.0, m)
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
-    return MatchTable(J, roots, rng.normal(size=m), sides, np.unique(frames, return_inverse=True)[1])
+    return MatchTable(J, roots, rng.normal(size=m), sides, np.unique(frames, return_inverse=True)[1], 5.0)
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
@@ -45,7 +44,7 @@ def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
         + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
-    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames)
+    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames, 5.0)
 
 
 def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
@@ -93,8 +92,15 @@ def test_fitted_variances_are_those_drawn() -> None:
 
 def test_floors() -> None:
     fitted = fit_error_model(drawn_table(ErrorModel(0.0, 0.0, 1.0), 0))
-    assert (fitted.side, fitted.side_frame) == (SIDE_FLOOR, SIDE_FRAME_FLOOR)
+    assert fitted == with_floors(0.0, 0.0, fitted.match, 5.0)
+    assert min(fitted.side, fitted.side_frame) > 0.1 * fitted.match
     assert fitted.match == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_side_seen_from_one_place_is_trusted_less() -> None:
+    sides = [with_floors(0.0, 0.0, 1.0, views).side for views in (0.0, 1.0, 20.0)]
+    assert sides[0] == sides[1] > 2.0 * sides[2]
+    assert with_floors(9.0, 8.0, 1.0, 1.0) == ErrorModel(9.0, 8.0, 1.0)
 
 
 def test_spread_beyond() -> None:
