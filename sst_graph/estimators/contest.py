@@ -86,7 +86,7 @@ def hold_contest(
         State(candidate.cTl, (candidate.offset_s,))
         for candidate in _with_offsets(candidates[:contenders], guess_offset_s)
     ]
-    for heat in _heats(_simple(joint)):
+    for heat in _heats(_simple(joint, config)):
         contestants = [(start, prior_centre(start, guess_cTl, guess_offset_s)) for start in starts]
         solutions = _solve_all(few, contestants, heat, tracks)
         starts = _survivors(solutions, config)
@@ -123,9 +123,11 @@ def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> lis
     return [*candidates, *others]
 
 
-def _simple(joint: JointConfig) -> JointConfig:
-    """Settings good enough to compare with: one mask bias a class."""
-    return replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0), min_matches=1)
+def _simple(joint: JointConfig, config: StartConfig) -> JointConfig:
+    """Settings to compare with: one mask bias a class, only objects that are matched well."""
+    match = joint.graph.match
+    match = replace(match, min_object_share=max(match.min_object_share, config.min_object_share))
+    return replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0, match=match), min_matches=1)
 
 
 def _heats(joint: JointConfig) -> list[JointConfig]:

@@ -32,6 +32,8 @@ class StartConfig:
         finalists: most different solutions of the contest that are solved on all frames.
         contest_scans: scans of each drive that they are compared on.
         survivors: fewest different solutions that go on from one heat of the contest to the next.
+        min_object_share: in the contest, an object of whose boundary in view less than this share finds a
+            match is left out.
         rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
             best one's makes the answer ambiguous.
         min_explained: least share of the boundary points in view that must meet a contour ...
@@ -47,6 +49,7 @@ class StartConfig:
     finalists: int = 2
     contest_scans: int = 10
     survivors: int = 3
+    min_object_share: float = 0.3
     rival_ratio: float = 0.9
     min_explained: float = 0.2
     min_concentration: float = 0.6
