@@ -115,7 +115,11 @@ def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
 def test_an_interrupted_run_leaves_nothing_at_all(tmp_path: Path) -> None:
     arguments = ["simulate", str(tmp_path / "drive"), *SMALL, "--set", "frames=150"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "sst_graph.cli", *arguments], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "sst_graph.cli", *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+        # Shells start jobs in the background with this signal ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not list(tmp_path.glob(".drive.*/sequences/00/velodyne/000001.bin")):

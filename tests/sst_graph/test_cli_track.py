@@ -75,7 +75,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ})
     assert process.stdout is not None
     for line in process.stdout:
-        if json.loads(line)["frame"] >= 13:
+        if json.loads(line)["frame"] >= 7:
             break
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -83,7 +83,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     time.sleep(0.01)
     main(["track", str(street), *OPTIONS, "--checkpoint", str(checkpoint), "--resume"])
     resumed = _lines(capsys.readouterr().out)
-    assert resumed[0]["frame"] in (9, 12, 15) and resumed[-1]["frame"] == 19
+    assert resumed[0]["frame"] in (6, 9, 12, 15, 18) and resumed[-1]["frame"] == 19
     a, b = unbroken[-1], resumed[-1]
     sigma = a["sigma_time_offset_s"]
     assert abs(a["time_offset_s"] - b["time_offset_s"]) < 0.3 * sigma
