@@ -51,7 +51,7 @@ _STANDING = {"motion": "standing", "frames": 3, "time_offset_s": 0.0}
 _STOP = {"motion": "mixed", "frames": 40, "time_offset_s": 0.1}
 
 SCENARIOS: Mapping[str, Scenario] = {
-    "standing": Scenario("standing, 3 frames", _STANDING, starts=5),
+    "standing": Scenario("standing, 3 frames", _STANDING, starts=10),
     "standing-none": Scenario("standing, 3 frames, no guess", _STANDING, guess=False),
     "stop-100": Scenario("moving with a stop, 40 frames, 100 ms", _STOP),
     "stop-200": Scenario("the same, 200 ms", {**_STOP, "time_offset_s": 0.2}),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, drives, motion, paper_table, slam
+from sst_graph.experiments import accuracy, consistency, drives, motion, paper_table, slam
 from sst_graph.problem.drive import Progress
 
 
@@ -31,6 +31,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "accuracy, failures and consistency of the joint method, scenario by scenario",
         accuracy.AccuracyConfig(),
         accuracy.run,
+    ),
+    "consistency": Experiment(
+        "NEES and coverage of the covariance over many short simulated drives",
+        consistency.ConsistencyConfig(),
+        consistency.run,
     ),
     "drives": Experiment(
         "real drives from many wrong starts: one answer, and its distance from the reference",

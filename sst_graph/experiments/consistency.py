@@ -1,0 +1,132 @@
+"""Does the covariance hold? NEES and coverage of the joint method over many short simulated drives."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.types import GroundTruth
+
+FloatArray = NDArray[np.float64]
+
+DRIVES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "standing": ("standing, 3 frames", {"motion": "standing", "frames": 3, "time_offset_s": 0.0}),
+    "stop": ("with a stop, 12 frames", {"motion": "mixed", "frames": 12, "time_offset_s": 0.1}),
+    "no-stop": ("varied speed, 12 frames", {"motion": "no_stop", "frames": 12, "time_offset_s": 0.1}),
+}
+"""Title and the simulator's settings of every kind of drive."""
+
+
+@dataclass(frozen=True)
+class ConsistencyConfig:
+    """Streets and starts; every run has a street of its own.
+
+    Attributes:
+        runs: of each kind of drive.
+        drives: kinds of drives.
+        seed: of the first street; the next ones follow.
+        start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
+        lost_deg: a rotation error beyond this is a wrong answer, not a matter of covariance [deg].
+        label_noise: of the simulator.
+        calibration: settings of the method.
+    """
+
+    runs: int = 100
+    drives: tuple[str, ...] = tuple(DRIVES)
+    seed: int = 1000
+    start_deg: float = 10.0
+    start_m: float = 0.1
+    lost_deg: float = 2.0
+    label_noise: float = 1.0
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.drives if name not in DRIVES]
+        if unknown or not self.drives or self.runs < 2:
+            raise ValueError(f"drives: found {unknown or 'none'}, expected some of {', '.join(DRIVES)}")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Error (7,) in the covariance's own coordinates, covariance (7, 7), whether the status is a doubt."""
+
+    error: FloatArray
+    covariance: FloatArray
+    doubted: bool
+
+    def nees(self, part: slice) -> float:
+        """Normalised estimation error squared of some of the seven."""
+        return float(self.error[part] @ np.linalg.solve(self.covariance[part, part], self.error[part]))
+
+
+def run(config: ConsistencyConfig, progress: Progress | None = None) -> str:
+    """A Markdown table, one row for every kind of drive and one for all."""
+    rows = [_HEADER, "|---|---|---|---|---|---|---|"]
+    everything: list[Run] = []
+    for name in config.drives:
+        title, drive = DRIVES[name]
+        runs = []
+        for number in range(config.runs):
+            runs.append(_run(drive, config.seed + number, config))
+            if progress is not None:
+                progress(name, number + 1, config.runs)
+        rows.append(row(title, runs, config.lost_deg, tells_delay=name != "standing"))
+        everything += runs
+    if len(config.drives) > 1:
+        rows.append(row("all", everything, config.lost_deg, tells_delay=False))
+    return "\n".join(rows) + "\n"
+
+
+def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
+    simulated = simulate(SimulationConfig(seed=seed, label_noise=config.label_noise, **drive))
+    prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
+    prepared = prepare_drive(simulated, config.calibration.classes, prepare)
+    rng = np.random.default_rng([seed, 11])
+    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
+    shift = config.start_m * rng.uniform(-1.0, 1.0, 3)
+    start = simulated.truth.cTl.retract(np.concatenate([turn, shift]))
+    result = calibrate_prepared([prepared], start, config.calibration)
+    error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
+    return Run(error, result.covariance, result.status == "not_converged" or not result.frames_used)
+
+
+def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:
+    """Truth minus estimate in the estimate's tangent space (7,) [rad, m, s]."""
+    return np.append(gtsam.Pose3.Logmap(cTl.between(truth.cTl)), (truth.time_offset_s or 0.0) - offset_s)
+
+
+_HEADER = (
+    "| drive | runs (doubted, lost) | NEES / dimension: rotation | translation | delay | all "
+    "| within 95 % intervals: rotation, translation, delay |"
+)
+
+
+def row(title: str, runs: Sequence[Run], lost_deg: float, tells_delay: bool) -> str:
+    """A row of the table. Doubted runs (no claim is made) and lost ones are counted, the rest judged."""
+    claimed = [r for r in runs if not r.doubted]
+    kept = [r for r in claimed if np.degrees(np.linalg.norm(r.error[:3])) < lost_deg]
+    parts = {"rotation": slice(0, 3), "translation": slice(3, 6), "delay": slice(6, 7), "all": slice(0, 7)}
+    nees = {
+        name: np.mean([r.nees(part) for r in kept]) / (part.stop - part.start) for name, part in parts.items()
+    }
+    inside = np.array([np.abs(r.error) < 1.96 * np.sqrt(np.diag(r.covariance)) for r in kept])
+    cover = [100.0 * inside[:, part].mean() for part in list(parts.values())[: 3 if tells_delay else 2]]
+    cells = [
+        title,
+        f"{len(runs)} ({len(runs) - len(claimed)}, {len(claimed) - len(kept)})",
+        f"{nees['rotation']:.2f}",
+        f"{nees['translation']:.2f}",
+        f"{nees['delay']:.2f}" if tells_delay else "–",
+        f"{nees['all']:.2f}",
+        ", ".join(f"{share:.0f} %" for share in cover),
+    ]
+    return "| " + " | ".join(cells) + " |"
