@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -74,6 +76,26 @@ def test_top_half_way_to_the_ring_above_at_the_objects_range() -> None:
     np.testing.assert_allclose(rho, 10.0, atol=1e-4)
     np.testing.assert_allclose(top.lPs[:, 2], between, atol=1e-4)
     np.testing.assert_array_less(top.lPs[:, 2], top.outward[:, 2])
+
+
+@pytest.mark.parametrize("ground_m", [6.0, 9.5, 14.0])
+def test_bottom_half_way_to_the_ring_that_meets_the_ground(ground_m: float) -> None:
+    """The plate ends above the ground, which the rings below meet before or behind it."""
+    scan, low = scene(), np.radians(-1.0)
+    azimuth, elevation, _ = (np.radians(a) for a in polar_deg(scan.points))
+    below = (scan.classes == VEHICLE) & (elevation < low)
+    rho = np.where(below, ground_m, np.hypot(scan.points[:, 0], scan.points[:, 1]))
+    points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), rho * np.tan(elevation)], axis=1)
+    classes = np.where(below, OTHER, scan.classes).astype(np.uint8)
+    cut = replace(scan, points=points.astype(np.float32), classes=classes)
+    found = found_in(cut, BoundaryConfig(bottom_edges=True))
+    bottom = found.take(np.flatnonzero(found.edges == Edge.BOTTOM))
+    assert len(bottom) == np.count_nonzero(np.abs(AZIMUTHS) < np.radians(5.0))
+    last = ELEVATIONS[low - 1e-9 < ELEVATIONS][0]
+    between = 0.5 * (np.tan(last) + np.tan(last - np.radians(RING_DEG))) * 10.0
+    np.testing.assert_allclose(bottom.lPs[:, 2], between, atol=2e-4)
+    np.testing.assert_array_less(bottom.outward[:, 2], bottom.lPs[:, 2])
+    assert Edge.BOTTOM not in found_in(cut).edges
 
 
 def test_nothing_where_the_neighbour_is_nearer_or_as_far() -> None:

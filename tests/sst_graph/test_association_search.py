@@ -7,11 +7,12 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from streets import standing_street
 
 from factors import PinholeCamera
 from sst_graph.association.search import Candidate, SearchConfig, rotation_matrices, search_start
-from sst_graph.association.votes import SearchFrame, States, Votes
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.association.votes import Judge, SearchFrame, States, Votes
+from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.errors import EstimationError
 from sst_graph.types import SemanticClass
 
@@ -21,17 +22,7 @@ VEHICLE = SemanticClass.VEHICLE
 @cache
 def drive() -> tuple[SimulatedDrive, tuple[SearchFrame, ...]]:
     """Three frames of a standing drive, as the search sees them."""
-    source = simulate(
-        SimulationConfig(
-            seed=3,
-            frames=3,
-            width=621,
-            height=188,
-            motion="standing",
-            time_offset_s=0.0,
-            azimuth_step_deg=0.35,
-        )
-    )
+    source = standing_street()
     frames = []
     for frame in source:
         assert frame.scan is not None and frame.image is not None
@@ -84,8 +75,9 @@ def test_the_same_seed_gives_the_same_answer() -> None:
     assert all(a.cTl.equals(b.cTl, 0.0) for a, b in zip(first, second, strict=True))
 
 
+@pytest.mark.parametrize("judge", ["votes", "dependence"])
 @pytest.mark.parametrize("blur_px", [45.0, 10.0, 4.0])
-def test_the_truth_scores_above_wrong_poses(blur_px: float) -> None:
+def test_the_truth_scores_above_wrong_poses(blur_px: float, judge: Judge) -> None:
     source, frames = drive()
     votes = Votes.gather(frames, source.camera, [VEHICLE], 250, np.random.default_rng(0))
     assert not votes.moving
@@ -93,7 +85,7 @@ def test_the_truth_scores_above_wrong_poses(blur_px: float) -> None:
     turns = np.concatenate([np.zeros((1, 3)), np.radians(12.0) * np.eye(3), -np.radians(12.0) * np.eye(3)])
     rotations = rotation_matrices(turns) @ truth.rotation().matrix()
     states = States(rotations, np.tile(truth.translation(), (7, 1)), np.zeros(7))
-    scores = votes.level(blur_px, 1.0).score(states)
+    scores = votes.level(blur_px, 1.0, judge).score(states)
     assert int(scores.argmax()) == 0 and scores[0] > 0.0
 
 
@@ -117,6 +109,39 @@ def test_moving_points_go_to_their_images_instant() -> None:
     # u = 320 + 100 * 6 / 5 = 440 with tau = 0.4 + 0.1 s, and 380 with tau = 0.
     scores = votes.level(4.0, 1.0).score(states)
     assert scores[0] > 0.0 > scores[1]
+
+
+def test_dependence_by_hand() -> None:
+    """Vehicles on the left half, whose mask is the left half: the G statistic of the 2x2 table."""
+    camera = PinholeCamera(100.0, 100.0, 320.0, 100.0, 640, 200)
+    mask = np.full((200, 640), SemanticClass.OTHER, np.uint8)
+    mask[:, :320] = VEHICLE
+    x = np.linspace(-2.9, 2.9, 40)  # one point a cell of the score
+    lPs = np.stack([x, 0.0 * x, np.ones(40)], axis=1)
+    kinds = {"fits": x < 0.0, "opposes": x > 0.0, "says nothing": x < 9.0}
+    scores = {}
+    for name, vehicles in kinds.items():
+        classes = np.where(vehicles, VEHICLE, SemanticClass.OTHER).astype(np.uint8)
+        frame = SearchFrame(lPs, classes, mask, 0.0, np.zeros(6))
+        votes = Votes.gather([frame], camera, [VEHICLE], 40, np.random.default_rng(0))
+        states = States(np.eye(3)[None], np.zeros((1, 3)), np.zeros(1))
+        scores[name] = float(votes.level(0.5, 1.0, "dependence").score(states)[0])
+    assert scores["fits"] == pytest.approx(-scores["opposes"], rel=0.05)
+    assert scores["fits"] > 5.0 and abs(scores["says nothing"]) < 1e-6
+
+
+def test_a_view_of_one_class_only_says_nothing() -> None:
+    """All points on one large mask: votes like it, dependence does not."""
+    camera = PinholeCamera(100.0, 100.0, 320.0, 100.0, 640, 200)
+    mask = np.full((200, 640), SemanticClass.OTHER, np.uint8)
+    mask[:, 100:540] = VEHICLE
+    x = np.linspace(-1.5, 1.5, 40)
+    lPs = np.stack([x, 0.0 * x, np.ones(40)], axis=1)
+    frame = SearchFrame(lPs, np.full(40, VEHICLE, np.uint8), mask, 0.0, np.zeros(6))
+    votes = Votes.gather([frame], camera, [VEHICLE], 40, np.random.default_rng(0))
+    states = States(np.eye(3)[None], np.zeros((1, 3)), np.zeros(1))
+    assert votes.level(4.0, 1.0, "votes").score(states)[0] > 1.0
+    assert votes.level(4.0, 1.0, "dependence").score(states)[0] < 0.5
 
 
 def test_nothing_to_search_with() -> None:

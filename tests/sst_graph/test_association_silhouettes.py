@@ -144,6 +144,19 @@ def test_sides_objects_and_top_edges() -> None:
     np.testing.assert_array_equal(without.index, np.flatnonzero(~top))
 
 
+def test_an_object_without_a_mask_is_left_out() -> None:
+    # The second object's points lie off the disc, but for a few that cross its rim by accident.
+    points, stray = ring(), np.arange(90) >= 50
+    shifted = points.lPs + stray[:, None] * np.array(CTL.rotation().unrotate(np.array([0.0, 2.0, 0.0])))
+    moved = replace(points, lPs=shifted, outward=points.outward + (shifted - points.lPs))
+    few = replace(moved, lPs=np.where((np.arange(90) < 50)[:, None], points.lPs, shifted))
+    strict = match(few, config=MatchConfig(min_object_share=0.3))
+    lenient = match(few, config=MatchConfig(min_object_share=0.0))
+    assert set(strict.objects) == {0} and set(lenient.objects) == {0, 1}
+    assert strict.seen == lenient.seen <= 90
+    assert len(strict) < len(lenient) < 70
+
+
 def test_sigmas_and_weights() -> None:
     config = MatchConfig(mask_sigma_px=1.2, side_sigma_px=0.7)
     found = match(ring(), config=config)

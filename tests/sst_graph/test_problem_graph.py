@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import gtsam
 import numpy as np
 import pytest
+from streets import prepared_street, standing_street
 
 from factors import RobustKernel
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
 from sst_graph.problem.graph import (
     GraphConfig,
     PairMatches,
@@ -28,25 +25,8 @@ VEHICLE = SemanticClass.VEHICLE
 CONFIG = GraphConfig()
 
 
-@cache
-def prepared() -> tuple[SimulatedDrive, Drive]:
-    source = simulate(
-        SimulationConfig(
-            seed=3,
-            frames=3,
-            width=621,
-            height=188,
-            motion="standing",
-            time_offset_s=0.0,
-            azimuth_step_deg=0.35,
-            label_noise=0.0,
-        )
-    )
-    return source, prepare_drive(source, [VEHICLE], PrepareConfig(use_visual_odometry=False))
-
-
 def matched(by_object: bool) -> tuple[State, list[PairMatches]]:
-    source, drive = prepared()
+    source, drive = standing_street(0.0), prepared_street(0.0)
     tracks = Tracks([drive], [object_tracks(drive)] if by_object else None)
     state = State(source.truth.cTl)
     return state, associate([drive], tracks, state, RobustKernel("geman_mcclure", 3.0), CONFIG)
@@ -69,6 +49,18 @@ def test_clocks_and_biases_of_a_state() -> None:
     # An object's bias is its class's until it has its own.
     assert [shared.object_bias_px(0, t, VEHICLE) for t in (7, 8)] == [0.8, 0.5]
     assert shared.object_bias_px(2, 7, VEHICLE) == 0.0
+
+
+def test_part_of_the_way_to_another_state() -> None:
+    turn = np.array([0.1, -0.2, 0.3, 1.0, 2.0, -1.0])
+    here = State(gtsam.Pose3(), (0.0, 1.0), {(0, VEHICLE): 1.0}, {(0, 7): 1.0})
+    there = State(gtsam.Pose3.Expmap(turn), (1.0, 1.0), {(0, VEHICLE): 3.0}, {(0, 7): 2.0, (0, 8): 5.0})
+    way = here.towards(there, 0.25)
+    np.testing.assert_allclose(gtsam.Pose3.Logmap(way.cTl), 0.25 * turn, atol=1e-12)
+    assert way.offsets_s == (0.25, 1.0) and way.biases_px == {(0, VEHICLE): 1.5}
+    # A bias that was not known before is taken over.
+    assert way.object_biases_px == {(0, 7): 1.25, (0, 8): 5.0}
+    assert here.towards(there, 1.0) is there
 
 
 @pytest.mark.parametrize("by_object", [False, True])

@@ -1,0 +1,33 @@
+"""Small simulated drives that several test modules look at, made once a process."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
+from sst_graph.types import SemanticClass
+
+
+@cache
+def standing_street(label_noise: float = 1.0) -> SimulatedDrive:
+    """Three frames of a standing drive at half the usual size."""
+    return simulate(
+        SimulationConfig(
+            seed=3,
+            frames=3,
+            width=621,
+            height=188,
+            motion="standing",
+            time_offset_s=0.0,
+            azimuth_step_deg=0.35,
+            label_noise=label_noise,
+        )
+    )
+
+
+@cache
+def prepared_street(label_noise: float = 1.0) -> Drive:
+    """:func:`standing_street`, reduced to what calibration needs of its vehicles."""
+    config = PrepareConfig(use_visual_odometry=False)
+    return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
