@@ -141,7 +141,8 @@ def answer_joint(
         solution.state.offsets_s[0],
         covariance[:7, :7],
         _frames_used(drives, solution),
-        doubts=(*_doubts(solution, finals[1:], covariance, contest, evidence, config), *heard.doubts),
+        remarks=_remarks(drives),
+        doubts=(*_doubts(solution, finals[1:], covariance, contest, evidence, guess, config), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -194,6 +195,7 @@ def _doubts(
     covariance: FloatArray,
     contest: Contest,
     evidence: Mapping[str, float],
+    guess: Guess,
     config: CalibrationConfig,
 ) -> tuple[str, ...]:
     """Why the joint estimate may be wrong altogether."""
@@ -209,6 +211,10 @@ def _doubts(
                 f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
                 "the pose may be wrong altogether"
             )
+    if config.start.enabled and guess.cTl is not None:
+        far = float(np.linalg.norm(solution.state.cTl.translation() - guess.cTl.translation()))
+        if far > 1.5 * config.start.search.translation_m:
+            doubts.append(f"the answer lies {far:.2f} m from the guess, farther than was searched")
     for other in others:
         step = np.append(
             gtsam.Pose3.Logmap(solution.state.cTl.between(other.state.cTl)),
@@ -222,6 +228,16 @@ def _doubts(
                 "that explains the labels almost as well"
             )
     return tuple(doubts)
+
+
+def _remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
+    """What was taken for granted."""
+    if all(drive.lidar_motions for drive in drives):
+        return ()
+    return (
+        "a single scan tells no motion and was taken as standing: at 1 m/s every 100 ms between scan and "
+        "image would shift the translation by 10 cm; give its neighbours too",
+    )
 
 
 def _frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:

@@ -60,7 +60,7 @@ def choose_start(
         return contest
     cTl, offset_s = contest.finalists[0]
     closer = find_start(drives, tracks, classes, cTl, guess_offset_s, config)
-    closer = [Candidate(cTl, offset_s, contest.score), *closer]
+    closer = [Candidate(cTl, offset_s, contest.score), *closer[: config.contenders]]
     return hold_contest(drives, tracks, closer, None, guess_offset_s, joint, config)
 
 
@@ -188,9 +188,9 @@ def prior_centre(start: State, guess_cTl: gtsam.Pose3 | None, guess_offset_s: fl
 def _is_within(solution: JointSolution, guess: gtsam.Pose3 | None, config: StartConfig) -> bool:
     """Whether the translation stayed where it was searched, and did not run away with the points."""
     search = config.search
-    limit = search.free_translation_m if guess is None else 2.0 * search.translation_m
+    limit = 1.25 * search.free_translation_m if guess is None else 1.75 * search.translation_m
     centre = np.zeros(3) if guess is None else np.asarray(guess.translation())
-    return float(np.linalg.norm(solution.state.cTl.translation() - centre)) < 1.25 * limit
+    return float(np.linalg.norm(solution.state.cTl.translation() - centre)) < limit
 
 
 def _doubt(solutions: Sequence[JointSolution], config: StartConfig) -> str | None:

@@ -23,7 +23,12 @@ from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.state import object_bias_key
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import ErrorModel, spread_beyond, with_floors
+from sst_graph.uncertainty.covariance import (
+    ErrorModel,
+    effective_views,
+    spread_beyond,
+    with_floors,
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -311,6 +316,4 @@ def fit_sides(rows: FloatArray) -> ErrorModel:
     total = np.bincount(sides, v)
     side_means = np.bincount(sides, v * means) / np.maximum(total, 1e-12)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(total), dtype=np.intp), centre=0.0)
-    views = np.bincount(sides, moved) + (np.bincount(sides, 1.0 - moved) > 0)
-    seen = float(weights.sum() / (weights / views[sides]).sum())
-    return with_floors(side, side_frame, match, seen)
+    return with_floors(side, side_frame, match, effective_views(sides, weights, moved > 0.5))

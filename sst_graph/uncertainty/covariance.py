@@ -49,7 +49,7 @@ class MatchTable:
         r: (m,) whitened residuals, unweighted.
         sides: (m,) number of the object's side over all frames.
         side_frames: (m,) number of the object's side in its frame.
-        views: from how many different places a side was seen: weighted harmonic mean over the matches.
+        views: from how many different places a side was seen: effective number, harmonic mean over the sides.
     """
 
     J: FloatArray
@@ -138,11 +138,24 @@ def _rows(
 
 
 def _views(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
-    """Weighted harmonic mean of the number of views of their side; all standing frames are one."""
-    first = np.unique(frames, return_index=True)[1]
-    moved = np.bincount(sides[first], moving[first])
-    stood = np.bincount(sides[first], ~moving[first]) > 0
-    return float(weights.sum() / (weights / (moved + stood)[sides]).sum())
+    """Effective number of views of a side, averaged harmonically: all its standing frames are one view."""
+    first, frame = np.unique(frames, return_index=True, return_inverse=True)[1:]
+    by_frame = np.asarray(np.bincount(frame.reshape(-1), weights), np.float64)
+    return effective_views(sides[first], by_frame, moving[first])
+
+
+def effective_views(sides: IntArray, weights: FloatArray, moving: NDArray[np.bool_]) -> float:
+    """(sum of weights)^2 / sum of squared weights of the views of a side, averaged over sides by weight.
+
+    Args:
+        sides, weights, moving: (k,) side, weight, and whether the LiDAR moved, of each side in each frame.
+    """
+    count = int(sides.max()) + 1 if len(sides) else 0
+    standing = np.bincount(sides, np.where(moving, 0.0, weights), count)
+    squares = np.bincount(sides, np.where(moving, weights**2, 0.0), count) + standing**2
+    total = np.bincount(sides, weights, count)
+    alone = squares / np.maximum(total, 1e-12) ** 2
+    return float(total.sum() / max(float((total * alone).sum()), 1e-12))
 
 
 def _numbered(labels: IntArray) -> IntArray:

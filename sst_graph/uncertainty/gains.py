@@ -222,8 +222,8 @@ def _entry(
     return FrameInformation(
         FrameId(drive.name, drive.scans[pair.pair.scan].index),
         0.5 * float(_log_det(without) - _log_det(full)) / float(np.log(2.0)),
-        np.sqrt(np.diag(without)) / sigmas,
-        np.sqrt(np.diag(so_far)) / sigmas,
+        np.sqrt(np.maximum(np.diag(without), 0.0)) / sigmas,
+        np.sqrt(np.maximum(np.diag(so_far), 0.0)) / sigmas,
         view,
         np.asarray(state.cTl.inverse().AdjointMap() @ pair.motion.c_twist),
         matches,

@@ -14,6 +14,7 @@ from sst_graph.uncertainty.covariance import (
     ErrorModel,
     MatchTable,
     Unknowns,
+    effective_views,
     fit_error_model,
     marginal_covariance,
     score_variance,
@@ -101,6 +102,17 @@ def test_a_side_seen_from_one_place_is_trusted_less() -> None:
     sides = [with_floors(0.0, 0.0, 1.0, views).side for views in (0.0, 1.0, 20.0)]
     assert sides[0] == sides[1] > 2.0 * sides[2]
     assert with_floors(9.0, 8.0, 1.0, 1.0) == ErrorModel(9.0, 8.0, 1.0)
+
+
+def test_effective_views() -> None:
+    """Four equal frames in motion are four views, four standing ones one; the heavier view counts alone."""
+    sides, moving = np.zeros(4, dtype=np.intp), np.ones(4, dtype=bool)
+    assert effective_views(sides, np.ones(4), moving) == pytest.approx(4.0)
+    assert effective_views(sides, np.ones(4), ~moving) == pytest.approx(1.0)
+    assert effective_views(sides, np.array([1e6, 1.0, 1.0, 1.0]), moving) == pytest.approx(1.0, abs=1e-4)
+    # Two sides of equal weight, one seen from four places and one from one: harmonic mean.
+    both = effective_views(np.repeat([0, 1], 4), np.ones(8), np.repeat([True, False], 4))
+    assert both == pytest.approx(2.0 / (1.0 / 4.0 + 1.0))
 
 
 def test_spread_beyond() -> None:
