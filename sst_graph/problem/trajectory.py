@@ -30,7 +30,8 @@ class TwistSample:
 
 
 class TwistTrack:
-    """Twists over time: linear between the middles of the measured intervals, constant beyond the ends.
+    """Twists over time: linear between the middles of the measured intervals,
+    carried on for half an interval beyond the ends, constant from there.
 
     The mean twist over an interval equals the twist at its middle up to the third derivative of the
     motion, so two intervals give twist and acceleration at the stamp between them.
