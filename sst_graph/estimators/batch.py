@@ -14,9 +14,9 @@ from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
-from sst_graph.estimators.contest import Contest, choose_start, narrowed, prior_centre
+from sst_graph.estimators.contest import Contest, choose_start, narrowed, prior_centre, solve_all
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained, solve_joint
+from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
@@ -176,17 +176,9 @@ def _finals(
     """
     clocks = len(drives) if config.delay_per_drive else 1
     joint = narrowed(config.joint) if config.start.enabled else config.joint
-    found, failures = [], []
-    for cTl, offset_s in contest.finalists:
-        start = State(cTl, (offset_s,) * clocks)
-        centre = prior_centre(start, guess.cTl, guess.offset_s)
-        try:
-            found.append(solve_joint(drives, start, joint, progress, centre, tracks))
-        except EstimationError as error:
-            failures.append(error)
-    if not found:
-        raise failures[0]
-    return sorted(found, key=agreement, reverse=True)
+    starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in contest.finalists]
+    centred = [(start, prior_centre(start, guess.cTl, guess.offset_s)) for start in starts]
+    return solve_all(drives, centred, joint, tracks, progress)
 
 
 def _doubts(

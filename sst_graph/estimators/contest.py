@@ -12,7 +12,7 @@ from sst_graph.association.search import Candidate
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
 from sst_graph.estimators.start import StartConfig, find_start
-from sst_graph.problem.drive import Drive
+from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
@@ -88,7 +88,7 @@ def hold_contest(
     ]
     for heat in _heats(_simple(joint, config)):
         contestants = [(start, prior_centre(start, guess_cTl, guess_offset_s)) for start in starts]
-        solutions = _solve_all(few, contestants, heat, tracks)
+        solutions = solve_all(few, contestants, heat, tracks)
         starts = _survivors(solutions, config)
     solutions = [solution for solution in solutions if _is_within(solution, guess_cTl, config)]
     if not solutions:
@@ -96,10 +96,14 @@ def hold_contest(
     return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config), candidates[0].score)
 
 
-def _solve_all(
-    drives: Sequence[Drive], starts: Sequence[tuple[State, State]], joint: JointConfig, tracks: Tracks
+def solve_all(
+    drives: Sequence[Drive],
+    starts: Sequence[tuple[State, State]],
+    joint: JointConfig,
+    tracks: Tracks,
+    progress: Progress | None = None,
 ) -> list[JointSolution]:
-    """Solutions from (start, what the weak priors are centred on), the best supported first.
+    """Solutions from (start, what the weak priors are centred on), the one that agrees best first.
 
     Raises:
         EstimationError: none leads anywhere.
@@ -107,7 +111,7 @@ def _solve_all(
     solutions, failures = [], []
     for start, centre in starts:
         try:
-            solutions.append(solve_joint(drives, start, joint, None, centre, tracks))
+            solutions.append(solve_joint(drives, start, joint, progress, centre, tracks))
         except EstimationError as error:
             failures.append(error)
     if not solutions:
