@@ -158,8 +158,7 @@ def concentration(
 
 def explained(solution: JointSolution) -> float:
     """Share of the boundary points in the images that a solution's :func:`support` stands for."""
-    seen = sum(matches.seen for pair in solution.pairs for matches in pair.matches.values())
-    return support(solution) / max(1, seen)
+    return support(solution) / _seen(solution)
 
 
 def agreement(solution: JointSolution) -> float:
@@ -167,7 +166,11 @@ def agreement(solution: JointSolution) -> float:
 
     The support alone prefers poses that bring many objects into view.
     """
-    return support(solution) * explained(solution)
+    return support(solution) ** 2 / _seen(solution)
+
+
+def _seen(solution: JointSolution) -> int:
+    return max(1, sum(matches.seen for pair in solution.pairs for matches in pair.matches.values()))
 
 
 def _check_matches(pairs: Sequence[PairMatches], config: JointConfig) -> None:

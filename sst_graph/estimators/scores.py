@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from factors import GroupedBias, frame_factor, twist_transfer_factor, velocity_factor
 from factors.alignment import weighted_residuals
 from factors.motion import twist_ad
+from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.state import object_bias_key
@@ -32,9 +33,6 @@ from sst_graph.uncertainty.covariance import (
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-
-_SIDES = 4
-"""More than there are sides of an object."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +150,10 @@ def score_pair(
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
     belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
     side = [
-        np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp) * _SIDES + m.sides
+        np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp) * SIDES + m.sides
         for c, m in pair.matches.items()
     ]
-    moved = pair.l_twist is not None and bool(pair.l_twist.twist.any())
-    sides = replace(_side_sums(J, r, roots, np.concatenate(side), share), moved=moved)
+    sides = replace(_side_sums(J, r, roots, np.concatenate(side), share), moved=pair.moved)
     return PairScore(belief, share * (J.T @ J), sides, sides.scores.T @ sides.scores, len(pair), places)
 
 

@@ -76,6 +76,11 @@ class PairMatches:
     def __len__(self) -> int:
         return sum(len(matches) for matches in self.matches.values())
 
+    @property
+    def moved(self) -> bool:
+        """Whether the LiDAR is known to move at the image's instant."""
+        return self.l_twist is not None and bool(self.l_twist.twist.any())
+
 
 class Tracks:
     """Twist tracks of all drives, and tracks of their objects where those are given; made once."""

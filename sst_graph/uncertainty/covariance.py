@@ -101,7 +101,7 @@ def match_table(
             side = (np.array(track) * SIDES + matches.sides) * 64 + pair.drive
             sides.append(side)
             frames.append(side + number * 1_000_000_000)
-            moving.append(np.full(len(side), pair.l_twist is not None and bool(pair.l_twist.twist.any())))
+            moving.append(np.full(len(side), pair.moved))
     side_of, frame_of = _numbered(np.concatenate(sides)), _numbered(np.concatenate(frames))
     return MatchTable(
         np.concatenate(blocks),
@@ -139,8 +139,8 @@ def _rows(
 
 def _views(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
     """Effective number of views of a side, averaged harmonically: all its standing frames are one view."""
-    first, frame = np.unique(frames, return_index=True, return_inverse=True)[1:]
-    by_frame = np.asarray(np.bincount(frame.reshape(-1), weights), np.float64)
+    first = np.unique(frames, return_index=True)[1]
+    by_frame = np.asarray(np.bincount(frames, weights), np.float64)
     return effective_views(sides[first], by_frame, moving[first])
 
 
