@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.problem.drive import Progress, prepare_drive
 from sst_graph.result import Status
@@ -131,18 +131,13 @@ def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outco
     rng = np.random.default_rng([seed, 7])
     outcomes = []
     for _ in range(scenario.starts):
-        start = _start(drive.truth.cTl, config, rng) if scenario.guess else None
+        start = start_near(drive.truth.cTl, config.start_deg, config.start_m, rng) if scenario.guess else None
         result = calibrate_prepared([prepared], start, calibration)
         errors = calibration_errors(
             result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
         )
         outcomes.append(Outcome(errors, result.status, errors.qad_deg > config.failed_deg))
     return outcomes
-
-
-def _start(cTl: gtsam.Pose3, config: AccuracyConfig, rng: np.random.Generator) -> gtsam.Pose3:
-    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
-    return cTl.retract(np.concatenate([turn, config.start_m * rng.uniform(-1.0, 1.0, 3)]))
 
 
 _HEADER = (

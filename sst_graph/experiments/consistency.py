@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.experiments.starts import start_near
 from sst_graph.problem.drive import Progress, prepare_drive
 from sst_graph.types import GroundTruth
 
@@ -91,9 +92,7 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
     prepared = prepare_drive(simulated, config.calibration.classes, prepare)
     rng = np.random.default_rng([seed, 11])
-    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
-    shift = config.start_m * rng.uniform(-1.0, 1.0, 3)
-    start = simulated.truth.cTl.retract(np.concatenate([turn, shift]))
+    start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
     result = calibrate_prepared([prepared], start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
     return Run(error, result.covariance, result.status == "not_converged" or not result.frames_used)

@@ -13,6 +13,7 @@ import numpy as np
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import Tracks
@@ -82,9 +83,7 @@ def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config:
     rng = np.random.default_rng([config.seed, shift])
     results = []
     for _ in range(config.starts):
-        turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
-        shift_m = config.start_m * rng.uniform(-1.0, 1.0, 3)
-        start = truth.cTl.retract(np.concatenate([turn, shift_m]))
+        start = start_near(truth.cTl, config.start_deg, config.start_m, rng)
         results.append(calibrate_prepared(drives, start, config.calibration))
     errors = [calibration_errors(r.T_camera_lidar, r.time_offset_s, truth, None) for r in results]
     cells = [

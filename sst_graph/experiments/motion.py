@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.problem.drive import Progress, prepare_drive
 from sst_graph.result import Status
@@ -94,7 +94,7 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
     source = simulate(dataclasses.replace(street, time_offset_s=delay_s))
     drive = prepare_drive(source, config.calibration.classes, config.calibration.prepare)
     rng = np.random.default_rng([street.seed, 9])
-    start = _start(source.truth.cTl, config, rng)
+    start = start_near(source.truth.cTl, config.start_deg, config.start_m, rng)
     outcomes = []
     for label, (guessed, settings) in RUNS.items():
         calibration = dataclasses.replace(config.calibration, **settings)
@@ -104,11 +104,6 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
         )
         outcomes.append(Outcome(label, errors, result.status, result.diagnostics["seconds"]["estimate"]))
     return outcomes
-
-
-def _start(cTl: gtsam.Pose3, config: MotionTableConfig, rng: np.random.Generator) -> gtsam.Pose3:
-    turn = np.radians(config.start_deg) * rng.uniform(-1.0, 1.0, 3)
-    return cTl.retract(np.concatenate([turn, config.start_m * rng.uniform(-1.0, 1.0, 3)]))
 
 
 _HEADER = (

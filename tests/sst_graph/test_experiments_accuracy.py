@@ -14,6 +14,7 @@ from sst_graph.estimators import CalibrationConfig
 from sst_graph.experiments import accuracy, drives
 from sst_graph.experiments.accuracy import SCENARIOS, AccuracyConfig, Outcome
 from sst_graph.experiments.drives import DrivesConfig
+from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, Nees
 
 
@@ -51,11 +52,20 @@ def test_a_row_by_hand() -> None:
 def test_starts_are_within_their_limits() -> None:
     config, rng = AccuracyConfig(), np.random.default_rng(0)
     cTl = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.2, 0.3), np.array([0.1, 0.2, 0.3]))
-    steps = np.array([cTl.between(accuracy._start(cTl, config, rng)).translation() for _ in range(200)])
+    steps = np.array(
+        [
+            cTl.between(start_near(cTl, config.start_deg, config.start_m, rng)).translation()
+            for _ in range(200)
+        ]
+    )
     assert 0.08 < np.linalg.norm(steps, axis=1).max() < 0.1 * np.sqrt(3.0) * 1.3
     turns = [
         np.degrees(
-            np.linalg.norm(gtsam.Rot3.Logmap(cTl.between(accuracy._start(cTl, config, rng)).rotation()))
+            np.linalg.norm(
+                gtsam.Rot3.Logmap(
+                    cTl.between(start_near(cTl, config.start_deg, config.start_m, rng)).rotation()
+                )
+            )
         )
         for _ in range(200)
     ]

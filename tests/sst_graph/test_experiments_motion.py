@@ -9,6 +9,7 @@ import pytest
 from sst_graph.experiments import motion
 from sst_graph.experiments.motion import MotionTableConfig, Outcome
 from sst_graph.experiments.registry import EXPERIMENTS
+from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, Nees
 
 
@@ -51,7 +52,10 @@ def test_settings_that_make_no_sense(wrong: dict[str, object]) -> None:
 
 def test_starts_are_seeded_and_within_bounds() -> None:
     config = EXPERIMENTS["motion"].config
-    poses = [motion._start(gtsam.Pose3(), config, np.random.default_rng(3)) for _ in range(2)]
+    poses = [
+        start_near(gtsam.Pose3(), config.start_deg, config.start_m, np.random.default_rng(3))
+        for _ in range(2)
+    ]
     assert poses[0].equals(poses[1], 1e-12)
     log = gtsam.Rot3.Logmap(poses[0].rotation())
     assert 0.0 < np.degrees(np.abs(log).max()) <= config.start_deg

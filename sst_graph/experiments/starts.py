@@ -1,0 +1,12 @@
+"""Wrong starts around a truth."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+
+def start_near(cTl: gtsam.Pose3, half_deg: float, half_m: float, rng: np.random.Generator) -> gtsam.Pose3:
+    """The extrinsic with an error uniform by axis within half widths [deg], [m], in its tangent space."""
+    turn = np.radians(half_deg) * rng.uniform(-1.0, 1.0, 3)
+    return cTl.retract(np.concatenate([turn, half_m * rng.uniform(-1.0, 1.0, 3)]))
