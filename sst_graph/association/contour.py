@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -15,9 +16,11 @@ FloatMap = NDArray[np.float32]
 
 _REMAP_LIMIT = 30_000
 _SMOOTHING_PX = 1.0
+BORDER_PX = 3.0
+"""Nothing is matched this close to the image's border [px]: objects are cut there."""
 REACH_PX = 64
 """The field ends this far from the class [px]: beyond every gate (``gate`` times the widest kernel)."""
-_MIN_GRADIENT = 0.3
+MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
 
 
@@ -51,6 +54,11 @@ class ContourMap:
     distance: FloatMap
     unknown: FloatMap
 
+    @cached_property
+    def veiled(self) -> bool:
+        """Whether any pixel is unknown."""
+        return bool(self.unknown.any())
+
     @classmethod
     def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image."""
@@ -72,11 +80,11 @@ class ContourMap:
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
         height, width = self.distance.shape
-        border = 3.0
         u, v = uvs[:, 0], uvs[:, 1]
         with np.errstate(invalid="ignore"):
-            valid = (u > border) & (u < width - 1 - border) & (v > border) & (v < height - 1 - border)
-        safe = np.where(valid[:, None], uvs, border + 1.0)
+            valid = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
+            valid &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
+        safe = np.where(valid[:, None], uvs, BORDER_PX + 1.0)
         distances = sample(self.distance, safe)
         step_u, step_v = np.array([1.0, 0.0]), np.array([0.0, 1.0])
         gradient = 0.5 * np.stack(
@@ -89,7 +97,7 @@ class ContourMap:
         length = np.linalg.norm(gradient, axis=1)
         normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
         feet = safe - distances[:, None] * normals
-        valid &= (length > _MIN_GRADIENT) & (sample(self.unknown, feet) < 0.1)
+        valid &= (length > MIN_GRADIENT) & (sample(self.unknown, feet) < 0.1)
         return ContourFeet(distances, normals, feet, valid)
 
 

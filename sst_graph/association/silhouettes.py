@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 SIDES = 4
 """An object has a left, a right, a top and a bottom side."""
-_SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
+SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
 """Side by kind of edge and whether the way out of the object runs to the right."""
 
 
@@ -114,7 +114,7 @@ def match_silhouettes(
             continue
         beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
         sigmas = np.hypot(config.mask_sigma_px, beam_sigma)
-        sides = _SIDE_OF[points.edges[index], (way[index, 0] > 0).astype(np.intp)]
+        sides = SIDE_OF[points.edges[index], (way[index, 0] > 0).astype(np.intp)]
         alignment = Alignment(
             camera=camera,
             lPs=points.lPs[index],

@@ -7,20 +7,28 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_graph.association.search import Candidate
+from sst_graph.association.crowd import Poses, Steps
+from sst_graph.association.search import Candidate, SearchConfig
 from sst_graph.errors import EstimationError
+from sst_graph.estimators.heats import Field, hold_heat
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
 from sst_graph.estimators.start import StartConfig, find_start
 from sst_graph.problem.drive import Drive, Progress
-from sst_graph.problem.graph import Tracks
+from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
 """Solutions on a few frames that are closer than all of these lead to one answer."""
 _SAME_DEG = 2.0
 """Solutions closer than this are one [deg]."""
+_REACH = 1.25
+"""Solutions may lie this many times as far from the guess as was searched, along each axis."""
 
 
 @dataclass(frozen=True)
@@ -54,19 +62,21 @@ def choose_start(
     Raises:
         EstimationError: no candidate leads anywhere.
     """
-    candidates = find_start(drives, tracks, classes, guess_cTl, guess_offset_s, config)
-    contest = hold_contest(drives, tracks, candidates, guess_cTl, guess_offset_s, joint, config)
+    coarse = replace(config, search=_coarse(config))
+    candidates = find_start(drives, tracks, classes, guess_cTl, guess_offset_s, coarse)
+    contest = hold_contest(drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config)
     if guess_cTl is not None:
         return contest
     cTl, offset_s = contest.finalists[0]
-    closer = find_start(drives, tracks, classes, cTl, guess_offset_s, config)
+    closer = find_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
     closer = [Candidate(cTl, offset_s, contest.score), *closer[: config.contenders]]
-    return hold_contest(drives, tracks, closer, None, guess_offset_s, joint, config)
+    return hold_contest(drives, tracks, classes, closer, None, guess_offset_s, joint, config)
 
 
 def hold_contest(
     drives: Sequence[Drive],
     tracks: Tracks,
+    classes: Sequence[SemanticClass],
     candidates: Sequence[Candidate],
     guess_cTl: gtsam.Pose3 | None,
     guess_offset_s: float,
@@ -80,20 +90,35 @@ def hold_contest(
     """
     if not config.enabled:
         return Contest(((candidates[0].cTl, candidates[0].offset_s),), None, candidates[0].score)
+    # 1. All candidates under wide kernels, on some of the points.
     few = [_thinned(drive, config.contest_scans) for drive in drives]
+    field = Field.of(few, tracks, classes, _simple(joint.graph, config))
+    quick = field.thinned(config.heat_points)
     contenders = config.free_contenders if guess_cTl is None else config.contenders
-    starts = [
-        State(candidate.cTl, (candidate.offset_s,))
-        for candidate in _with_offsets(candidates[:contenders], guess_offset_s)
-    ]
-    for heat in _heats(_simple(joint, config)):
-        contestants = [(start, prior_centre(start, guess_cTl, guess_offset_s)) for start in starts]
-        solutions = solve_all(few, contestants, heat, tracks)
-        starts = _survivors(solutions, config)
-    solutions = [solution for solution in solutions if _is_within(solution, guess_cTl, config)]
-    if not solutions:
+    poses = _poses(_with_offsets(candidates[:contenders], guess_offset_s), field.biases)
+    centres = _centres(poses, guess_cTl, guess_offset_s)
+    for kernels_px in _wide_heats(joint):
+        poses = hold_heat(quick, poses, centres, kernels_px)
+        kept = _survivors(poses, quick.steps(poses, kernels_px[-1]), config)
+        poses, centres = poses.take(kept), centres.take(kept)
+    # 2. What is left under narrow ones, on all points.
+    narrow = narrowed(joint).kernel_px
+    poses = hold_heat(field, poses, centres, (*narrow, *[narrow[-1]] * config.settling))
+    # 3. The best that stayed within reach.
+    steps = field.steps(poses, narrow[-1])
+    ranks = _agreements(steps) * _within(poses, guess_cTl, config)
+    order = _different(poses, ranks)
+    if ranks[order[0]] <= 0.0:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
-    return Contest(_finalists(solutions, config.finalists), _doubt(solutions, config), candidates[0].score)
+    poses, ranks = poses.take(order), ranks[order]
+    finalists = [
+        (pose, float(offset))
+        for pose, offset, rank in zip(_cTls(poses), poses.offsets, ranks, strict=True)
+        if rank > config.finalist_ratio * ranks[0]
+    ]
+    return Contest(
+        tuple(finalists[: config.finalists]), _doubt(_cTls(poses), ranks, config), candidates[0].score
+    )
 
 
 def solve_all(
@@ -119,67 +144,10 @@ def solve_all(
     return sorted(solutions, key=agreement, reverse=True)
 
 
-def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
-    """The candidates, and the first of them at other time offsets: slow frames hardly tell the offset."""
-    if all(candidate.offset_s == guess_offset_s for candidate in candidates):
-        return list(candidates)
-    others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
-    return [*candidates, *others]
-
-
-def _simple(joint: JointConfig, config: StartConfig) -> JointConfig:
-    """Settings to compare with: one mask bias a class, only objects that are matched well."""
-    match = joint.graph.match
-    match = replace(match, min_object_share=max(match.min_object_share, config.min_object_share))
-    return replace(joint, graph=replace(joint.graph, object_bias_sigma_px=0.0, match=match), min_matches=1)
-
-
-def _heats(joint: JointConfig) -> list[JointConfig]:
-    """Two kernels a heat while they are wide, the rest in the last one."""
-    half = (len(joint.kernel_px) + 1) // 2
-    wide = [joint.kernel_px[i : min(i + 2, half)] for i in range(0, half, 2)]
-    return [*(replace(joint, kernel_px=some, max_outer=len(some)) for some in wide), narrowed(joint)]
-
-
 def narrowed(joint: JointConfig) -> JointConfig:
     """Settings from a start that is nearly right: wide kernels would only lead away from it."""
     half = (len(joint.kernel_px) + 1) // 2
     return replace(joint, kernel_px=joint.kernel_px[half:] or joint.kernel_px[-1:])
-
-
-def _survivors(solutions: Sequence[JointSolution], config: StartConfig) -> list[State]:
-    """The better half of what differs; ``config.survivors`` or more."""
-    kept: list[State] = []
-    for solution in solutions:
-        if not any(_alike(solution.state, state, 3.0) for state in kept):
-            kept.append(solution.state)
-    return kept[: max(config.survivors, (len(solutions) + 1) // 2)]
-
-
-def _finalists(solutions: Sequence[JointSolution], most: int) -> tuple[tuple[gtsam.Pose3, float], ...]:
-    """The first ``most`` solutions that differ; a few frames cannot always tell near ones apart."""
-    found: list[State] = []
-    for solution in solutions:
-        if not any(_alike(solution.state, state) for state in found):
-            found.append(solution.state)
-    return tuple((state.cTl, state.offsets_s[0]) for state in found[:most])
-
-
-def _alike(one: State, other: State, slack: float = 1.0) -> bool:
-    """Whether two solutions on a few frames lead to one answer."""
-    step = np.abs(gtsam.Pose3.Logmap(one.cTl.between(other.cTl)))
-    late = abs(one.offsets_s[0] - other.offsets_s[0])
-    return bool(
-        step[:3].max() <= slack * _ALIKE_RAD
-        and step[3:].max() <= slack * _ALIKE_M
-        and late <= slack * _ALIKE_S
-    )
-
-
-def _thinned(drive: Drive, most: int) -> Drive:
-    """The drive with at most so many scans, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(drive.scans) - 1, most).round().astype(int))
-    return replace(drive, scans=tuple(drive.scans[i] for i in chosen))
 
 
 def prior_centre(start: State, guess_cTl: gtsam.Pose3 | None, guess_offset_s: float) -> State:
@@ -189,20 +157,114 @@ def prior_centre(start: State, guess_cTl: gtsam.Pose3 | None, guess_offset_s: fl
     return State(cTl, (guess_offset_s,) * len(start.offsets_s))
 
 
-def _is_within(solution: JointSolution, guess: gtsam.Pose3 | None, config: StartConfig) -> bool:
-    """Whether the translation stayed where it was searched, and did not run away with the points."""
+def _coarse(config: StartConfig) -> SearchConfig:
+    """The search on the most blurred masks only: the heats reach farther than what they leave undone."""
     search = config.search
-    limit = 1.25 * search.free_translation_m if guess is None else 1.75 * search.translation_m
+    return replace(
+        search,
+        blurs_px=search.blurs_px[:1],
+        shares=search.shares[:1],
+        candidates=search.candidates[:1],
+        population=config.population,
+        rounds=config.rounds,
+    )
+
+
+def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
+    """The candidates, and the first of them at other time offsets: slow frames hardly tell the offset."""
+    if all(candidate.offset_s == guess_offset_s for candidate in candidates):
+        return list(candidates)
+    others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
+    return [*candidates, *others]
+
+
+def _simple(graph: GraphConfig, config: StartConfig) -> GraphConfig:
+    """Settings to compare with: only objects that are matched well."""
+    share = max(graph.match.min_object_share, config.min_object_share)
+    return replace(graph, match=replace(graph.match, min_object_share=share))
+
+
+def _wide_heats(joint: JointConfig) -> list[tuple[float, ...]]:
+    """The wider half of the kernels in two heats."""
+    half = (len(joint.kernel_px) + 1) // 2
+    wide = joint.kernel_px[:half]
+    return [kernels for kernels in (wide[: half // 2], wide[half // 2 :]) if kernels]
+
+
+def _thinned(drive: Drive, most: int) -> Drive:
+    """The drive with at most so many scans, evenly spread."""
+    chosen = np.unique(np.linspace(0, len(drive.scans) - 1, most).round().astype(int))
+    return replace(drive, scans=tuple(drive.scans[i] for i in chosen))
+
+
+def _poses(candidates: Sequence[Candidate], biases: int) -> Poses:
+    return Poses(
+        np.stack([candidate.cTl.rotation().matrix() for candidate in candidates]),
+        np.stack([candidate.cTl.translation() for candidate in candidates]),
+        np.array([candidate.offset_s for candidate in candidates]),
+        np.zeros((len(candidates), biases)),
+    )
+
+
+def _cTls(poses: Poses) -> list[gtsam.Pose3]:
+    return [
+        gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)
+        for R, t in zip(poses.rotations, poses.translations, strict=True)
+    ]
+
+
+def _centres(poses: Poses, guess_cTl: gtsam.Pose3 | None, guess_offset_s: float) -> Poses:
+    """What the weak priors of each pose are centred on, as in :func:`prior_centre`."""
+    offsets = np.full(len(poses), guess_offset_s)
+    if guess_cTl is None:
+        return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)
+    rotations = np.broadcast_to(guess_cTl.rotation().matrix(), poses.rotations.shape)
+    translations = np.broadcast_to(guess_cTl.translation(), poses.translations.shape)
+    return Poses(rotations, translations, offsets, poses.biases)
+
+
+def _agreements(steps: Steps) -> FloatArray:
+    """(m,) as :func:`sst_graph.estimators.joint.agreement`."""
+    return np.asarray(steps.support**2 / np.maximum(steps.seen, 1.0))
+
+
+def _survivors(poses: Poses, steps: Steps, config: StartConfig) -> IntArray:
+    """The better ``config.survival`` of the poses, as far as they differ; ``config.survivors`` or more."""
+    most = max(config.survivors, round(config.survival * len(poses)))
+    return _different(poses, _agreements(steps), 3.0)[:most]
+
+
+def _different(poses: Poses, ranks: FloatArray, slack: float = 1.0) -> IntArray:
+    """Positions of the poses that are not alike a better one, the best first."""
+    remaining, chosen = np.argsort(-ranks, kind="stable"), []
+    flat = poses.rotations.reshape(-1, 9)
+    trace = 1.0 + 2.0 * np.cos(slack * _ALIKE_RAD)
+    while len(remaining):
+        best = remaining[0]
+        chosen.append(best)
+        alike = flat[remaining] @ flat[best] > trace
+        shift = np.abs(poses.translations[remaining] - poses.translations[best]).max(axis=1)
+        late = np.abs(poses.offsets[remaining] - poses.offsets[best])
+        alike &= (shift <= slack * _ALIKE_M) & (late <= slack * _ALIKE_S)
+        alike[0] = True
+        remaining = remaining[~alike]
+    return np.array(chosen, dtype=np.intp)
+
+
+def _within(poses: Poses, guess: gtsam.Pose3 | None, config: StartConfig) -> NDArray[np.bool_]:
+    """(m,) whether the translation stayed where it was searched, and did not run away with the points."""
+    search = config.search
+    width = search.free_translation_m if guess is None else search.translation_m
     centre = np.zeros(3) if guess is None else np.asarray(guess.translation())
-    return float(np.linalg.norm(solution.state.cTl.translation() - centre)) < limit
+    return np.asarray((np.abs(poses.translations - centre) < _REACH * width).all(axis=1))
 
 
-def _doubt(solutions: Sequence[JointSolution], config: StartConfig) -> str | None:
-    best, *others = solutions
-    for other in others:
-        turn = best.state.cTl.between(other.state.cTl).rotation()
+def _doubt(cTls: Sequence[gtsam.Pose3], ranks: FloatArray, config: StartConfig) -> str | None:
+    """Whether another pose is nearly as good as the first one."""
+    for other, rank in zip(cTls[1:], ranks[1:], strict=True):
+        turn = cTls[0].between(other).rotation()
         degrees = float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turn))))
-        share = agreement(other) / max(agreement(best), 1e-9)
+        share = rank / max(ranks[0], 1e-9)
         if degrees > _SAME_DEG and share > config.rival_ratio:
             return (
                 f"a pose {degrees:.0f} deg away explains the labels almost as well (score {share:.2f} of the "

@@ -27,11 +27,16 @@ class StartConfig:
     Attributes:
         search: the global search.
         enabled: False takes the guess as it is.
-        contenders, free_contenders: most candidates whose joint solutions are compared, with and without
-            a guess.
-        finalists: most different solutions of the contest that are solved on all frames.
+        population, rounds: of the search's cross-entropy method before a contest, which takes the search's
+            first blur only.
+        contenders, free_contenders: most candidates that are compared, with and without a guess.
         contest_scans: scans of each drive that they are compared on.
-        survivors: fewest different solutions that go on from one heat of the contest to the next.
+        heat_points: boundary points, in all, that they are compared on while the kernels are wide.
+        survival: share of them that goes on from one heat of the contest to the next ...
+        survivors: ... but so many at least, if so many differ.
+        settling: steps under the narrowest kernel.
+        finalists: most different solutions of the contest that are solved on all frames ...
+        finalist_ratio: ... if their agreement with the labels is at least this fraction of the best one's.
         min_object_share: in the contest, an object of whose boundary in view less than this share finds a
             match is left out.
         rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
@@ -44,11 +49,17 @@ class StartConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     enabled: bool = True
-    contenders: int = 16
-    free_contenders: int = 48
-    finalists: int = 2
+    population: int = 16
+    rounds: int = 1
+    contenders: int = 320
+    free_contenders: int = 1280
     contest_scans: int = 10
-    survivors: int = 3
+    heat_points: int = 500
+    survival: float = 0.4
+    survivors: int = 16
+    settling: int = 6
+    finalists: int = 2
+    finalist_ratio: float = 0.7
     min_object_share: float = 0.3
     rival_ratio: float = 0.9
     min_explained: float = 0.2

@@ -10,9 +10,17 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
+from sst_graph.association.crowd import Poses
 from sst_graph.association.search import Candidate
+from sst_graph.errors import EstimationError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
-from sst_graph.estimators.contest import _heats, _survivors, choose_start, hold_contest, narrowed
+from sst_graph.estimators.contest import (
+    _different,
+    _wide_heats,
+    choose_start,
+    hold_contest,
+    narrowed,
+)
 from sst_graph.estimators.joint import (
     JointConfig,
     JointSolution,
@@ -51,21 +59,22 @@ def solved(degrees: float) -> JointSolution:
 
 
 def test_heats_use_every_kernel_once() -> None:
-    heats = _heats(JOINT)
-    assert tuple(k for heat in heats for k in heat.kernel_px) == JOINT.kernel_px
-    assert all(heat.max_outer == len(heat.kernel_px) for heat in heats[:-1])
-    assert heats[-1].max_outer == JOINT.max_outer and heats[-1] == narrowed(JOINT)
+    heats = [*_wide_heats(JOINT), narrowed(JOINT).kernel_px]
+    assert tuple(k for kernels in heats for k in kernels) == JOINT.kernel_px
     one = replace(JOINT, kernel_px=(4.0,))
     assert narrowed(one).kernel_px == (4.0,)
 
 
-def test_survivors_differ_and_are_the_better_half() -> None:
-    found = [
-        replace(solved(0.0), state=State(turned(0.0, 0.0, a))) for a in (0.0, 0.01, 5.0, 10.0, 15.0, 20.0)
-    ]
-    kept = [off_deg(state.cTl) for state in _survivors(found, replace(START, survivors=1))]
-    np.testing.assert_allclose(kept, [0.0, 5.0, 10.0], atol=1e-6)
-    assert len(_survivors(found, replace(START, survivors=4))) == 4
+def test_poses_that_are_alike_count_once() -> None:
+    turns = [turned(0.0, 0.0, a) for a in (0.0, 0.01, 5.0, 10.0, 10.02, 20.0)]
+    poses = Poses(
+        np.stack([cTl.rotation().matrix() for cTl in turns]),
+        np.stack([cTl.translation() for cTl in turns]),
+        np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.0]),
+        np.zeros((6, 1)),
+    )
+    ranks = np.array([3.0, 4.0, 9.0, 1.0, 2.0, 5.0])
+    assert _different(poses, ranks).tolist() == [2, 5, 1, 4, 3]  # 0 is 1; 4 has another offset than 3
 
 
 def test_the_truth_agrees_best() -> None:
@@ -81,9 +90,16 @@ def test_the_contest_finds_the_right_one_of_three() -> None:
         Candidate(turned(*a), 0.0, 1.0) for a in ((25.0, 0.0, 0.0), (0.0, 1.0, 2.0), (0.0, -30.0, 0.0))
     ]
     tracks = Tracks([prepared_street()])
-    contest = hold_contest([prepared_street()], tracks, candidates, truth(), 0.0, JOINT, START)
+    contest = hold_contest([prepared_street()], tracks, [VEHICLE], candidates, truth(), 0.0, JOINT, START)
     assert off_deg(contest.finalists[0][0]) < 1.0
     assert len(contest.finalists) <= START.finalists
+
+
+def test_a_pose_far_from_the_guess_is_no_answer() -> None:
+    tracks, candidates = Tracks([prepared_street()]), [Candidate(turned(0.0, 1.0, 2.0), 0.0, 1.0)]
+    far = gtsam.Pose3(truth().rotation(), truth().translation() + np.array([0.0, 0.9, 0.0]))
+    with pytest.raises(EstimationError, match="near the guess"):
+        hold_contest([prepared_street()], tracks, [VEHICLE], candidates, far, 0.0, JOINT, START)
 
 
 @pytest.mark.parametrize("guess", [True, False])

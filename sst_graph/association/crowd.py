@@ -1,0 +1,342 @@
+"""Many poses against the silhouettes of one drive at once, with one Gauss-Newton step each.
+
+The matches and residuals are those of :mod:`~sst_graph.association.silhouettes`; what a graph would hold as
+variables beside pose, offset and mask biases (the twists) is fixed. So candidates can be told apart at
+a hundredth of what their graphs would cost; the answer itself comes from a graph.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from factors.robust import RobustKernel
+from sst_graph.association.boundary import Boundaries, Edge
+from sst_graph.association.contour import BORDER_PX, MIN_GRADIENT, ContourMap
+from sst_graph.association.silhouettes import SIDE_OF, SIDES, MatchConfig
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_MIN_DEPTH_M = 0.5
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Rotations (m, 3, 3), translations (m, 3) [m], offsets (m,) [s] and mask biases (m, classes) [px]."""
+
+    rotations: FloatArray
+    translations: FloatArray
+    offsets: FloatArray
+    biases: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def take(self, index: IntArray) -> Poses:
+        """Some of the poses, by position."""
+        return Poses(self.rotations[index], self.translations[index], self.offsets[index], self.biases[index])
+
+
+@dataclass(frozen=True)
+class Views:
+    """Which image each scan is compared with, under each pose.
+
+    Attributes:
+        images: (m, scans) number of the image; -1 for none.
+        base_taus_s: (m, scans) image stamp minus scan stamp [s].
+        twists, accelerations: (m, scans, 6) of the LiDAR at the image's instant, or None where it stands
+            in all of them [rad/s, m/s].
+    """
+
+    images: IntArray
+    base_taus_s: FloatArray
+    twists: FloatArray | None
+    accelerations: FloatArray | None
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Normal equations H x = -g of every pose, and how well the labels agree with it.
+
+    Attributes:
+        H: (m, k, k), g: (m, k), over [camera-side rotation, translation, offset, bias of each class]:
+            cP' = Exp(rotation) cP + translation.
+        support: (m,) matches, each counted by its robust weight.
+        seen: (m,) boundary points that fall into an image.
+    """
+
+    H: FloatArray
+    g: FloatArray
+    support: FloatArray
+    seen: FloatArray
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Boundary points in an image, pose by pose.
+
+    Attributes:
+        pose, point: (k,) which.
+        cPs, ways: (3, k) point, and the step to its neighbour outside the object, in the camera [m].
+        uvs: (2, k) pixels.
+    """
+
+    pose: IntArray
+    point: IntArray
+    cPs: FloatArray
+    ways: FloatArray
+    uvs: FloatArray
+
+    def take(self, index: IntArray) -> _Seen:
+        return _Seen(
+            self.pose[index],
+            self.point[index],
+            self.cPs[:, index],
+            self.ways[:, index],
+            self.uvs[:, index],
+        )
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """The boundary points of some scans of a drive, and the contours of its images.
+
+    Attributes:
+        camera: of all images.
+        contours: of each image, by class.
+        classes: all classes.
+        lPs, ways: (3, n) boundary points, and the step from each to its neighbour outside the object [m].
+        offsets_s: (n,) time of each point relative to its scan's stamp [s].
+        scans, kinds, objects: (n,) number of its scan, of its class, of its object in all scans.
+        edges: (n,) kind of edge.
+    """
+
+    camera: PinholeCamera
+    contours: Sequence[Mapping[SemanticClass, ContourMap]]
+    classes: Sequence[SemanticClass]
+    lPs: FloatArray
+    ways: FloatArray
+    offsets_s: FloatArray
+    scans: IntArray
+    kinds: IntArray
+    objects: IntArray
+    edges: NDArray[np.uint8]
+
+    @classmethod
+    def gather(
+        cls,
+        scans: Sequence[Mapping[SemanticClass, Boundaries]],
+        contours: Sequence[Mapping[SemanticClass, ContourMap]],
+        classes: Sequence[SemanticClass],
+        camera: PinholeCamera,
+    ) -> Outlines:
+        """All boundary points of the classes."""
+        parts: list[Boundaries] = []
+        numbers: list[tuple[int, int]] = []
+        objects, first = [np.zeros(0, np.intp)], 0
+        for number, boundaries in enumerate(scans):
+            for kind, c in enumerate(classes):
+                if c not in boundaries or len(boundaries[c]) == 0:
+                    continue
+                parts.append(boundaries[c])
+                numbers.append((number, kind))
+                own = np.unique(boundaries[c].objects, return_inverse=True)[1].reshape(-1)
+                objects.append(own + first)
+                first += int(own.max()) + 1
+        counts = [len(part) for part in parts]
+        scan_of, kind_of = np.array(numbers, np.intp).reshape(-1, 2).T
+        lPs = np.concatenate([np.zeros((0, 3)), *(part.lPs for part in parts)])
+        outward = np.concatenate([np.zeros((0, 3)), *(part.outward for part in parts)])
+        return cls(
+            camera,
+            contours,
+            classes,
+            np.ascontiguousarray(lPs.T),
+            np.ascontiguousarray((outward - lPs).T),
+            np.concatenate([np.zeros(0), *(part.offsets_s for part in parts)]),
+            np.repeat(scan_of, counts),
+            np.repeat(kind_of, counts),
+            np.concatenate(objects),
+            np.concatenate([np.zeros(0, np.uint8), *(part.edges for part in parts)]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.offsets_s)
+
+    def thinned(self, most: int) -> Outlines:
+        """Evenly spread points, at most so many."""
+        some = np.arange(0, len(self), max(1, -(-len(self) // most)))
+        return replace(
+            self,
+            lPs=self.lPs[:, some],
+            ways=self.ways[:, some],
+            offsets_s=self.offsets_s[some],
+            scans=self.scans[some],
+            kinds=self.kinds[some],
+            objects=self.objects[some],
+            edges=self.edges[some],
+        )
+
+    def steps(self, poses: Poses, views: Views, kernel: RobustKernel, config: MatchConfig) -> Steps:
+        """Match every pose's boundary points to the nearest contours; the kernel's scale is in pixels."""
+        moved, rates = self._moved(poses, views)
+        seen = self._seen(poses, views, moved, config)
+        image = views.images[seen.pose, self.scans[seen.point]]
+        distance, normals = self._look_up(seen, image)
+        kind = self.kinds[seen.point]
+        r = distance + poses.biases[seen.pose, kind]
+        # 1. The contour faces the way out of the object, and is near.
+        way, length = _directions(self.camera, seen)
+        cosine = way[0] * normals[0] + way[1] * normals[1]
+        matched = (cosine > config.min_cosine) & (np.abs(r) < config.gate * kernel.scale)
+        # 2. Enough of the object's boundary meets one.
+        count = int(self.objects.max(initial=-1)) + 1
+        owner = seen.pose * count + self.objects[seen.point]
+        whole = np.bincount(owner, minlength=1)
+        matched &= (np.bincount(owner, matched, len(whole)) >= config.min_object_share * whole)[owner]
+        on = np.flatnonzero(matched)
+        # 3. A side of an object has a voice that grows little with its points.
+        sigma = np.hypot(config.mask_sigma_px, 0.5 * length[on] * cosine[on] / np.sqrt(3.0))
+        point = seen.point[on]
+        side = owner[on] * SIDES + SIDE_OF[self.edges[point], (way[0, on] > 0.0).astype(np.intp)]
+        information = np.bincount(side, sigma**-2.0, 1)[side]
+        robust = kernel.weight(r[on] / sigma)
+        weight = robust / (sigma**2 * (1.0 + information * config.side_sigma_px**2))
+        # 4. Normal equations.
+        rows = self._rows(seen.take(on), normals[:, on], kind[on], rates, len(poses.biases[0]))
+        H, g = _normal_equations(rows, r[on], weight, seen.pose[on], len(poses))
+        support = np.bincount(seen.pose[on], robust, len(poses)).astype(np.float64)
+        return Steps(H, g, support, np.bincount(seen.pose, minlength=len(poses)).astype(np.float64))
+
+    def _moved(self, poses: Poses, views: Views) -> tuple[FloatArray, FloatArray | None]:
+        """Points at their images' instant, (3, n) or (m, 3, n), and rates by the offset in the camera.
+
+        lP' = Exp(-tau w) lP to second order, w the LiDAR's mean twist over the interval.
+        """
+        if views.twists is None or views.accelerations is None:
+            return self.lPs, None
+        taus = poses.offsets[:, None] + views.base_taus_s[:, self.scans] - self.offsets_s
+        now = np.moveaxis(views.twists[:, self.scans], 2, 1)
+        change = np.moveaxis(views.accelerations[:, self.scans], 2, 1) * taus[:, None]
+        mean = now - 0.5 * change
+        first = _cross(mean[:, :3], self.lPs[None]) + mean[:, 3:]
+        step = taus[:, None] * first
+        moved = self.lPs - step + 0.5 * taus[:, None] * _cross(mean[:, :3], step)
+        last = now - change
+        return moved, -poses.rotations @ (_cross(last[:, :3], moved) + last[:, 3:])
+
+    def _seen(self, poses: Poses, views: Views, moved: FloatArray, config: MatchConfig) -> _Seen:
+        """The points that fall into their image."""
+        camera = self.camera
+        cPs = poses.rotations @ moved + poses.translations[:, :, None]
+        paired = views.images >= 0
+        ahead = cPs[:, 2] > _MIN_DEPTH_M
+        if not paired.all():
+            ahead &= paired[:, self.scans]
+        if not config.top_edges:
+            ahead &= self.edges != Edge.TOP
+        pose, point = np.nonzero(ahead)
+        X, Y, Z = (cPs[pose, row, point] for row in range(3))
+        u, v = camera.fx * X / Z + camera.cx, camera.fy * Y / Z + camera.cy
+        inside = np.flatnonzero(
+            (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
+        )
+        pose, point = pose[inside], point[inside]
+        ways = np.einsum("kij,jk->ik", poses.rotations[pose], self.ways[:, point])
+        return _Seen(
+            pose,
+            point,
+            np.stack([X[inside], Y[inside], Z[inside]]),
+            ways,
+            np.stack([u[inside], v[inside]]),
+        )
+
+    def _look_up(self, seen: _Seen, image: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Signed distances (k,) [px] and normals (2, k); infinite and 0 where there is no clear contour."""
+        distance, normals = np.full(len(image), np.inf), np.zeros((2, len(image)))
+        if len(image) == 0:
+            return distance, normals
+        key = image * len(self.classes) + self.kinds[seen.point]
+        order = np.argsort(key, kind="stable")
+        names, starts = np.unique(key[order], return_index=True)
+        for name, part in zip(names, np.split(order, starts[1:]), strict=True):
+            number, kind = divmod(int(name), len(self.classes))
+            contour = self.contours[number].get(self.classes[kind])
+            if contour is not None:
+                distance[part], normals[:, part] = _foot(contour, seen.uvs[:, part])
+        return distance, normals
+
+    def _rows(
+        self, seen: _Seen, normals: FloatArray, kind: IntArray, rates: FloatArray | None, classes: int
+    ) -> FloatArray:
+        """(7 + classes, k) derivatives of the residuals."""
+        X, Y, Z = seen.cPs
+        rows = np.zeros((7 + classes, len(X)))
+        a, b = normals[0] * self.camera.fx / Z, normals[1] * self.camera.fy / Z
+        c = -(a * X + b * Y) / Z
+        rows[0], rows[1], rows[2] = Y * c - Z * b, Z * a - X * c, X * b - Y * a
+        rows[3], rows[4], rows[5] = a, b, c
+        if rates is not None:
+            rows[6] = (rows[3:6] * rates[seen.pose, :, seen.point].T).sum(axis=0)
+        rows[7 + kind, np.arange(len(X))] = 1.0
+        return rows
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """a x b over the second of three axes."""
+    x, y, z = a[:, 0], a[:, 1], a[:, 2]
+    return np.stack([y * b[:, 2] - z * b[:, 1], z * b[:, 0] - x * b[:, 2], x * b[:, 1] - y * b[:, 0]], axis=1)
+
+
+def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatArray]:
+    """(2, k) unit ways out of the objects in the image, and the lengths (k,) of the steps [px]."""
+    X, Y, Z = seen.cPs
+    dX, dY, dZ = seen.ways
+    farther = np.maximum(Z + dZ, _MIN_DEPTH_M)
+    step = np.stack([camera.fx * (dX - dZ * X / Z), camera.fy * (dY - dZ * Y / Z)]) / farther
+    length = np.sqrt(step[0] ** 2 + step[1] ** 2)
+    return step / np.maximum(length, 1e-9), length
+
+
+def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Signed distances (k,) and normals (2, k) at pixels (2, k) on the image; infinite at ridges."""
+    height, width = contour.distance.shape
+    u, v = uvs
+    column, row = u.astype(np.intp), v.astype(np.intp)
+    valid = (u > BORDER_PX) & (u < width - 1 - BORDER_PX) & (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
+    at = np.where(valid, row * width + column, 0)
+    field = contour.distance.reshape(-1)
+    a, b, c, d = (field[at + step].astype(np.float64) for step in (0, 1, width, width + 1))
+    x, y = u - column, v - row
+    top, bottom = a + x * (b - a), c + x * (d - c)
+    distance = top + y * (bottom - top)
+    gradient = np.stack([(1.0 - y) * (b - a) + y * (d - c), bottom - top])
+    length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
+    valid &= length > MIN_GRADIENT
+    normals = gradient / np.maximum(length, MIN_GRADIENT)
+    if contour.veiled:
+        feet = np.rint(uvs - distance * normals).astype(np.intp)
+        feet = np.clip(feet, 0, [[width - 1], [height - 1]])
+        valid &= contour.unknown[feet[1], feet[0]] < 0.5
+    return np.where(valid, distance, np.inf), normals
+
+
+def _normal_equations(
+    rows: FloatArray, r: FloatArray, weight: FloatArray, pose: IntArray, poses: int
+) -> tuple[FloatArray, FloatArray]:
+    """H (m, k, k) and g (m, k) from rows (k, n) that come pose by pose."""
+    k = len(rows)
+    H, g = np.zeros((poses, k, k)), np.zeros((poses, k))
+    weighted = rows * weight
+    borders = np.searchsorted(pose, np.arange(poses + 1))
+    for i, (a, b) in enumerate(itertools.pairwise(borders)):
+        H[i] = weighted[:, a:b] @ rows[:, a:b].T
+        g[i] = weighted[:, a:b] @ r[a:b]
+    return H, g
