@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import delay_prior, frame_factor, twist_transfer_factor, velocity_factor
+from factors import GroupedBias, delay_prior, frame_factor, twist_transfer_factor, velocity_factor
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries
 from sst_graph.association.pairing import Pair, pair_by_time
@@ -198,13 +198,17 @@ def joint_graph(
 
 def silhouettes_of(pair: PairMatches, state: State) -> gtsam.CustomFactor:
     """All silhouette matches of one pair as one condensed factor on E, D, V(image) and mask biases."""
-    alignments, biases = [], []
-    for c, matches in pair.matches.items():
-        for key, index in bias_groups(pair, c):
-            alignments.append(matches.alignment if index is None else matches.alignment.take(index))
-            biases.append(key)
+    biases: list[int | float | GroupedBias | None] = []
+    for c in pair.matches:
+        tracks = pair.tracks.get(c)
+        if tracks is None:
+            biases.append(bias_key(pair.drive, c))
+            continue
+        names, groups = np.unique(tracks, return_inverse=True)
+        own = tuple(object_bias_key(pair.drive, int(track)) for track in names)
+        biases.append(GroupedBias(own, groups.reshape(-1)))
     return frame_factor(
-        alignments,
+        [matches.alignment for matches in pair.matches.values()],
         EXTRINSIC,
         delay_key(state.clock(pair.drive)),
         twist_key(pair.drive, pair.pair.image),
