@@ -43,6 +43,8 @@ class LidarOdometryConfig:
         search_m, search_step_m: where the speed is unknown (first pair, or after a failure), shifts of the
             start up to this far in the LiDAR's horizontal plane, and this far apart, are tried [m].
         search_iterations: Gauss-Newton steps of each trial.
+        rest_m, rest_inlier_ratio: no other shift is tried where the scan, begun where it is predicted, stays
+            within this distance [m] with at least this fraction of its points paired: it stands.
         missed_cost: what a point without a voxel to pair with costs in the choice among trials.
         min_inlier_ratio: a registration with fewer points paired than this fraction has failed.
         compensations: most registrations of one scan while its sweep compensation settles.
@@ -69,6 +71,8 @@ class LidarOdometryConfig:
     search_m: float = 3.0
     search_step_m: float = 0.6
     search_iterations: int = 6
+    rest_m: float = 0.02
+    rest_inlier_ratio: float = 0.5
     missed_cost: float = 1.0
     min_inlier_ratio: float = 0.3
     compensations: int = 3
@@ -161,10 +165,14 @@ class LidarOdometry:
             start = wTl.copy()
             start[:3, 3] += wTl[:3, :3] @ shift
             result = self._registered(cloud, start, config.search_iterations)
+            found = np.asarray(result.T_target_source)
             missed = cloud.size() - result.num_inliers
             misfit = (2.0 * result.error + config.missed_cost * missed) / cloud.size()
-            if np.isfinite(result.T_target_source).all() and misfit < least:
-                best, least = _orthonormal(np.asarray(result.T_target_source)), misfit
+            if np.isfinite(found).all() and misfit < least:
+                best, least = _orthonormal(found), misfit
+            rests = float(np.linalg.norm(found[:3, 3] - start[:3, 3])) < config.rest_m
+            if not shift.any() and rests and missed <= (1.0 - config.rest_inlier_ratio) * cloud.size():
+                return best
         return best
 
     def _registered(

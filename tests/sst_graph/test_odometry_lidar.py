@@ -255,3 +255,25 @@ def test_only_vehicles_are_better_than_nothing() -> None:
     motions = lidar_odometry(vehicles, LidarOdometryConfig())
     assert all(motion.ok for motion in motions)
     assert motions[-1].aTb.translation()[0] == pytest.approx(0.2, abs=0.01)
+
+
+class CountingOdometry(LidarOdometry):
+    """Counts its registrations."""
+
+    registrations = 0
+
+    def _registered(self, *args, **kwargs):  # type: ignore[no-untyped-def]
+        self.registrations += 1
+        return super()._registered(*args, **kwargs)
+
+
+@pytest.mark.parametrize(("speed_mps", "fewest", "most"), [(0.0, 1, 3), (8.0, 30, 60)])
+def test_the_speed_is_searched_only_where_the_lidar_does_not_rest(
+    speed_mps: float, fewest: int, most: int
+) -> None:
+    odometry = CountingOdometry()
+    scans = [scan_at(wTl, k * PERIOD_NS, k) for k, wTl in enumerate(path(speed_mps, 0.0, 2))]
+    motion = [odometry.add(scan) for scan in scans][1]
+    assert motion is not None and motion.ok
+    np.testing.assert_allclose(motion.aTb.translation(), [0.1 * speed_mps, 0.0, 0.0], atol=0.02)
+    assert fewest <= odometry.registrations <= most
