@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from factors.motion import cross
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
 from sst_graph.association.contour import BORDER_PX, MIN_GRADIENT, ContourMap
@@ -25,6 +26,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _MIN_DEPTH_M = 0.5
+_REACH_M = 3.0
+"""Farthest that a point moves between its scan and its image [m]."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,7 @@ class _Seen:
         pose, point: (k,) which.
         cPs, ways: (3, k) point, and the step to its neighbour outside the object, in the camera [m].
         uvs: (2, k) pixels.
+        rates: (3, k) of the points by the time offset, in the camera [m/s]; None where nothing moves.
     """
 
     pose: IntArray
@@ -93,6 +97,7 @@ class _Seen:
     cPs: FloatArray
     ways: FloatArray
     uvs: FloatArray
+    rates: FloatArray | None
 
     def take(self, index: IntArray) -> _Seen:
         return _Seen(
@@ -101,6 +106,7 @@ class _Seen:
             self.cPs[:, index],
             self.ways[:, index],
             self.uvs[:, index],
+            None if self.rates is None else self.rates[:, index],
         )
 
 
@@ -186,8 +192,7 @@ class Outlines:
 
     def steps(self, poses: Poses, views: Views, kernel: RobustKernel, config: MatchConfig) -> Steps:
         """Match every pose's boundary points to the nearest contours; the kernel's scale is in pixels."""
-        moved, rates = self._moved(poses, views)
-        seen = self._seen(poses, views, moved, config)
+        seen = self._seen(poses, views, config)
         image = views.images[seen.pose, self.scans[seen.point]]
         distance, normals = self._look_up(seen, image)
         kind = self.kinds[seen.point]
@@ -210,53 +215,60 @@ class Outlines:
         robust = kernel.weight(r[on] / sigma)
         weight = robust / (sigma**2 * (1.0 + information * config.side_sigma_px**2))
         # 4. Normal equations.
-        rows = self._rows(seen.take(on), normals[:, on], kind[on], rates, len(poses.biases[0]))
+        rows = self._rows(seen.take(on), normals[:, on], kind[on], poses.biases.shape[1])
         H, g = _normal_equations(rows, r[on], weight, seen.pose[on], len(poses))
         support = np.bincount(seen.pose[on], robust, len(poses)).astype(np.float64)
         return Steps(H, g, support, np.bincount(seen.pose, minlength=len(poses)).astype(np.float64))
 
-    def _moved(self, poses: Poses, views: Views) -> tuple[FloatArray, FloatArray | None]:
-        """Points at their images' instant, (3, n) or (m, 3, n), and rates by the offset in the camera.
+    def _seen(self, poses: Poses, views: Views, config: MatchConfig) -> _Seen:
+        """The points that fall into their image."""
+        camera = self.camera
+        # 1. Where nothing moved: most points are far from the image.
+        near = self._roughly_in_view(poses, views, config)
+        pose, point = np.nonzero(near)
+        R, t = poses.rotations[pose], poses.translations[pose]
+        lPs, rates = self._moved(poses, views, pose, point)
+        cPs = np.einsum("kij,jk->ik", R, lPs) + t.T
+        # 2. Where they are at the image's instant.
+        ahead = np.maximum(cPs[2], _MIN_DEPTH_M)
+        uvs = np.stack([camera.fx * cPs[0] / ahead + camera.cx, camera.fy * cPs[1] / ahead + camera.cy])
+        inside = np.flatnonzero((cPs[2] > _MIN_DEPTH_M) & camera.in_image(uvs.T))
+        R, pose, point = R[inside], pose[inside], point[inside]
+        ways = np.einsum("kij,jk->ik", R, self.ways[:, point])
+        rates = None if rates is None else np.einsum("kij,jk->ik", R, rates[:, inside])
+        return _Seen(pose, point, cPs[:, inside], ways, uvs[:, inside], rates)
+
+    def _roughly_in_view(self, poses: Poses, views: Views, config: MatchConfig) -> NDArray[np.bool_]:
+        """(m, n) whether a point that moves by less than :data:`_REACH_M` may fall into its image."""
+        camera = self.camera
+        margin = 0.0 if views.twists is None else _REACH_M
+        side = max(camera.cx + 0.5, camera.width - camera.cx - 0.5) / camera.fx
+        across, ahead = (
+            poses.rotations[:, row] @ self.lPs + poses.translations[:, row, None] for row in (0, 2)
+        )
+        near = (ahead > _MIN_DEPTH_M - margin) & (np.abs(across) <= side * (ahead + margin) + margin)
+        near &= views.images[:, self.scans] >= 0
+        if not config.top_edges:
+            near &= self.edges != Edge.TOP
+        return np.asarray(near)
+
+    def _moved(
+        self, poses: Poses, views: Views, pose: IntArray, point: IntArray
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Points (3, k) at their images' instant, and their rates by the time offset, in the LiDAR frame.
 
         lP' = Exp(-tau w) lP to second order, w the LiDAR's mean twist over the interval.
         """
+        lPs = self.lPs[:, point]
         if views.twists is None or views.accelerations is None:
-            return self.lPs, None
-        taus = poses.offsets[:, None] + views.base_taus_s[:, self.scans] - self.offsets_s
-        now = np.moveaxis(views.twists[:, self.scans], 2, 1)
-        change = np.moveaxis(views.accelerations[:, self.scans], 2, 1) * taus[:, None]
-        mean = now - 0.5 * change
-        first = _cross(mean[:, :3], self.lPs[None]) + mean[:, 3:]
-        step = taus[:, None] * first
-        moved = self.lPs - step + 0.5 * taus[:, None] * _cross(mean[:, :3], step)
-        last = now - change
-        return moved, -poses.rotations @ (_cross(last[:, :3], moved) + last[:, 3:])
-
-    def _seen(self, poses: Poses, views: Views, moved: FloatArray, config: MatchConfig) -> _Seen:
-        """The points that fall into their image."""
-        camera = self.camera
-        cPs = poses.rotations @ moved + poses.translations[:, :, None]
-        paired = views.images >= 0
-        ahead = cPs[:, 2] > _MIN_DEPTH_M
-        if not paired.all():
-            ahead &= paired[:, self.scans]
-        if not config.top_edges:
-            ahead &= self.edges != Edge.TOP
-        pose, point = np.nonzero(ahead)
-        X, Y, Z = (cPs[pose, row, point] for row in range(3))
-        u, v = camera.fx * X / Z + camera.cx, camera.fy * Y / Z + camera.cy
-        inside = np.flatnonzero(
-            (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
-        )
-        pose, point = pose[inside], point[inside]
-        ways = np.einsum("kij,jk->ik", poses.rotations[pose], self.ways[:, point])
-        return _Seen(
-            pose,
-            point,
-            np.stack([X[inside], Y[inside], Z[inside]]),
-            ways,
-            np.stack([u[inside], v[inside]]),
-        )
+            return lPs, None
+        scan = self.scans[point]
+        taus = poses.offsets[pose] + views.base_taus_s[pose, scan] - self.offsets_s[point]
+        now, change = views.twists[pose, scan].T, views.accelerations[pose, scan].T * taus
+        mean, last = now - 0.5 * change, now - change
+        step = taus * (cross(mean[:3], lPs) + mean[3:])
+        moved = lPs - step + 0.5 * taus * cross(mean[:3], step)
+        return moved, -(cross(last[:3], moved) + last[3:])
 
     def _look_up(self, seen: _Seen, image: IntArray) -> tuple[FloatArray, FloatArray]:
         """Signed distances (k,) [px] and normals (2, k); infinite and 0 where there is no clear contour."""
@@ -273,9 +285,7 @@ class Outlines:
                 distance[part], normals[:, part] = _foot(contour, seen.uvs[:, part])
         return distance, normals
 
-    def _rows(
-        self, seen: _Seen, normals: FloatArray, kind: IntArray, rates: FloatArray | None, classes: int
-    ) -> FloatArray:
+    def _rows(self, seen: _Seen, normals: FloatArray, kind: IntArray, classes: int) -> FloatArray:
         """(7 + classes, k) derivatives of the residuals."""
         X, Y, Z = seen.cPs
         rows = np.zeros((7 + classes, len(X)))
@@ -283,16 +293,10 @@ class Outlines:
         c = -(a * X + b * Y) / Z
         rows[0], rows[1], rows[2] = Y * c - Z * b, Z * a - X * c, X * b - Y * a
         rows[3], rows[4], rows[5] = a, b, c
-        if rates is not None:
-            rows[6] = (rows[3:6] * rates[seen.pose, :, seen.point].T).sum(axis=0)
+        if seen.rates is not None:
+            rows[6] = (rows[3:6] * seen.rates).sum(axis=0)
         rows[7 + kind, np.arange(len(X))] = 1.0
         return rows
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """a x b over the second of three axes."""
-    x, y, z = a[:, 0], a[:, 1], a[:, 2]
-    return np.stack([y * b[:, 2] - z * b[:, 1], z * b[:, 0] - x * b[:, 2], x * b[:, 1] - y * b[:, 0]], axis=1)
 
 
 def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatArray]:

@@ -20,6 +20,7 @@ from sst_graph.association.pairing import pair_by_time
 from sst_graph.association.search import rotation_matrices
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
+from sst_graph.problem.trajectory import TwistSample
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +28,8 @@ IntArray = NDArray[np.intp]
 
 _LONGEST_RAD, _LONGEST_M, _LONGEST_S, _LONGEST_PX = 0.1, 0.3, 0.1, 3.0
 """Longest step of one iteration."""
+_NEAR_NS = 4_000_000
+"""Twists this close in time are one [ns]."""
 _DAMPING = 1e-3
 """Of a Gauss-Newton step, as a share of the diagonal of the normal equations."""
 
@@ -45,6 +48,7 @@ class Field:
 
     def __init__(self, parts: Sequence[_Part], tracks: Tracks, config: GraphConfig) -> None:
         self._parts, self._tracks, self.config = parts, tracks, config
+        self._twists: dict[tuple[int, int], TwistSample | None] = {}
         self.biases = sum(len(part.outlines.classes) for part in parts)
 
     @classmethod
@@ -97,13 +101,19 @@ class Field:
             same = np.flatnonzero(which.reshape(-1) == number)
             for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, limit):
                 images[same, pair.scan], taus[same, pair.scan] = pair.image, pair.base_tau_s
-                stamp_ns = drive.images[pair.image].stamp_ns + round(offset_s * 1e9)
-                sample = self._tracks.at(part.number, stamp_ns)
+                sample = self._twist(part, drive.images[pair.image].stamp_ns + round(offset_s * 1e9))
                 if sample is not None:
                     twists[same, pair.scan] = sample.twist
                     accelerations[same, pair.scan] = sample.acceleration
         moves = bool(twists.any())
         return Views(images, taus, twists if moves else None, accelerations if moves else None)
+
+    def _twist(self, part: _Part, stamp_ns: int) -> TwistSample | None:
+        """The LiDAR's twist, near enough in time."""
+        key = (part.number, stamp_ns // _NEAR_NS)
+        if key not in self._twists:
+            self._twists[key] = self._tracks.at(part.number, key[1] * _NEAR_NS + _NEAR_NS // 2)
+        return self._twists[key]
 
 
 def hold_heat(field: Field, poses: Poses, centres: Poses, kernels_px: Sequence[float]) -> Poses:
