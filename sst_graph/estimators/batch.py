@@ -20,7 +20,7 @@ from sst_graph.estimators.joint import JointSolution, agreement, concentration, 
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
-from sst_graph.problem.graph import Tracks
+from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
@@ -29,6 +29,7 @@ from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
+from sst_graph.uncertainty.observability import weak_directions
 
 FloatArray = NDArray[np.float64]
 
@@ -65,14 +66,21 @@ def calibrate(
     sources = as_sources(frames)
     _check(sources, config)
     began = time.perf_counter()
-    prepare = config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS and not (config.method == "joint" and config.use_motion):
-        prepare = dataclasses.replace(prepare, use_visual_odometry=False)
-    drives = [prepare_drive(source, config.classes, prepare, progress) for source in sources]
+    drives = prepare_drives(sources, config, progress)
     seconds = time.perf_counter() - began
     result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
     timing = {"prepare": seconds, **result.diagnostics["seconds"]}
     return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+
+
+def prepare_drives(
+    sources: Sequence[Source], config: CalibrationConfig, progress: Progress | None = None
+) -> list[Drive]:
+    """Of every frame what the method needs: image features are not tracked for one that does without."""
+    prepare = config.prepare
+    if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
+        prepare = dataclasses.replace(prepare, use_visual_odometry=False)
+    return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
 
 
 def calibrate_prepared(
@@ -83,7 +91,7 @@ def calibrate_prepared(
     initial_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> CalibrationResult:
-    """:func:`calibrate` of drives that were prepared before, with the same classes and settings."""
+    """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
     config = config or CalibrationConfig()
     guess = Guess(initial, initial_offset_s)
     began = time.perf_counter()
@@ -104,8 +112,12 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
         raise ConfigError(f"delay_per_drive needs drives of different names, found {names}")
     if config.delay_per_drive and config.method != "joint":
         raise ConfigError(f"delay_per_drive needs method joint, found {config.method}")
-    if config.delay_per_drive and config.use_motion:
-        raise ConfigError("use_motion knows one time offset only: leave out delay_per_drive")
+    if config.delay_per_drive and config.use_motion == "always":
+        raise ConfigError("use_motion always knows one time offset only: leave out delay_per_drive")
+
+
+def _may_hear_motion(config: CalibrationConfig) -> bool:
+    return config.method == "joint" and config.use_motion != "never" and not config.delay_per_drive
 
 
 def answer_joint(
@@ -123,19 +135,17 @@ def answer_joint(
     tracks = Tracks(drives, objects) if by_object else tracks
     finals = _finals(drives, tracks, contest, guess, config, progress)
     solution = finals[0]
-    # 3. What the motion alone says, where it is asked.
-    heard = WithMotion(solution)
-    if config.use_motion:
-        centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
-        heard = with_motion(drives, tracks, objects, solution, centre, config, progress)
+    # 3. How sure; where the labels tell everything, the motion is heard too.
+    covariance, model, _ = robust_covariance(*_frozen(solution), objects)
+    heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
+    if heard.solution is not solution:
         solution = heard.solution
+        covariance, model, _ = robust_covariance(*_frozen(solution), objects)
+        covariance *= heard.inflation
     evidence = {
         "explained": explained(solution),
         "concentration": concentration(solution, drives, tracks, config.joint),
     }
-    # 4. How sure, and in which directions not at all.
-    frozen = (solution.graph, solution.values, solution.pairs, solution.state, objects)
-    covariance, model, _ = robust_covariance(*frozen)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
@@ -154,11 +164,40 @@ def answer_joint(
                 f"{drives[d].name}:{c.name.lower()}": bias
                 for (d, c), bias in solution.state.biases_px.items()
             },
-            **({"motion": heard.diagnostics} if config.use_motion else {}),
+            "motion": heard.diagnostics,
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            FRAME_INFORMATION: to_document(frame_gains(*frozen, drives, model)),
+            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), objects, drives, model)),
         },
     )
+
+
+def _frozen(
+    solution: JointSolution,
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[PairMatches], State]:
+    """What the covariance is computed from."""
+    return solution.graph, solution.values, solution.pairs, solution.state
+
+
+def _hear_motion(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    solution: JointSolution,
+    covariance: FloatArray,
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None,
+) -> WithMotion:
+    """The solution with the motion in its graph, where it is asked for and there is any."""
+    if not _may_hear_motion(config):
+        return WithMotion(solution)
+    if config.use_motion == "auto":
+        weak = weak_directions(covariance[:7, :7], solution.state.cTl, config.observability)
+        rolling = any(scan.offsets_s.any() for drive in drives for scan in drive.scans)
+        if weak or rolling:
+            why = "the labels alone leave directions open" if weak else "the scans take their time"
+            return WithMotion(solution, diagnostics={"left_out": why})
+    centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+    return with_motion(drives, tracks, solution, covariance[:7, :7], centre, config, progress)
 
 
 def _finals(

@@ -16,6 +16,7 @@ from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.observability import ObservabilityConfig
 
 Method = Literal["joint", "paper", "static", "semalign", "motion"]
+UseMotion = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,10 @@ class CalibrationConfig:
             against visual odometry).
         classes: semantic classes to align.
         delay_per_drive: each drive has a time offset of its own, instead of one for all.
-        use_motion: method joint also hears what camera and LiDAR motion say (hand-eye), as a factor and as a
-            check.
+        use_motion: whether method joint also hears what camera and LiDAR motion say (hand-eye), as a factor
+            and as a check. ``auto``: where the labels alone tell all seven unknowns (a direction that only
+            the motion tells stays reported as unobservable), and the points of a scan share one time (a
+            rolling sweep is compensated by the very motion, which then lags a few milliseconds behind).
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
@@ -43,7 +46,7 @@ class CalibrationConfig:
     method: Method = "joint"
     classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
     delay_per_drive: bool = False
-    use_motion: bool = False
+    use_motion: UseMotion = "auto"
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)

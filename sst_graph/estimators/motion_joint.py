@@ -16,11 +16,12 @@ from sst_graph.estimators.joint import JointSolution, solve_joint
 from sst_graph.estimators.motion import difference, solve_motion
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import Tracks
-from sst_graph.problem.objects import ObjectId
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
-from sst_graph.uncertainty.covariance import robust_covariance
 
 FloatArray = NDArray[np.float64]
+
+_UNLIKELY_CHI2 = 14.07
+"""95 % quantile of chi-squared with 7 degrees of freedom."""
 
 
 @dataclass(frozen=True)
@@ -30,19 +31,22 @@ class WithMotion:
     Attributes:
         solution: with the motion in its graph, or as it was where motion says nothing or something else.
         doubts: a sentence where the two contradict each other.
+        inflation: of the covariance of what both say together: 1 where they agree as their covariances
+            claim, else the chi-squared of their difference over its dimension (Birge's ratio, squared).
         diagnostics: JSON-able numbers.
     """
 
     solution: JointSolution
     doubts: tuple[str, ...] = ()
+    inflation: float = 1.0
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
 def with_motion(
     drives: Sequence[Drive],
     tracks: Tracks,
-    objects: Sequence[dict[ObjectId, int]],
     solution: JointSolution,
+    covariance: FloatArray,
     guess: State,
     config: CalibrationConfig,
     progress: Progress | None = None,
@@ -54,7 +58,7 @@ def with_motion(
     independent here.
 
     Args:
-        objects: tracks of the objects of each drive, for the covariance.
+        covariance: (7, 7) of the joint solution.
         guess: what the weak priors are centred on.
     """
     # 1. The hand-eye solution from the joint one.
@@ -62,23 +66,20 @@ def with_motion(
     try:
         motion = solve_motion(drives, state.cTl, state.offsets_s[0], config.motion, progress)[0]
     except EstimationError as error:
-        return WithMotion(solution, (), {"left_out": str(error)})
+        return WithMotion(solution, diagnostics={"left_out": str(error)})
     # 2. Do they agree?
-    covariance, _, _ = robust_covariance(
-        solution.graph, solution.values, solution.pairs, solution.state, objects
-    )
     step = difference(state, motion.state)
-    apart = float(step @ np.linalg.solve(covariance[:7, :7] + motion.covariance, step))
+    apart = float(step @ np.linalg.solve(covariance + motion.covariance, step))
     sigmas = np.sqrt(np.diag(motion.covariance))
     facts = {"chi2_of_7": apart, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
     if apart > config.motion.max_disagreement or not motion.converged:
-        return WithMotion(solution, _contradiction(step, apart, motion.converged), facts)
+        return WithMotion(solution, _contradiction(step, apart, motion.converged), diagnostics=facts)
     # 3. Silhouettes once more, the motion among the factors.
     belief = belief_factor(motion.state, motion.covariance)
     last_scale = replace(config.joint, kernel_px=config.joint.kernel_px[-1:])
-    return WithMotion(
-        solve_joint(drives, state, last_scale, progress, guess, tracks, belief), (), {"fused": True, **facts}
-    )
+    fused = solve_joint(drives, state, last_scale, progress, guess, tracks, belief)
+    inflation = apart / len(step) if apart > _UNLIKELY_CHI2 else 1.0
+    return WithMotion(fused, inflation=inflation, diagnostics={"fused": True, **facts})
 
 
 def belief_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:

@@ -11,10 +11,10 @@ import numpy as np
 
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.problem.drive import Progress
 from sst_graph.result import Status
 from sst_graph.types import SemanticClass
 
@@ -125,14 +125,13 @@ def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outco
     """Every start on one street; the data are prepared once."""
     settings: dict[str, Any] = {"label_noise": config.label_noise, **scenario.drive}
     drive = simulate(SimulationConfig(seed=seed, **settings))
-    prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
-    prepared = prepare_drive(drive, scenario.classes, prepare)
     calibration = dataclasses.replace(config.calibration, classes=scenario.classes)
+    prepared = prepare_drives([drive], calibration)
     rng = np.random.default_rng([seed, 7])
     outcomes = []
     for _ in range(scenario.starts):
         start = start_near(drive.truth.cTl, config.start_deg, config.start_m, rng) if scenario.guess else None
-        result = calibrate_prepared([prepared], start, calibration)
+        result = calibrate_prepared(prepared, start, calibration)
         errors = calibration_errors(
             result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
-from sst_graph.problem.drive import Progress, prepare_drive
+from sst_graph.problem.drive import Progress
 from sst_graph.types import GroundTruth
 
 FloatArray = NDArray[np.float64]
@@ -89,11 +88,10 @@ def run(config: ConsistencyConfig, progress: Progress | None = None) -> str:
 
 def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     simulated = simulate(SimulationConfig(seed=seed, label_noise=config.label_noise, **drive))
-    prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
-    prepared = prepare_drive(simulated, config.calibration.classes, prepare)
+    prepared = prepare_drives([simulated], config.calibration)
     rng = np.random.default_rng([seed, 11])
     start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
-    result = calibrate_prepared([prepared], start, config.calibration)
+    result = calibrate_prepared(prepared, start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
     return Run(error, result.covariance, result.status == "not_converged" or not result.frames_used)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -12,10 +11,10 @@ import numpy as np
 
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Drive, Progress, prepare_drive
+from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.result import CalibrationResult
@@ -58,8 +57,7 @@ def run(config: DrivesConfig, progress: Progress | None = None) -> str:
     rows = [_HEADER, "|---|---|---|---|---|---|---|---|---|"]
     for done, shift in enumerate(config.shifts):
         sources = [open_source(path, image_shift=shift) for path in config.data]
-        prepare = dataclasses.replace(config.calibration.prepare, use_visual_odometry=False)
-        drives = [prepare_drive(source, config.calibration.classes, prepare) for source in sources]
+        drives = prepare_drives(sources, config.calibration)
         groups = [([source], [drive]) for source, drive in zip(sources, drives, strict=True)]
         if config.together and len(drives) > 1:
             groups.append((sources, drives))

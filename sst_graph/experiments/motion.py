@@ -25,8 +25,9 @@ DRIVES: Mapping[str, Mapping[str, Any]] = {
 """Changes to the simulator's settings, by name."""
 RUNS: Mapping[str, tuple[bool, Mapping[str, Any]]] = {
     "motion, no guess": (False, {"method": "motion"}),
+    "joint, labels only": (True, {"method": "joint", "use_motion": "never"}),
     "joint": (True, {"method": "joint"}),
-    "joint with motion": (True, {"method": "joint", "use_motion": True}),
+    "joint, motion always": (True, {"method": "joint", "use_motion": "always"}),
 }
 """Whether it starts from a guess, and its settings, by name."""
 

@@ -257,9 +257,9 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
 def test_the_joint_method_hears_the_motion(street: Path) -> None:
     source = open_source(street, frames="0:12")
     settings = dataclasses.replace(CalibrationConfig(), start=StartConfig(enabled=False))
-    deaf = calibrate(source, source.nominal, settings)
-    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion=True))
-    assert hearing.diagnostics["motion"]["fused"] is True and "motion" not in deaf.diagnostics
+    deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
+    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="always"))
+    assert hearing.diagnostics["motion"]["fused"] is True and not deaf.diagnostics["motion"]
     assert hearing.covariance[6, 6] < deaf.covariance[6, 6]
     truth = source.truth
     assert truth is not None and truth.time_offset_s is not None
@@ -267,6 +267,6 @@ def test_the_joint_method_hears_the_motion(street: Path) -> None:
 
 
 def test_one_clock_only(street: Path) -> None:
-    settings = dataclasses.replace(CalibrationConfig(), use_motion=True, delay_per_drive=True)
+    settings = dataclasses.replace(CalibrationConfig(), use_motion="always", delay_per_drive=True)
     with pytest.raises(ConfigError, match="use_motion"):
         calibrate(open_source(street), None, settings)
