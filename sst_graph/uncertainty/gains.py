@@ -2,7 +2,8 @@
 
 The covariance of a set of frames is that of :mod:`sst_graph.uncertainty.covariance` over those frames
 alone, matches and error model unchanged: H sums the frames' information with the motion marginalised out,
-the surplus their scores; sides that several frames see keep their shared error.
+the surplus their scores; sides that several frames see keep their shared error. All this under the error
+model alone, without what the answer's covariance takes from leaving objects out.
 """
 
 from __future__ import annotations

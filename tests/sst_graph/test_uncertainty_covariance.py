@@ -19,6 +19,7 @@ from sst_graph.uncertainty.covariance import (
     marginal_covariance,
     score_variance,
     spread_beyond,
+    steps_without_objects,
     with_floors,
 )
 
@@ -32,7 +33,8 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
     frames = sides * 3 + rng.integers(0, 3, m)
     roots = rng.uniform(0.1, 1.0, m)
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
-    return MatchTable(J, roots, rng.normal(size=m), sides, np.unique(frames, return_inverse=True)[1], 5.0)
+    side_frames = np.unique(frames, return_inverse=True)[1]
+    return MatchTable(J, roots, rng.normal(size=m), sides, side_frames, sides // 3, 5.0)
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
@@ -45,7 +47,22 @@ def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
         + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
-    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames, 5.0)
+    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames, sides // 3, 5.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_without_objects_are_those_of_solving_again(seed: int) -> None:
+    table = replace(random_table(seed, m=60), objects=np.repeat(np.arange(5), 12))
+    J, r = table.J, table.root_weights * table.r
+    # A prior that makes 0 the optimum of all: minimise |r + J x|^2 + |P^(1/2) (x - x0)|^2.
+    P = np.diag(np.linspace(0.5, 2.0, J.shape[1]))
+    x0 = np.linalg.solve(P, J.T @ r)
+    steps = steps_without_objects(table, np.linalg.inv(J.T @ J + P))
+    assert steps.shape == (5, J.shape[1])
+    for number, step in enumerate(steps):
+        rest = table.objects != number
+        again = np.linalg.solve(J[rest].T @ J[rest] + P, P @ x0 - J[rest].T @ r[rest])
+        np.testing.assert_allclose(step, again, rtol=1e-5, atol=1e-7)
 
 
 def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
