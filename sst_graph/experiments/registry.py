@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, consistency, drives, motion, paper_table, slam
+from sst_graph.experiments import accuracy, consistency, drives, motion, paper_table, slam, windows
 from sst_graph.problem.drive import Progress
 
 
@@ -56,6 +56,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "SLAM and calibration in one graph against either alone, on simulated streets",
         slam.SlamConfig(),
         slam.run,
+    ),
+    "windows": Experiment(
+        "real drives cut into windows: the spread of the answers against the claimed sigmas",
+        windows.WindowsConfig(),
+        windows.run,
     ),
 }
 

@@ -1,0 +1,118 @@
+"""Real drives cut into windows: do the answers spread as far as their covariances claim?"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data import open_source
+from sst_graph.errors import ConfigError
+from sst_graph.estimators import CalibrationConfig, calibrate
+from sst_graph.problem.drive import Progress
+from sst_graph.result import CalibrationResult
+
+FloatArray = NDArray[np.float64]
+
+PARTS = (slice(0, 3), slice(3, 6), slice(6, 7))
+"""Rotation, translation and time offset among the seven unknowns."""
+
+
+@dataclass(frozen=True)
+class WindowsConfig:
+    """Drives and how they are cut.
+
+    Attributes:
+        data: folders of drives that bring a nominal calibration, the guess of every window.
+        windows: numbers of equal windows that each drive is cut into, one row of the table each.
+        shift: image shift.
+        calibration: settings of the method.
+    """
+
+    data: tuple[str, ...] = ()
+    windows: tuple[int, ...] = (2, 3, 4)
+    shift: int = 0
+    calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        if not self.windows or min(self.windows) < 2:
+            raise ValueError(f"windows: found {list(self.windows)}, expected numbers from 2 on")
+
+
+def run(config: WindowsConfig, progress: Progress | None = None) -> str:
+    """A Markdown table: one row for every drive and number of windows.
+
+    Raises:
+        ConfigError: no data.
+        DataError: a drive cannot be used.
+    """
+    if not config.data:
+        raise ConfigError("data: found none, expected folders, such as --set 'data=[\"DRIVE\"]'")
+    rows = [_HEADER, "|---|---|---|---|---|---|---|"]
+    for path in config.data:
+        for done, count in enumerate(config.windows):
+            rows.append(_row(path, count, config))
+            if progress is not None:
+                progress(path, done + 1, len(config.windows))
+    return "\n".join(rows) + "\n"
+
+
+_HEADER = (
+    "| drive | windows | rotation [deg]: spread / claimed | translation [cm] | time offset [ms] "
+    "| spread in claimed sigmas: rotation, translation, offset | status |"
+)
+
+
+def _row(path: str, count: int, config: WindowsConfig) -> str:
+    whole = open_source(path, image_shift=config.shift)
+    edges = np.linspace(0, len(whole), count + 1).round().astype(int)
+    results = []
+    for first, last in itertools.pairwise(edges):
+        window = open_source(path, image_shift=config.shift, frames=f"{first}:{last}")
+        results.append(calibrate(window, window.nominal, config.calibration))
+    deviations, covariances = deviations_of(results)
+    units = (np.degrees(1.0), 100.0, 1e3)
+    cells = [whole.name, str(count)]
+    for part, unit in zip(PARTS, units, strict=True):
+        width = part.stop - part.start
+        spread = np.sqrt((deviations[:, part] ** 2).sum() / (width * (count - 1)))
+        claimed = np.sqrt(np.mean([np.trace(C[part, part]) / width for C in covariances]))
+        cells.append(f"{unit * spread:.2f} / {unit * claimed:.2f}")
+    cells.append(", ".join(f"{ratio:.2f}" for ratio in spread_in_sigmas(deviations, covariances)))
+    cells.append(", ".join(result.status for result in results))
+    return "| " + " | ".join(cells) + " |"
+
+
+def deviations_of(results: Sequence[CalibrationResult]) -> tuple[FloatArray, list[FloatArray]]:
+    """(n, 7) deviations of answers from their mean weighted by information, and their covariances."""
+    first = results[0]
+    steps = np.array(
+        [
+            np.append(
+                gtsam.Pose3.Logmap(first.T_camera_lidar.between(result.T_camera_lidar)),
+                result.time_offset_s - first.time_offset_s,
+            )
+            for result in results
+        ]
+    )
+    covariances = [np.asarray(result.covariance, np.float64) for result in results]
+    information = [np.linalg.inv(C) for C in covariances]
+    weighted = np.sum([H @ step for H, step in zip(information, steps, strict=True)], axis=0)
+    return steps - np.linalg.solve(np.sum(information, axis=0), weighted), covariances
+
+
+def spread_in_sigmas(deviations: FloatArray, covariances: Sequence[FloatArray]) -> list[float]:
+    """Spread of rotation, translation and time offset over what is claimed; 1 where the claims hold."""
+    ratios = []
+    for part in PARTS:
+        squares = [
+            float(d[part] @ np.linalg.solve(C[part, part], d[part]))
+            for d, C in zip(deviations, covariances, strict=True)
+        ]
+        freedom = (part.stop - part.start) * (len(deviations) - 1)
+        ratios.append(float(np.sqrt(np.sum(squares) / freedom)))
+    return ratios

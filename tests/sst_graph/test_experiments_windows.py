@@ -1,0 +1,66 @@
+"""The experiment on windows of real drives: its statistics, its refusals and a small run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.errors import ConfigError
+from sst_graph.estimators import CalibrationConfig
+from sst_graph.estimators.start import StartConfig
+from sst_graph.experiments import windows
+from sst_graph.experiments.windows import WindowsConfig, deviations_of, spread_in_sigmas
+from sst_graph.result import CalibrationResult
+from tests.sst_graph.streets import standing_street
+
+
+def drawn_results(template: CalibrationResult, count: int, claimed: float) -> list[CalibrationResult]:
+    """Answers drawn from a covariance, claiming ``claimed`` times its sigmas."""
+    rng = np.random.default_rng(3)
+    root = np.diag([1e-3] * 3 + [0.01] * 3 + [0.002]) @ (np.eye(7) + 0.3 * rng.normal(size=(7, 7)))
+    results = []
+    for _ in range(count):
+        error = root @ rng.normal(size=7)
+        results.append(
+            replace(
+                template,
+                T_camera_lidar=template.T_camera_lidar.compose(gtsam.Pose3.Expmap(error[:6])),
+                time_offset_s=float(error[6]),
+                covariance=claimed**2 * root @ root.T,
+            )
+        )
+    return results
+
+
+@pytest.mark.parametrize("claimed", [1.0, 0.5])
+def test_the_spread_of_drawn_answers_is_what_was_drawn(claimed: float) -> None:
+    template = CalibrationResult(gtsam.Pose3(), 0.0, np.eye(7), "ok", standing_street().camera)
+    deviations, covariances = deviations_of(drawn_results(template, 200, claimed))
+    assert spread_in_sigmas(deviations, covariances) == pytest.approx([1.0 / claimed] * 3, rel=0.08)
+
+
+def test_no_data_and_one_window_are_refused() -> None:
+    with pytest.raises(ConfigError, match="data"):
+        windows.run(WindowsConfig())
+    with pytest.raises(ValueError, match="windows"):
+        WindowsConfig(windows=(1,))
+
+
+def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
+    folder = tmp_path / "street"
+    small = SimulationConfig(
+        seed=3, frames=4, width=621, height=188, motion="no_stop", azimuth_step_deg=0.35, time_offset_s=0.0
+    )
+    write_drive(simulate(small), folder)
+    known = replace(CalibrationConfig(), start=StartConfig(enabled=False))
+    table = windows.run(WindowsConfig((str(folder),), (2,), calibration=known))
+    cells = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
+    assert cells[:2] == ["street/00", "2"] and len(table.splitlines()) == 3
+    spread, claimed = (float(part) for part in cells[2].split(" / "))
+    assert 0.0 < spread < 1.0 and 0.0 < claimed < 2.0
+    assert all(0.0 < float(ratio) < 6.0 for ratio in cells[5].split(", "))
