@@ -83,8 +83,7 @@ class StepAlarm:
         if not scores or len(self.recent) < self.config.frames:
             return None
         statistic = chi_square(list(self.recent), joint, model, self.object_sigma_px)
-        scale = self._scale(joint.core_size)
-        value = statistic / scale
+        value = statistic / self._scale(joint.core_size)
         self.quiet += 1
         if value > self.config.chi2:
             self.raised += 1
@@ -92,6 +91,10 @@ class StepAlarm:
             self.raised = 0
             self.usual.append(statistic)
         return value
+
+    def value(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float:
+        """The statistic of any frames' scores, over its usual size; nothing is learnt from it."""
+        return chi_square(scores, joint, model, self.object_sigma_px) / self._scale(joint.core_size)
 
     @property
     def alarm(self) -> bool:

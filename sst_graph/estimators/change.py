@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -12,7 +12,7 @@ import numpy as np
 from factors import delay_drift, extrinsic_drift
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Point
-from sst_graph.estimators.scores import pair_factors
+from sst_graph.estimators.scores import motion_factor, silhouettes_factor
 from sst_graph.problem.state import object_bias_key, twist_key
 
 if TYPE_CHECKING:
@@ -33,6 +33,19 @@ def read_point(isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] =
     return Point(cTl, float(scalars[0]), scalars[1:objects], tracks, scalars[objects:])
 
 
+@dataclass(frozen=True)
+class TwistFactor:
+    """What odometry says of an image's twist: once, however many scans meet the image.
+
+    Attributes:
+        index: of the factor in iSAM2.
+        scan: the scan whose matches it was made with.
+    """
+
+    index: int
+    scan: int
+
+
 class Change:
     """One update, prepared on copies."""
 
@@ -48,6 +61,7 @@ class Change:
         self._alive = alive
         self.isam = gtsam.ISAM2(smoother.isam)
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
+        self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
@@ -57,6 +71,7 @@ class Change:
         self._graph, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         self._remove: list[int] = []
         self._added: list[tuple[str, int]] = []
+        self._tied: dict[int, int] = {}
 
     def apply(self) -> None:
         """Prepare all changes, update the copy of iSAM2, read the estimate."""
@@ -64,6 +79,7 @@ class Change:
         self._retire()
         self._welcome()
         self._enter()
+        self._tie_twists()
         self._close_epochs()
         self._bury()
         if self.past is not self._smoother.past:
@@ -79,7 +95,7 @@ class Change:
     def _retire(self) -> None:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
             entry = self.entries.pop(scan)
-            self._remove += self.ids.pop(scan)
+            self._remove.append(self.ids.pop(scan))
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
             self.past = self.past.plus(entry.score.belief)
@@ -88,7 +104,7 @@ class Change:
                 self.epoch_sums.add(entry.score, scan, self._smoother.graph.object_bias_sigma_px)
         for scan in self._dropped & set(self.entries):
             del self.entries[scan]
-            self._remove += self.ids.pop(scan)
+            self._remove.append(self.ids.pop(scan))
 
     def _welcome(self) -> None:
         """Objects seen for the first time get a mask bias of their own, tied to their class's."""
@@ -115,21 +131,33 @@ class Change:
     def _enter(self) -> None:
         smoother = self._smoother
         for scan, new in sorted(self._found.items()):
-            pair, score = new.pair, new.score
+            pair = new.pair
             known = self.entries.get(scan)
             epoch = self._epoch_at(new.stamp_ns) if known is None else known.epoch
             if known is not None:
-                self._remove += self.ids[scan]
-            point = score.belief.point
-            key = twist_key(0, scan)
-            factors = pair_factors(
-                pair, smoother.classes, smoother.keys(epoch), key, point.offset_s, point.cTl, smoother.graph
-            )
-            for factor in factors:
-                self._add(factor, "pair", scan)
-            if known is None:
+                self._remove.append(self.ids[scan])
+            key = twist_key(0, new.image)
+            self._add(silhouettes_factor(pair, smoother.classes, smoother.keys(epoch), key), "pair", scan)
+            if not (self.isam.valueExists(key) or self._values.exists(key)):
                 self._values.insert(key, pair.motion.c_twist)
-            self.entries[scan] = Entry(pair, score, epoch)
+            self.entries[scan] = Entry(pair, new.score, epoch, new.image)
+
+    def _tie_twists(self) -> None:
+        """Odometry's word on each image's twist, by the first scan that meets the image, as in the batch."""
+        firsts: dict[int, int] = {}
+        for scan in sorted(self.entries):
+            firsts.setdefault(self.entries[scan].image, scan)
+        for image, twist in list(self.twists.items()):
+            if firsts.get(image) != twist.scan or twist.scan in self._found:
+                self._remove.append(self.twists.pop(image).index)
+        smoother = self._smoother
+        for image, scan in firsts.items():
+            if image not in self.twists:
+                entry = self.entries[scan]
+                keys, key = smoother.keys(entry.epoch), twist_key(0, image)
+                point = entry.score.belief.point
+                self._add(motion_factor(entry.pair, point, keys, key, smoother.graph), "twist", image)
+                self._tied[image] = scan
 
     def _epoch_at(self, stamp_ns: int) -> int:
         """The epoch of a stamp; a new one where the last has lasted long enough."""
@@ -181,16 +209,16 @@ class Change:
 
     def _number(self, indices: list[int]) -> None:
         """Remember under which index iSAM2 keeps each new factor."""
-        pairs: dict[int, list[int]] = {}
         links: dict[int, int] = {}
         for (kind, number), index in zip(self._added, indices, strict=True):
             if kind == "past":
                 self.past_id = index
             elif kind == "pair":
-                pairs.setdefault(number, []).append(index)
+                self.ids[number] = index
+            elif kind == "twist":
+                self.twists[number] = TwistFactor(index, self._tied[number])
             else:
                 links[number] = index
-        self.ids.update({scan: (a, b) for scan, (a, b) in pairs.items()})
         self.epochs = tuple(
             replace(epoch, links=(links[epoch.number], links[-epoch.number]))
             if epoch.number in links

@@ -23,6 +23,7 @@ from sst_graph.estimators.epochs import RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.scores import ScoreSums
+from sst_graph.estimators.settling import Milestones
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
@@ -33,7 +34,7 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 2
+VERSION = 3
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -56,6 +57,8 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "alarmed": tracker.alarmed,
         "attempts": tracker.attempts,
         "waited": tracker.waited,
+        "watched": list(tracker.watched),
+        "milestones": [tracker.milestones.first, tracker.milestones.next],
         "inflation": tracker.inflation,
         "alarm": [tracker.alarm.raised, tracker.alarm.quiet],
         "window": _put_window(arrays, tracker.window),
@@ -113,6 +116,9 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     tracker.guess = _guess(head["guess"])
     tracker.alarmed, tracker.attempts, tracker.waited = head["alarmed"], head["attempts"], head["waited"]
     tracker.inflation = head["inflation"]
+    first, following = head["milestones"]
+    tracker.milestones = Milestones(first, following, tracker.config.window)
+    tracker.watched.extend(head["watched"])
     tracker.alarm.raised, tracker.alarm.quiet = head["alarm"]
     tracker.alarm.usual.extend(arrays["usual"].tolist())
     tracker.adoption.costs.extend((float(a), float(b)) for a, b in arrays["costs"])
@@ -152,6 +158,7 @@ def _put_window(arrays: Arrays, window: Window) -> dict[str, Any]:
     objects = window.objects
     return {
         "next_scan": window.next_scan,
+        "next_image": window.next_image,
         "scans": scans,
         "images": [[image.index, image.stamp_ns] for image in window.images],
         "motions": [[motion.from_ns, motion.to_ns, motion.ok] for motion in window.motions],
@@ -195,7 +202,7 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
         pose, covariance = gtsam.Pose3(arrays[f"motion/{i}"]), arrays[f"motion/{i}/covariance"]
         window.motions.append(RelativeMotion(from_ns, to_ns, pose, covariance, ok))
     window.wTl = gtsam.Pose3(arrays["wTl"])
-    window.next_scan = head["next_scan"]
+    window.next_scan, window.next_image = head["next_scan"], head["next_image"]
     for track, c, place, last in head["objects"]:
         window.objects.live[track] = (SemanticClass(c), np.array(place))
         window.objects.last_seen[track] = last

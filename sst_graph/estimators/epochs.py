@@ -23,11 +23,13 @@ class Found:
         pair: the matches.
         score: their belief and sums.
         stamp_ns: of the scan.
+        image: number of the image; scans that meet the same one share its twist.
     """
 
     pair: PairMatches
     score: PairScore
     stamp_ns: int
+    image: int
 
 
 @dataclass(frozen=True)
@@ -38,11 +40,13 @@ class Entry:
         pair: its matches.
         score: its belief and sums at the point of the matches.
         epoch: which calibration it sees.
+        image: number of its image.
     """
 
     pair: PairMatches
     score: PairScore
     epoch: int
+    image: int
 
 
 @dataclass(frozen=True)

@@ -14,11 +14,13 @@ from factors.camera import PinholeCamera
 from factors.errors import FactorError
 from factors.robust import RobustKernel
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.matcher import WindowMatcher
+from sst_graph.estimators.settling import Milestones, settle_window
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
@@ -36,8 +38,6 @@ FloatArray = NDArray[np.float64]
 
 _UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
-_WHOLE_STEPS = 5
-"""Steps under the last kernel before they are shortened."""
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
@@ -74,6 +74,8 @@ class Tracker:
         self.adoption = Adoption(self.config.adoption)
         self.history_store = History(self.config.drift.history)
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
+        self.watched: deque[int] = deque(maxlen=self.config.alarm.frames)
+        self.milestones = Milestones(0, self.config.window, self.config.window)
         self.alarmed = False
         self.attempts = 0
         self.waited = 0
@@ -116,8 +118,8 @@ class Tracker:
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Take in an image; it is used as soon as a scan close to it in true time is there."""
         try:
-            self._check_image(image)
-            self.window.add_image(image_features(len(self.window.images), image, self.classes))
+            check_image(image, self.camera, self.window, self.point.offset_s, self.config.late_s)
+            self.window.add_image(image_features(self.window.next_image, image, self.classes))
         except (DataError, FactorError, ValueError) as error:
             return self._answer(image.stamp_ns, str(error))
         return self._answer(image.stamp_ns)
@@ -151,29 +153,9 @@ class Tracker:
         self._take_covariance(smoother)
         self.smoother = smoother
 
-    def _check_image(self, image: CameraImage) -> None:
-        expected = (self.camera.height, self.camera.width)
-        if image.mask.shape != expected:
-            raise DataError("tracker", f"a mask of {image.mask.shape}", f"{expected}, the camera's size")
-        newest = self.window.last_stamp_ns
-        if newest is not None and self.window.images:
-            late = (newest - image.stamp_ns) * 1e-9 - self.point.offset_s
-            if late > self.config.late_s and image.stamp_ns < self.window.images[-1].stamp_ns:
-                raise DataError(
-                    "tracker",
-                    f"an image {late:.2f} s behind the newest scan",
-                    f"at most {self.config.late_s:g} s",
-                )
-
     def _take_scan(self, scan: Scan) -> int:
         """Features and motion of a scan into the window; its number."""
-        if not np.isfinite(scan.points).all():
-            raise DataError("tracker", "points that are NaN or inf", "finite points")
-        if len(scan.points) != len(scan.classes):
-            raise DataError("tracker", f"{len(scan.classes)} labels", f"{len(scan.points)}, one a point")
-        newest = self.window.last_stamp_ns
-        if newest is not None and scan.stamp_ns <= newest:
-            raise DataError("tracker", f"a scan of stamp {scan.stamp_ns} ns", f"one after {newest} ns")
+        check_scan(scan, self.window)
         prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
@@ -216,6 +198,8 @@ class Tracker:
         self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
         self.alarm.restart()
         self.adoption.restart()
+        self.watched.clear()
+        self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
         _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
         return self._answer(stamp_ns)
@@ -232,7 +216,10 @@ class Tracker:
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         chi2 = self._watch(new, before)
         if self.alarm.alarm:
-            return self._change(stamp_ns, chi2)
+            if self._is_change(before):
+                return self._change(before, stamp_ns, chi2)
+            before = smoother.point
+            found, missing = self.matcher.match(before, chosen, share=self._share)
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
@@ -240,6 +227,8 @@ class Tracker:
             smoother.update(found, missing, first, self.window.objects.live)
             self.window.judged_anew -= chosen
         self.entered.extend(new)
+        if self.milestones.reached(number) and not self.config.drift.enabled:
+            self.settle(most=0)
         self._take_covariance(smoother)
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
@@ -284,36 +273,24 @@ class Tracker:
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
 
-        The kernel begins wide and narrows: matches made frame by frame hold the estimate within a standard
-        deviation or two of where the batch would end. Where matches come and go in turn, so that the
-        estimate goes round in a circle, the steps are shortened and end in the middle of it.
-
         Returns:
             Whether it rests: the last whole step was below 0.02 standard deviations.
         """
-        smoother = self.smoother
+        smoother, joint = self.smoother, self.config.calibration.joint
         if smoother is None:
             return False
         self.window.judge_all()
-        scales = self.config.calibration.joint.kernel_px
-        at = smoother.point
-        for i, scale in enumerate((*scales, *[scales[-1]] * most)):
-            kernel = RobustKernel("geman_mcclure", scale)
-            found, missing = self.matcher.match(at, None, kernel, self._share)
-            try:
-                smoother.update(found, missing, 0, self.window.objects.live)
-                smoother.polish()
-                self._take_covariance(smoother)
-            except EstimationError as error:
-                _LOG.warning("tracker: not settled: %s", error)
-                return False
-            left = smoother.point.core().local(at.core())
-            if i + 1 >= len(scales) and left @ np.linalg.solve(self.covariance, left) < 0.02**2:
-                return True
-            share = 1.0 / max(1, i + 1 - len(scales) - _WHOLE_STEPS)
-            at = smoother.point.moved(np.append((1.0 - share) * left, np.zeros(len(smoother.point.tracks))))
-        smoother.rest_at(at)
-        return False
+        alive = self.window.objects.live
+        try:
+            rests = settle_window(
+                smoother, self.matcher, joint.kernel_px, most, joint.full_steps, alive, self._share
+            )
+            self._take_covariance(smoother)
+        except EstimationError as error:
+            _LOG.warning("tracker: not settled: %s", error)
+            return False
+        self.entered.extend(set(smoother.entries) - set(self.entered))
+        return rests
 
     @property
     def _share(self) -> float:
@@ -326,7 +303,30 @@ class Tracker:
             return None
         kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
         scores = self.matcher.scores(before, new, kernel)
+        self.watched.extend(new)
         return self.alarm.check(scores, self.joint, self.smoother.model)
+
+    def _is_change(self, before: Point) -> bool:
+        """Whether frames past the threshold mean that the calibration has changed.
+
+        Not where a single object says so, for its labels may err for a while; nor where one calibration
+        explains the frames before and since, the young estimate having been wrong.
+        """
+        kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
+        smoother, limit = self.smoother, self.config.alarm.chi2
+        assert smoother is not None
+
+        def value(point: Point, without: int | None = None) -> float:
+            scores = self.matcher.scores(point, self.watched, kernel, without)
+            return self.alarm.value(scores, self.joint, smoother.model)
+
+        if any(value(before, track) <= limit for track in self.matcher.objects_of(self.watched)):
+            return False
+        self.settle(most=0)
+        if value(smoother.point) <= limit:
+            self.alarm.restart()
+            return False
+        return True
 
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""
@@ -344,9 +344,8 @@ class Tracker:
             return None
         return Point(self.guess.cTl, self.guess.offset_s, np.zeros(len(self.classes)))
 
-    def _change(self, stamp_ns: int, chi2: float | None) -> TrackUpdate:
+    def _change(self, point: Point, stamp_ns: int, chi2: float | None) -> TrackUpdate:
         """The calibration has changed: begin again from the frames since, near the last estimate."""
-        point = self.point
         _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
         self.guess = Guess(point.cTl, point.offset_s, search=False)
         self.smoother, self.alarmed = None, True

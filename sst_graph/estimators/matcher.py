@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.estimators.adoption import mean_cost
@@ -47,13 +50,33 @@ class WindowMatcher:
         for number, pair in pairs.items():
             if len(pair) >= self.config.min_frame_matches:
                 pair = pair if share == 1.0 else with_share(pair, share)
-                found[number] = Found(pair, self._score(pair, number, point, share), stamps[number])
+                score, image = self._score(pair, number, point, share), self.window.images[pair.pair.image]
+                found[number] = Found(pair, score, stamps[number], image.index)
         return found, set(numbers) - set(found)
 
-    def scores(self, point: Point, chosen: Collection[int], kernel: RobustKernel) -> list[PairScore]:
-        """What some scans say at a point."""
+    def scores(
+        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: int | None = None
+    ) -> list[PairScore]:
+        """What some scans say at a point, all their objects but the one of track ``without``."""
         pairs, _ = self._pairs(point, chosen, kernel)
-        return [self._score(pair, number, point, 1.0) for number, pair in pairs.items()]
+        if without is not None:
+            pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
+        return [self._score(pair, number, point, 1.0) for number, pair in pairs.items() if len(pair)]
+
+    def objects_of(self, chosen: Collection[int]) -> set[int]:
+        """Tracks of all objects of some scans."""
+        return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
+
+    def _leaving_out(self, pair: PairMatches, number: int, track: int) -> PairMatches:
+        tracks, matches, own = self.window.tracks[number], {}, {}
+        for c, m in pair.matches.items():
+            kept = np.flatnonzero([tracks[c, int(name)] != track for name in m.objects])
+            if len(kept):
+                part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index")}
+                matches[c] = replace(m, alignment=m.alignment.take(kept), **part)
+                if c in pair.tracks:
+                    own[c] = pair.tracks[c][kept]
+        return replace(pair, matches=matches, tracks=own)
 
     def cost(self, point: Point, chosen: Collection[int]) -> float | None:
         """Mean cost of the boundary points of some scans at a point; None where none can be seen."""

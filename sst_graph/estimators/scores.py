@@ -83,16 +83,10 @@ def object_places(pair: PairMatches, classes: Sequence[SemanticClass]) -> dict[i
     return {int(track): classes.index(c) for c, tracks in pair.tracks.items() for track in np.unique(tracks)}
 
 
-def pair_factors(
-    pair: PairMatches,
-    classes: Sequence[SemanticClass],
-    keys: Sequence[int],
-    V_key: int,
-    offset_0_s: float,
-    cTl: gtsam.Pose3,
-    config: GraphConfig,
-) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
-    """Silhouettes and motion of one pair, on the keys of its epoch [E, D, biases...] and its twist."""
+def silhouettes_factor(
+    pair: PairMatches, classes: Sequence[SemanticClass], keys: Sequence[int], V_key: int
+) -> gtsam.NonlinearFactor:
+    """Silhouettes of one pair, on the keys of its epoch [E, D, biases...] and its image's twist."""
     biases: list[int | float | GroupedBias | None] = []
     for c in pair.matches:
         tracks = pair.tracks.get(c)
@@ -103,15 +97,21 @@ def pair_factors(
         own = tuple(object_bias_key(0, int(track)) for track in names)
         biases.append(GroupedBias(own, groups.reshape(-1)))
     alignments = [matches.alignment for matches in pair.matches.values()]
-    silhouettes = frame_factor(alignments, keys[0], keys[1], V_key, biases)
+    return frame_factor(alignments, keys[0], keys[1], V_key, biases)
+
+
+def motion_factor(
+    pair: PairMatches, point: Point, keys: Sequence[int], V_key: int, config: GraphConfig
+) -> gtsam.NonlinearFactor:
+    """What odometry says of the twist of a pair's image, at the point of its matches."""
     if pair.l_twist is None:
         sigmas = np.repeat(config.still_sigma, 3)
-        return silhouettes, velocity_factor(V_key, np.zeros(6), np.diag(sigmas**2))
-    covariance = camera_twist(pair.l_twist, cTl).covariance
-    motion = twist_transfer_factor(
-        V_key, keys[0], keys[1], pair.l_twist.twist, pair.l_twist.acceleration, offset_0_s, covariance
+        return velocity_factor(V_key, np.zeros(6), np.diag(sigmas**2))
+    covariance = camera_twist(pair.l_twist, point.cTl).covariance
+    l_twist = pair.l_twist
+    return twist_transfer_factor(
+        V_key, keys[0], keys[1], l_twist.twist, l_twist.acceleration, point.offset_s, covariance
     )
-    return silhouettes, motion
 
 
 def with_share(pair: PairMatches, share: float) -> PairMatches:
@@ -131,7 +131,7 @@ def score_pair(
     config: GraphConfig,
     share: float = 1.0,
 ) -> PairScore:
-    """Linearize a pair at the point its matches were made at: the factors of :func:`pair_factors`.
+    """Linearize a pair at the point its matches were made at: its silhouettes and its motion.
 
     Args:
         tracks: number of the track of each (class, object) of the scan.

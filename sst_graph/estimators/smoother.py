@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.change import Change, read_point
+from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
 from sst_graph.estimators.scores import ScoreSums
@@ -66,7 +66,8 @@ class WindowSmoother:
         self.model = model or ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
         self._epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
-        self.ids: dict[int, tuple[int, int]] = {}
+        self.ids: dict[int, int] = {}
+        self.twists: dict[int, TwistFactor] = {}
         self.isam, self.past_id = self._begun()
         self._point = past.mean()
         self.epoch_sums = EpochSums.empty(past.point)
@@ -128,7 +129,7 @@ class WindowSmoother:
 
     def _take(self, change: Change) -> None:
         self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
-        self.ids, self.entries = change.ids, change.entries
+        self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
         self.past, self.sums = change.past, change.sums
         self.epoch_sums, self._point = change.epoch_sums, change.point
         self.retired += change.retired
@@ -148,7 +149,7 @@ class WindowSmoother:
         graph, factors = gtsam.NonlinearFactorGraph(), self.isam.getFactorsUnsafe()
         order = [self.past_id]
         order += [index for epoch in self._epochs for index in epoch.links or ()]
-        order += [index for pair in self.ids.values() for index in pair]
+        order += [*self.ids.values(), *(twist.index for twist in self.twists.values())]
         for index in order:
             graph.add(factors.at(index))
         params = gtsam.LevenbergMarquardtParams()
@@ -166,7 +167,8 @@ class WindowSmoother:
         except (RuntimeError, ValueError) as error:
             raise EstimationError(f"the window's optimisation failed: {error}") from error
         self.isam, self.past_id, self._point = isam, new[self.past_id], point
-        self.ids = {scan: (new[a], new[b]) for scan, (a, b) in self.ids.items()}
+        self.ids = {scan: new[index] for scan, index in self.ids.items()}
+        self.twists = {image: replace(twist, index=new[twist.index]) for image, twist in self.twists.items()}
         self._epochs = tuple(
             replace(epoch, links=None if epoch.links is None else (new[epoch.links[0]], new[epoch.links[1]]))
             for epoch in self._epochs

@@ -54,6 +54,7 @@ class Window:
         sightings: the latest ones of each track, in the order of time.
         moving: speed of the objects of a scan that move by themselves, by the scan's number [m/s].
         judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
+        next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
     """
 
     def __init__(self, camera: PinholeCamera, scans: int) -> None:
@@ -67,6 +68,7 @@ class Window:
         self.moving: dict[int, dict[tuple[SemanticClass, int], float]] = {}
         self.judged_anew: set[int] = set()
         self.next_scan = 0
+        self.next_image = 0
         self.wTl = gtsam.Pose3()
 
     @property
@@ -160,7 +162,7 @@ class Window:
         return tracks, speeds
 
     def add_image(self, features: ImageFeatures) -> None:
-        """Keep an image in the order of stamps.
+        """Keep an image, with a number of its own, in the order of stamps.
 
         Raises:
             DataError: one with this stamp is there already.
@@ -169,7 +171,8 @@ class Window:
         place = int(np.searchsorted(stamps, features.stamp_ns))
         if place < len(stamps) and stamps[place] == features.stamp_ns:
             raise DataError("tracker", f"a second image of stamp {features.stamp_ns} ns", "one image a stamp")
-        self.images.insert(place, features)
+        self.images.insert(place, dataclasses.replace(features, index=self.next_image))
+        self.next_image += 1
 
     def forget_images(self, before_ns: int) -> None:
         """Drop images of a camera stamp before ``before_ns``, but never the newest two."""

@@ -193,7 +193,7 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
     pair = dataclasses.replace(entry.pair, l_twist=broken)
     before, entries = smoother.point, dict(smoother.entries)
     with pytest.raises(EstimationError, match="covariance"):
-        smoother.update({scan: Found(pair, entry.score, 0)}, set(), 0)
+        smoother.update({scan: Found(pair, entry.score, 0, entry.image)}, set(), 0)
     assert smoother.point is before and smoother.entries == entries
     assert tracker.add(frames[20]).accepted
 

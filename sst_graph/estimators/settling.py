@@ -1,0 +1,88 @@
+"""The whole window solved again as the batch does, from a wide kernel to the narrowest."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from factors.robust import RobustKernel
+from sst_graph.estimators.matcher import WindowMatcher
+from sst_graph.estimators.smoother import WindowSmoother
+
+_RESTS_SIGMAS = 0.02
+"""A whole step shorter than this is rest."""
+
+
+@dataclass
+class Milestones:
+    """When a running tracker settles: each time it has seen twice as much, and before scans first leave.
+
+    A young estimate wanders, and what was matched on the way no longer lies where it would now.
+
+    Attributes:
+        first: number of the first scan.
+        next: scans seen at the next time.
+        window: length of the window.
+    """
+
+    first: int
+    next: int
+    window: int
+
+    def reached(self, scan: int) -> bool:
+        """Whether it is time at this scan; then the next time is set."""
+        seen = scan + 1 - self.first
+        if seen < self.next:
+            return False
+        while self.next <= seen:
+            self.next = self.window if self.next < self.window < 2 * self.next else 2 * self.next
+        return True
+
+
+def settle_window(
+    smoother: WindowSmoother,
+    matcher: WindowMatcher,
+    kernel_px: Sequence[float],
+    most: int,
+    whole_steps: int,
+    alive: Container[int],
+    share: float = 1.0,
+) -> bool:
+    """Match all scans, solve, and again under the next kernel; then under the last until it rests.
+
+    Matches made frame by frame hold the estimate within a standard deviation or two of where the batch
+    would end. Where matches come and go in turn, so that the estimate goes round in a circle, the steps
+    are shortened and end in the middle of it, as the batch's do.
+
+    Args:
+        kernel_px: scales of the robust kernel, one a step.
+        most: further steps under the last one.
+        whole_steps: those of them before the steps are shortened.
+        alive: tracks of objects that may be seen again.
+        share: factor on the weights of all matches.
+
+    Returns:
+        Whether it rests.
+
+    Raises:
+        EstimationError: an update fails; what the steps before it reached stays.
+    """
+    at = smoother.point
+    for i in range(len(kernel_px) + most):
+        kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
+        found, missing = matcher.match(at, None, kernel, share)
+        smoother.update(found, missing, 0, alive)
+        smoother.polish()
+        rested = i + 1 - len(kernel_px)
+        left = smoother.point.core().local(at.core())
+        n = len(left)
+        if rested >= 0 and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _RESTS_SIGMAS**2:
+            return True
+        shorter = 1.0 / (1.0 + max(0, rested - whole_steps))
+        back = np.zeros(smoother.point.size)
+        back[:n] = (1.0 - shorter) * left
+        at = smoother.point.moved(back)
+    smoother.rest_at(at)
+    return False
