@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from sst_graph.association.crowd import Poses, Steps
 from sst_graph.association.search import Candidate, SearchConfig
+from sst_graph.association.votes import States
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.heats import Field, hold_heat
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
-from sst_graph.estimators.start import StartConfig, find_start
+from sst_graph.estimators.start import StartConfig, find_start, label_scores
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.state import State
@@ -27,8 +28,11 @@ _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
 """Solutions on a few frames that are closer than all of these lead to one answer."""
 _SAME_DEG = 2.0
 """Solutions closer than this are one [deg]."""
+_FAR_DEG = 20.0
+"""A search around one pose finds those that are closer than this [deg]."""
 _REACH = 1.25
-"""Solutions may lie this many times as far from the guess as was searched, along each axis."""
+"""Solutions may lie this many times as far from the guess as was searched, along each axis; without a guess,
+in all."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +41,13 @@ class Contest:
 
     Attributes:
         finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first.
+        leads: the winner and those of the others, with the support of a finalist, that are far from it.
         doubt: why the winner may be the wrong one; None where nothing speaks for another.
         score: of the search's best candidate.
     """
 
     finalists: tuple[tuple[gtsam.Pose3, float], ...]
+    leads: tuple[tuple[gtsam.Pose3, float], ...]
     doubt: str | None
     score: float
 
@@ -57,7 +63,7 @@ def choose_start(
 ) -> Contest:
     """Search for a start and let the candidates compete.
 
-    Without a guess a second search looks closer around the winner of the first.
+    Without a guess a second search looks closer around the best of the first that are far from each other.
 
     Raises:
         EstimationError: no candidate leads anywhere.
@@ -67,9 +73,10 @@ def choose_start(
     contest = hold_contest(drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config)
     if guess_cTl is not None:
         return contest
-    cTl, offset_s = contest.finalists[0]
-    closer = find_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
-    closer = [Candidate(cTl, offset_s, contest.score), *closer[: config.contenders]]
+    closer = []
+    for cTl, offset_s in contest.leads:
+        around = find_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
+        closer += [Candidate(cTl, offset_s, contest.score), *around[: config.contenders]]
     return hold_contest(drives, tracks, classes, closer, None, guess_offset_s, joint, config)
 
 
@@ -83,13 +90,14 @@ def hold_contest(
     joint: JointConfig,
     config: StartConfig,
 ) -> Contest:
-    """Solve the best candidates on a few scans; the solution that most matches agree with wins.
+    """Solve the best candidates on a few scans; the solution that the labels agree with most wins.
 
     Raises:
         EstimationError: no candidate leads anywhere.
     """
     if not config.enabled:
-        return Contest(((candidates[0].cTl, candidates[0].offset_s),), None, candidates[0].score)
+        start = ((candidates[0].cTl, candidates[0].offset_s),)
+        return Contest(start, start, None, candidates[0].score)
     # 1. All candidates under wide kernels, on some of the points.
     few = [_thinned(drive, config.contest_scans) for drive in drives]
     field = Field.of(few, tracks, classes, _simple(joint.graph, config))
@@ -104,9 +112,11 @@ def hold_contest(
     # 2. What is left under narrow ones, on all points.
     narrow = narrowed(joint).kernel_px
     poses = hold_heat(field, poses, centres, (*narrow, *[narrow[-1]] * config.settling))
-    # 3. The best that stayed within reach.
+    # 3. The best that stayed within reach, by boundaries and by all labels.
     steps = field.steps(poses, narrow[-1])
-    ranks = _agreements(steps) * _within(poses, guess_cTl, config)
+    states = States(poses.rotations, poses.translations, poses.offsets)
+    scores = label_scores(drives, tracks, classes, states, guess_offset_s, config)
+    ranks = _agreements(steps) * np.sqrt(np.maximum(scores, 0.0)) * _within(poses, guess_cTl, config)
     order = _different(poses, ranks)
     if ranks[order[0]] <= 0.0:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
@@ -116,9 +126,9 @@ def hold_contest(
         for pose, offset, rank in zip(_cTls(poses), poses.offsets, ranks, strict=True)
         if rank > config.finalist_ratio * ranks[0]
     ]
-    return Contest(
-        tuple(finalists[: config.finalists]), _doubt(_cTls(poses), ranks, config), candidates[0].score
-    )
+    leads = tuple(_far_apart(finalists)[: config.leads])
+    doubt = _doubt(_cTls(poses), ranks, config)
+    return Contest(tuple(finalists[: config.finalists]), leads, doubt, candidates[0].score)
 
 
 def solve_all(
@@ -253,17 +263,31 @@ def _different(poses: Poses, ranks: FloatArray, slack: float = 1.0) -> IntArray:
 
 def _within(poses: Poses, guess: gtsam.Pose3 | None, config: StartConfig) -> NDArray[np.bool_]:
     """(m,) whether the translation stayed where it was searched, and did not run away with the points."""
-    search = config.search
-    width = search.free_translation_m if guess is None else search.translation_m
-    centre = np.zeros(3) if guess is None else np.asarray(guess.translation())
-    return np.asarray((np.abs(poses.translations - centre) < _REACH * width).all(axis=1))
+    search, away = config.search, poses.translations
+    if guess is None:
+        return np.asarray(np.linalg.norm(away, axis=1) < _REACH * search.free_translation_m)
+    return np.asarray(
+        (np.abs(away - np.asarray(guess.translation())) < _REACH * search.translation_m).all(axis=1)
+    )
+
+
+def _far_apart(starts: Sequence[tuple[gtsam.Pose3, float]]) -> list[tuple[gtsam.Pose3, float]]:
+    """The starts that are turned by more than :data:`_FAR_DEG` against every better one."""
+    chosen: list[tuple[gtsam.Pose3, float]] = []
+    for cTl, offset_s in starts:
+        if all(_turn_deg(cTl, other) > _FAR_DEG for other, _ in chosen):
+            chosen.append((cTl, offset_s))
+    return chosen
+
+
+def _turn_deg(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation()))))
 
 
 def _doubt(cTls: Sequence[gtsam.Pose3], ranks: FloatArray, config: StartConfig) -> str | None:
     """Whether another pose is nearly as good as the first one."""
     for other, rank in zip(cTls[1:], ranks[1:], strict=True):
-        turn = cTls[0].between(other).rotation()
-        degrees = float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turn))))
+        degrees = _turn_deg(cTls[0], other)
         share = rank / max(ranks[0], 1e-9)
         if degrees > _SAME_DEG and share > config.rival_ratio:
             return (

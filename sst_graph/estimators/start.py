@@ -8,14 +8,18 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
+from factors.camera import PinholeCamera
 from sst_graph.association.pairing import pair_by_time
 from sst_graph.association.search import Candidate, SearchConfig, search_start
-from sst_graph.association.votes import SearchFrame
+from sst_graph.association.votes import SearchFrame, States, Votes
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,8 +39,11 @@ class StartConfig:
         survival: share of them that goes on from one heat of the contest to the next ...
         survivors: ... but so many at least, if so many differ.
         settling: steps under the narrowest kernel.
+        leads: without a guess, most poses of the first contest that are looked around more closely.
         finalists: most different solutions of the contest that are solved on all frames ...
-        finalist_ratio: ... if their agreement with the labels is at least this fraction of the best one's.
+        finalist_ratio: ... if their score is at least this fraction of the best one's.
+        label_blur_px: width of the masks' blur when the labels of all points have their say in the contest,
+            at an image width of 1242 [px].
         min_object_share: in the contest, an object of whose boundary in view less than this share finds a
             match is left out.
         rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
@@ -58,8 +65,10 @@ class StartConfig:
     survival: float = 0.4
     survivors: int = 16
     settling: int = 6
+    leads: int = 3
     finalists: int = 2
     finalist_ratio: float = 0.7
+    label_blur_px: float = 10.0
     min_object_share: float = 0.3
     rival_ratio: float = 0.9
     min_explained: float = 0.2
@@ -84,6 +93,45 @@ def find_start(
         if guess is None:
             raise EstimationError("no guess to start from, and the search is switched off")
         return [Candidate(guess, offset_s, 0.0)]
+    frames, camera = _looked_at(drives, tracks, classes, offset_s, config)
+    candidates = search_start(frames, camera, classes, guess, offset_s, config.search)
+    _LOG.info("start: %d frames, scores %s", len(frames), [round(c.score, 4) for c in candidates])
+    return candidates
+
+
+def label_scores(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    states: States,
+    offset_s: float,
+    config: StartConfig,
+) -> FloatArray:
+    """(m,) how much the labels of all points depend on those of their pixels, under each of the states.
+
+    Silhouettes compare only where LiDAR shows an object; this also hears of masks without points.
+
+    Raises:
+        EstimationError: no frame shows a searched class to both sensors.
+    """
+    frames, camera = _looked_at(drives, tracks, classes, offset_s, config)
+    rng = np.random.default_rng(config.search.seed)
+    votes = Votes.gather(frames, camera, classes, config.search.points_per_class, rng)
+    return votes.level(config.label_blur_px, 1.0, "dependence").score(states)
+
+
+def _looked_at(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    offset_s: float,
+    config: StartConfig,
+) -> tuple[list[SearchFrame], PinholeCamera]:
+    """Frames of the drive that shows most, and its camera.
+
+    Raises:
+        EstimationError: there is none.
+    """
     frames = [
         _search_frames(number, drive, tracks, classes, offset_s, config)
         for number, drive in enumerate(drives)
@@ -93,11 +141,7 @@ def find_start(
         raise EstimationError(
             "no frame in which LiDAR and camera both show " + " or ".join(c.name.lower() for c in classes)
         )
-    candidates = search_start(
-        frames[richest], drives[richest].camera, classes, guess, offset_s, config.search
-    )
-    _LOG.info("start: %d frames, scores %s", len(frames[richest]), [round(c.score, 4) for c in candidates])
-    return candidates
+    return frames[richest], drives[richest].camera
 
 
 def _search_frames(
