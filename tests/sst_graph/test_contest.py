@@ -12,10 +12,12 @@ from streets import prepared_street, standing_street
 
 from sst_graph.association.crowd import Poses
 from sst_graph.association.search import Candidate
+from sst_graph.association.votes import States
 from sst_graph.errors import EstimationError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
 from sst_graph.estimators.contest import (
     _different,
+    _far_apart,
     _wide_heats,
     choose_start,
     hold_contest,
@@ -30,7 +32,7 @@ from sst_graph.estimators.joint import (
     solve_joint,
     support,
 )
-from sst_graph.estimators.start import StartConfig
+from sst_graph.estimators.start import StartConfig, label_scores
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
@@ -140,3 +142,20 @@ def test_an_answer_with_little_behind_it_is_doubted(changes: dict[str, float], r
     assert result.status == "not_converged"
     assert any(reason in sentence for sentence in result.reasons)
     assert 0.0 < result.diagnostics["explained"] < 1.0 and 0.0 < result.diagnostics["concentration"] < 1.0
+
+
+def test_leads_are_far_apart_and_the_winner_comes_first() -> None:
+    starts = [(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0)]
+    assert [round(off_deg(cTl)) for cTl, _ in _far_apart(starts)] == [0, 60, 120]
+
+
+def test_labels_tell_a_pose_that_shows_none_of_the_vehicles() -> None:
+    drives = [prepared_street()]
+    poses = [truth(), turned(0.0, 0.0, 30.0), turned(0.0, 180.0, 0.0)]
+    states = States(
+        np.stack([cTl.rotation().matrix() for cTl in poses]),
+        np.stack([cTl.translation() for cTl in poses]),
+        np.zeros(3),
+    )
+    scores = label_scores(drives, Tracks(drives), [VEHICLE], states, 0.0, START)
+    assert scores[0] > 1.5 * scores[1] and scores[0] > 1.5 * scores[2] and scores[0] > 5.0
