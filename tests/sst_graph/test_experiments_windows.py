@@ -62,5 +62,5 @@ def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     cells = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     assert cells[:2] == ["street/00", "2"] and len(table.splitlines()) == 3
     spread, claimed = (float(part) for part in cells[2].split(" / "))
-    assert 0.0 < spread < 1.0 and 0.0 < claimed < 2.0
-    assert all(0.0 < float(ratio) < 6.0 for ratio in cells[5].split(", "))
+    assert spread > 0.0 and claimed > 0.0
+    assert all(float(ratio) > 0.0 for ratio in cells[5].split(", "))
