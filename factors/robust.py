@@ -47,6 +47,20 @@ class RobustKernel:
             return np.asarray(1.0 / np.square(1.0 + z))
         return np.asarray(np.square(np.maximum(1.0 - z, 0.0)))
 
+    def curvature(self, x: ArrayLike) -> FloatArray:
+        """rho''(x), any shape: negative where a kernel bends over."""
+        x = np.asarray(x, dtype=np.float64)
+        if self.kind == "none":
+            return np.ones_like(x)
+        if self.kind == "huber":
+            return np.asarray(np.abs(x) <= self.scale, dtype=np.float64)
+        z = np.square(x / self.scale)
+        if self.kind == "cauchy":
+            return np.asarray((1.0 - z) / np.square(1.0 + z))
+        if self.kind == "geman_mcclure":
+            return np.asarray((1.0 - 3.0 * z) / (1.0 + z) ** 3)
+        return np.asarray(np.maximum(1.0 - z, 0.0) * (1.0 - 5.0 * z) * (z < 1.0))
+
     def loss(self, x: ArrayLike) -> FloatArray:
         """rho(x), any shape."""
         x = np.asarray(x, dtype=np.float64)

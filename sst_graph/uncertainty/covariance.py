@@ -9,6 +9,10 @@ with three variances fitted from the residuals (method of moments). The informat
 graph, which takes all matches for independent, becomes the bread of a sandwich whose filling is the
 variance of the score under this model.
 
+Robust weights are frozen in the graph, as if the kernel stayed as steep as it is on average to the middle;
+under heavy tails it is flatter where it counts (Huber, Robust statistics, 1981, sec. 3.2), and the covariance
+grows with the square of that ratio.
+
 Some objects err as no model of the others says: two that were merged, one half hidden. Where such an
 object has a direction to itself, the residuals do not show it. So the answer without each object is computed,
 too (a jackknife over objects), and the covariance takes a part of both.
@@ -50,6 +54,7 @@ class MatchTable:
     Attributes:
         J: (m, n) rows multiplied by sqrt(robust weight) / sigma.
         root_weights: (m,) sqrt(robust weight).
+        curvatures: (m,) second derivative of the robust loss (its slope over the residual is the weight).
         r: (m,) whitened residuals, unweighted.
         sides: (m,) number of the object's side over all frames.
         side_frames: (m,) number of the object's side in its frame.
@@ -59,11 +64,18 @@ class MatchTable:
 
     J: FloatArray
     root_weights: FloatArray
+    curvatures: FloatArray
     r: FloatArray
     sides: IntArray
     side_frames: IntArray
     objects: IntArray
     views: float
+
+    @property
+    def flatness(self) -> float:
+        """Mean robust weight over mean curvature: 1 for least squares, inf where the kernel bends over."""
+        curvature = float(self.curvatures.sum())
+        return float(self.root_weights @ self.root_weights) / curvature if curvature > 0.0 else np.inf
 
 
 @dataclass(frozen=True)
@@ -96,13 +108,16 @@ def match_table(
     unknowns: Unknowns,
 ) -> MatchTable:
     """All matches of the frozen graph at a state, with the clusters they belong to."""
-    blocks, weights, residuals, sides, frames, objects, moving = [], [], [], [], [], [], []
+    blocks, weights, residuals, curvatures = [], [], [], []
+    sides, frames, objects, moving = [], [], [], []
     for number, pair in enumerate(pairs):
         for c, matches in pair.matches.items():
             block, root, r = _rows(pair, c, state, unknowns)
             blocks.append(block)
             weights.append(root)
             residuals.append(r)
+            kernel = matches.alignment.kernel
+            curvatures.append(root**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
             side = (track * SIDES + matches.sides) * 64 + pair.drive
             sides.append(side)
@@ -113,6 +128,7 @@ def match_table(
     return MatchTable(
         np.concatenate(blocks),
         np.concatenate(weights),
+        np.concatenate(curvatures),
         np.concatenate(residuals),
         side_of,
         frame_of,
@@ -248,17 +264,21 @@ def robust_covariance(
     model = fit_error_model(table)
     surplus = score_variance(table, model) - table.J.T @ table.J
     covariance = bread + bread @ surplus @ bread
+    flatness = min(max(table.flatness, 1.0), _FLATTEST)
     steps = steps_without_objects(table, bread)
     if len(steps) > 1:
         jackknife = (len(steps) - 1) / len(steps) * (steps.T @ steps)
         covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * jackknife
+    covariance *= flatness**2
     return 0.5 * (covariance + covariance.T), model, unknowns
 
 
-_MODEL_SHARE, _OBJECT_SHARE = 0.7, 0.5
+_MODEL_SHARE, _OBJECT_SHARE = 0.41, 0.18
 """Parts of the covariance under the error model, and of the jackknife over objects, in the answer's: set on
 simulated drives so that the normalised error squared is neither too large on drives with few or moving
 vehicles, where the model alone is too sure, nor too small on the others."""
+_FLATTEST = 3.0
+"""Largest ratio of the mean robust weight to the mean curvature that is believed."""
 
 
 def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:

@@ -34,6 +34,14 @@ def test_weight_is_the_slope_over_x_and_the_slack_is_not_negative(kind):
     assert (2.0 * kernel.loss(X) - kernel.weight(X) * X**2 >= -1e-12).all()
 
 
+@pytest.mark.parametrize("kind", ["none", *ESTIMATORS])
+def test_curvature_is_the_slope_of_the_slope(kind):
+    kernel, h = RobustKernel(kind, 2.0), 1e-5
+    x = X[np.abs(np.abs(X) - 2.0) > 1e-3]
+    slopes = [kernel.weight(x + step) * (x + step) for step in (-h, h)]
+    np.testing.assert_allclose(kernel.curvature(x), (slopes[1] - slopes[0]) / (2.0 * h), rtol=1e-6, atol=1e-8)
+
+
 def test_least_squares_by_hand():
     assert RobustKernel().loss(3.0) == 4.5
     assert RobustKernel().weight(3.0) == 1.0

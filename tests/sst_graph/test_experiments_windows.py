@@ -63,4 +63,4 @@ def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     assert cells[:2] == ["street/00", "2"] and len(table.splitlines()) == 3
     spread, claimed = (float(part) for part in cells[2].split(" / "))
     assert spread > 0.0 and claimed > 0.0
-    assert all(float(ratio) > 0.0 for ratio in cells[5].split(", "))
+    assert all(float(ratio) > 0.0 for ratio in cells[5].split(", ")[:2])

@@ -34,7 +34,7 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
     roots = rng.uniform(0.1, 1.0, m)
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
     side_frames = np.unique(frames, return_inverse=True)[1]
-    return MatchTable(J, roots, rng.normal(size=m), sides, side_frames, sides // 3, 5.0)
+    return MatchTable(J, roots, roots**2, rng.normal(size=m), sides, side_frames, sides // 3, 5.0)
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
@@ -47,7 +47,9 @@ def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
         + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
-    return MatchTable(np.zeros((len(r), 8)), np.ones(len(r)), r, sides, frames, sides // 3, 5.0)
+    return MatchTable(
+        np.zeros((len(r), 8)), np.ones(len(r)), np.ones(len(r)), r, sides, frames, sides // 3, 5.0
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
