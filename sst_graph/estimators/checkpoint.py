@@ -68,6 +68,7 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "history": [epoch.start_ns for epoch in tracker.history_store.epochs],
     }
     arrays["covariance"] = tracker.covariance
+    arrays["arrivals"] = np.array(tracker.arrivals.rows).reshape(-1, 9)
     arrays["entered"] = np.array(tracker.entered, np.int64)
     arrays["usual"] = np.array(tracker.alarm.usual)
     arrays["costs"] = np.array(tracker.adoption.costs).reshape(-1, 2)
@@ -136,6 +137,9 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
         smoother = _get_smoother(arrays, head["smoother"], tracker)
         tracker.resume(smoother, set(head["smoother"]["entries"]), _point(arrays, "point"))
     tracker.covariance = arrays["covariance"]
+    tracker.arrivals.rows.extend(arrays["arrivals"])
+    if tracker.smoother is not None:
+        tracker.arrivals.restart(tracker.covariance[:7, :7])
     return tracker
 
 

@@ -17,6 +17,7 @@ from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm
+from sst_graph.estimators.arrivals import Arrivals
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.matcher import WindowMatcher
@@ -76,6 +77,7 @@ class Tracker:
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
         self.watched: deque[int] = deque(maxlen=self.config.alarm.frames)
         self.milestones = Milestones(0, self.config.window, self.config.window)
+        self.arrivals = Arrivals()
         self.alarmed = False
         self.attempts = 0
         self.waited = 0
@@ -201,6 +203,8 @@ class Tracker:
         self.watched.clear()
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
+        self.arrivals.restart()
+        self.arrivals.take(self.window.next_scan - 1, self.covariance[:7, :7])
         _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
         return self._answer(stamp_ns)
 
@@ -230,6 +234,8 @@ class Tracker:
         if self.milestones.reached(number) and not self.config.drift.enabled:
             self.settle(most=0)
         self._take_covariance(smoother)
+        if new:
+            self.arrivals.take(number, self.covariance[:7, :7])
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"

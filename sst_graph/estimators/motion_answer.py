@@ -12,6 +12,7 @@ from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.motion import MotionConfig, MotionSolution, difference, rival, solve_motion
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.result import FrameId
+from sst_graph.uncertainty.gained import KEY, pair_gains, to_document
 
 
 def answer_motion(
@@ -25,11 +26,13 @@ def answer_motion(
     solutions = solve_motion(drives, guess.cTl, guess.offset_s, config.motion, progress)
     best = solutions[0]
     pairs = [term.pair for term in best.terms]
+    frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)
+    gained = pair_gains(best.terms, frames, best.state, config.motion.priors)
     return Answer(
         best.state.cTl,
         best.state.offsets_s[0],
         best.covariance,
-        tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs),
+        frames,
         doubts=_doubts(solutions, config.motion),
         diagnostics={
             "outer_iterations": best.outer_iterations,
@@ -37,6 +40,7 @@ def answer_motion(
             "directions": sum(term.has_direction for term in best.terms),
             "noise_scales": {"rotation": best.scales.rotation, "direction": best.scales.direction},
             "turned_deg": _turned_deg(best),
+            KEY: to_document(gained),
         },
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from sst_graph.config import to_dict
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
+from sst_graph.uncertainty.gained import KEY, to_document
 
 
 def tracker_result(
@@ -44,5 +45,6 @@ def tracker_result(
             "error_model": None
             if model is None
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+            **({} if tracker.config.drift.enabled else {KEY: to_document(tracker.arrivals.gained(drive))}),
         },
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
 from sst_graph.uncertainty.frame_information import FrameInformation, frames_of
+from sst_graph.uncertainty.gained import Gained, gained_of
 from sst_graph.uncertainty.observability import ObservabilityConfig, weak_directions
 from sst_graph.uncertainty.planning import Plan, limits_of, plan_recording
 
@@ -93,6 +94,7 @@ class Inspection:
         redundant: positions in ``frames`` of those that each could be left out ...
         redundant_share: ... without any sigma growing by more than this share.
         plan: what to record next, or None without ``frames``.
+        gained: what else the result says of each frame, or None.
     """
 
     result: CalibrationResult
@@ -106,6 +108,7 @@ class Inspection:
     redundant: tuple[int, ...]
     redundant_share: float
     plan: Plan | None
+    gained: Gained | None
 
 
 def inspect_result(result: CalibrationResult, config: InspectConfig | None = None) -> Inspection:
@@ -129,6 +132,7 @@ def inspect_result(result: CalibrationResult, config: InspectConfig | None = Non
         redundant_frames(frames, config.redundant),
         config.redundant,
         plan_recording(result, frames, config.next_frames) if frames else None,
+        gained_of(result),
     )
 
 
@@ -226,11 +230,23 @@ def to_dict(inspection: Inspection) -> dict[str, Any]:
         "weakest_direction": _direction(inspection.weakest),
         "frames": [_frame(frame, k in inspection.redundant) for k, frame in enumerate(inspection.frames)],
         "plan": None if inspection.plan is None else inspection.plan.to_dict(),
+        "gained": None if inspection.gained is None else _gained(inspection.gained),
     }
 
 
 def _direction(weak: WeakDirection) -> dict[str, Any]:
     return {**dataclasses.asdict(weak), "vector": np.asarray(weak.vector).tolist()}
+
+
+def _gained(gained: Gained) -> dict[str, Any]:
+    name = "sigma_after" if gained.kind == "as they came" else "sigma_ratio_without"
+    return {
+        "kind": gained.kind,
+        "frames": [
+            {"drive": g.frame.drive, "frame": g.frame.frame, "bits": g.bits, name: g.values.tolist()}
+            for g in gained.gains
+        ],
+    }
 
 
 def _frame(frame: FrameInformation, redundant: bool) -> Mapping[str, Any]:

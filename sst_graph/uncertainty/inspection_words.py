@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.result import CalibrationResult
 from sst_graph.uncertainty.frame_information import FrameInformation
+from sst_graph.uncertainty.gained_words import MOST_FRAMES, SHORT, gained_lines, short
 from sst_graph.uncertainty.inspection import (
     HUMAN,
     NAMES,
@@ -23,18 +24,9 @@ from sst_graph.uncertainty.planning import limits_of as limits_of_result
 
 FloatArray = NDArray[np.float64]
 
-NO_FRAMES = (
-    "this result does not tell what each frame brought (method joint of sst-graph calibrate does), so "
-    "nothing is said about frames and what to record next"
-)
 
 MOST_SENTENCES = 5
 """Correlations that are put into words."""
-
-MOST_FRAMES = 12
-"""Frames in the table unless all are asked for."""
-
-_SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
 
 
 def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
@@ -46,17 +38,10 @@ def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
         _weak_block(inspection),
     ]
     if inspection.plan is None:
-        blocks.append([NO_FRAMES])
+        blocks.append(gained_lines(inspection.result, inspection.gained, all_frames))
     else:
         blocks += [_frame_block(inspection, all_frames), _plan_block(inspection, inspection.plan)]
     return "\n\n".join("\n".join(line.rstrip() for line in block) for block in blocks)
-
-
-def short(value: float) -> str:
-    """Two significant digits, without an exponent between 0.0001 and a million."""
-    if value == 0.0 or not 1e-4 <= abs(value) < 1e6:
-        return f"{value:.2g}"
-    return f"{value:.{max(0, 1 - int(np.floor(np.log10(abs(value)))))}f}"
 
 
 def correlation_sentence(pair: Correlation) -> str:
@@ -163,8 +148,8 @@ def _sigma_block(inspection: Inspection) -> list[str]:
 
 
 def _correlation_block(inspection: Inspection) -> list[str]:
-    lines = [f"{'correlation':<12}" + "".join(f"{name:>8}" for name in _SHORT)]
-    for name, row in zip(_SHORT, inspection.correlation, strict=True):
+    lines = [f"{'correlation':<12}" + "".join(f"{name:>8}" for name in SHORT)]
+    for name, row in zip(SHORT, inspection.correlation, strict=True):
         lines.append(f"{name:<12}" + "".join(f"{value:>+8.2f}" for value in row))
     lines += [f"- {correlation_sentence(pair)}" for pair in inspection.strong[:MOST_SENTENCES]]
     if (more := len(inspection.strong) - MOST_SENTENCES) > 0:
@@ -195,7 +180,7 @@ def _frame_block(inspection: Inspection, all_frames: bool) -> list[str]:
         "what each frame brings: bits it adds to all the others; sigma without it over sigma with it"
         + (f" (the {MOST_FRAMES} that add most; {left_out} more with --all-frames)" if left_out else ""),
         f"{'frame':<16}{'bits':>7}"
-        + "".join(f"{name:>8}" for name in _SHORT)
+        + "".join(f"{name:>8}" for name in SHORT)
         + f"{'m/s':>7}{'deg/s':>7}{'matches':>9}{'objects':>9}{'nearest':>9}",
     ]
     for k in shown:
@@ -228,7 +213,7 @@ def _plan_block(inspection: Inspection, plan: Plan) -> list[str]:
     lines = [
         f"what to record next: sigmas predicted for {plan.count} more frames, each at another place, with "
         "the record's average view",
-        f"{'':<38}" + "".join(f"{name:>8}" for name in _SHORT) + f"{'of limit':>10}{'bits':>7}{'enough':>8}",
+        f"{'':<38}" + "".join(f"{name:>8}" for name in SHORT) + f"{'of limit':>10}{'bits':>7}{'enough':>8}",
         f"{'':<38}" + "".join(f"{unit:>8}" for unit in UNITS) + f"{'':>10}{'':>7}{'frames':>8}",
     ]
     for prediction in (plan.now, *plan.motions, plan.nearer):

@@ -19,10 +19,13 @@ from sst_graph.estimators.epochs import Found
 from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
+from sst_graph.estimators.tracker_result import tracker_result
 from sst_graph.problem.graph import Tracks, associate, joint_graph, state_from
 from sst_graph.problem.objects import object_tracks
+from sst_graph.result import CalibrationResult
 from sst_graph.types import CameraImage, Frame
 from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.gained import gained_of
 
 CONFIG = TrackerConfig(start_scans=8)
 STREET = SimulationConfig(
@@ -106,6 +109,16 @@ def test_the_covariance_is_the_batch_s(running: Path) -> None:
     expected, _, _ = robust_covariance(graph, values, pairs, state, [tracks])
     ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+
+
+def test_the_result_tells_what_each_scan_brought(running: Path) -> None:
+    tracker = load_checkpoint(running)
+    gained = gained_of(CalibrationResult.from_json(tracker_result(tracker, "drive").to_json()))
+    assert gained is not None and gained.kind == "as they came"
+    first, *rest = gained.gains
+    assert first.bits is None and len(rest) > 5
+    assert sum(gain.bits or 0.0 for gain in rest) > 3.0
+    np.testing.assert_allclose(rest[-1].values, tracker.current().sigmas, rtol=1e-3)
 
 
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
