@@ -66,7 +66,7 @@ class ObservabilityConfig:
 
     rotation_deg: float = 0.5
     translation_m: float = 0.05
-    offset_s: float = 0.005
+    offset_s: float = 0.01
 
 
 def weak_directions(
