@@ -264,13 +264,23 @@ def robust_covariance(
     model = fit_error_model(table)
     surplus = score_variance(table, model) - table.J.T @ table.J
     covariance = bread + bread @ surplus @ bread
-    flatness = min(max(table.flatness, 1.0), _FLATTEST)
     steps = steps_without_objects(table, bread)
-    if len(steps) > 1:
-        jackknife = (len(steps) - 1) / len(steps) * (steps.T @ steps)
-        covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * jackknife
-    covariance *= flatness**2
+    jackknife = (len(steps) - 1) / len(steps) * (steps.T @ steps) if len(steps) > 1 else None
+    covariance = composed(covariance, jackknife, table.flatness)
     return 0.5 * (covariance + covariance.T), model, unknowns
+
+
+def composed(covariance: FloatArray, jackknife: FloatArray | None, flatness: float) -> FloatArray:
+    """(n, n) covariance of an answer.
+
+    Args:
+        covariance: under the error model.
+        jackknife: over objects; None where there is but one.
+        flatness: mean robust weight over mean curvature.
+    """
+    if jackknife is not None:
+        covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * jackknife
+    return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
 
 
 _MODEL_SHARE, _OBJECT_SHARE = 0.41, 0.18
