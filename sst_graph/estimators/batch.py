@@ -242,10 +242,12 @@ def _doubts(
                 f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
                 "the pose may be wrong altogether"
             )
-    if config.start.enabled and guess.cTl is not None:
-        far = float(np.linalg.norm(solution.state.cTl.translation() - guess.cTl.translation()))
-        if far > 1.5 * config.start.search.translation_m:
-            doubts.append(f"the answer lies {far:.2f} m from the guess, farther than was searched")
+    if config.start.enabled:
+        search, around = config.start.search, np.zeros(3) if guess.cTl is None else guess.cTl.translation()
+        far = float(np.linalg.norm(solution.state.cTl.translation() - around))
+        if far > (1.25 * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
+            what = "the guess" if guess.cTl is not None else "the LiDAR"
+            doubts.append(f"the answer lies {far:.2f} m from {what}, farther than was searched")
     for other in others:
         step = np.append(
             gtsam.Pose3.Logmap(solution.state.cTl.between(other.state.cTl)),
