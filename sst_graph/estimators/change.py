@@ -11,7 +11,7 @@ import numpy as np
 
 from factors import delay_drift, extrinsic_drift
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.gaussian import Point, scaled_inverse
 from sst_graph.estimators.scores import motion_factor, silhouettes_factor
 from sst_graph.problem.state import object_bias_key, twist_key
 
@@ -99,8 +99,9 @@ class Change:
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
             self.past = self.past.plus(entry.score.belief)
-            self.sums.add(entry.score, self.past.point.columns(entry.score.belief.point.tracks), scan)
-            if self._smoother.drift.enabled:
+            columns, drift = self.past.point.columns(entry.score.belief.point.tracks), self._smoother.drift
+            self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
+            if drift.enabled:
                 self.epoch_sums.add(entry.score, scan, self._smoother.graph.object_bias_sigma_px)
         for scan in self._dropped & set(self.entries):
             del self.entries[scan]
@@ -124,9 +125,29 @@ class Change:
         """Objects that the window does not see, and that will not be seen again, leave the unknowns."""
         seen = {track for entry in self.entries.values() for track in entry.score.places}
         gone = [t for t in self.past.point.tracks if t not in seen and t not in self._alive]
+        if not self._smoother.drift.enabled:
+            self._close_objects()
         if gone:
             self.past, T = self.past.without(gone)
             self.sums.transform(T)
+
+    def _close_objects(self) -> None:
+        """Objects that are gone for good are no longer kept one by one."""
+        kept = {
+            track
+            for entry in self.entries.values()
+            if entry.score.objects is not None
+            for track in entry.score.objects.tracks
+        }
+        kept |= {track for track in self.sums.objects.live if track in self._alive}
+        if all(track in kept for track in self.sums.objects.live):
+            return
+        information = self.past.information.copy()
+        for entry in self.entries.values():
+            columns = self.past.point.columns(entry.score.belief.point.tracks)
+            information[np.ix_(columns, columns)] += entry.score.belief.information
+        point = self.past.at(self.point).point
+        self.sums.objects.close(kept, information, scaled_inverse(information), point)
 
     def _enter(self) -> None:
         smoother = self._smoother

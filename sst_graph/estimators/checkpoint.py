@@ -22,6 +22,7 @@ from sst_graph.errors import DataError
 from sst_graph.estimators.epochs import RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.object_sums import ObjectSums
 from sst_graph.estimators.scores import ScoreSums
 from sst_graph.estimators.settling import Milestones
 from sst_graph.estimators.smoother import WindowSmoother
@@ -227,12 +228,17 @@ def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
     arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"] = sums.JJ, sums.frames, sums.closed
     arrays["sums/live"] = np.array([row for row, _ in sums.live.values()])
     arrays["sums/sides"] = np.array([[side, last] for side, (_, last) in sums.live.items()], np.int64)
+    arrays["sums/objects/closed"] = sums.objects.closed
+    for track, own in sums.objects.live.items():
+        _put_gaussian(arrays, f"sums/objects/{track}", own)
     arrays["sums/recent"] = np.concatenate([np.zeros((0, 6)), *sums.recent])
     return {
         "start_ns": smoother.epochs[0].start_ns,
         "entries": sorted(smoother.entries),
         "model": [smoother.model.side, smoother.model.side_frame, smoother.model.match],
         "recent": [len(rows) for rows in sums.recent],
+        "objects": [sums.objects.count, list(sums.objects.live)],
+        "weights": [sums.weight, sums.curvature],
     }
 
 
@@ -240,6 +246,10 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
     recent = np.split(arrays["sums/recent"], np.cumsum(head["recent"])[:-1]) if head["recent"] else []
     sums = ScoreSums(arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"])
     sums.recent = deque(recent, sums.recent.maxlen)
+    sums.weight, sums.curvature = head["weights"]
+    count, objects = head["objects"]
+    live = {track: _gaussian(arrays, f"sums/objects/{track}") for track in objects}
+    sums.objects = ObjectSums(arrays["sums/objects/closed"], count, live)
     for (side, last), row in zip(arrays["sums/sides"].reshape(-1, 2), arrays["sums/live"], strict=True):
         sums.live[int(side)] = (row, int(last))
     return WindowSmoother(

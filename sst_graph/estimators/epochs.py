@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.scores import PairScore, ScoreSums
 from sst_graph.problem.graph import PairMatches
-from sst_graph.uncertainty.covariance import ErrorModel
+from sst_graph.uncertainty.covariance import ErrorModel, composed
 
 FloatArray = NDArray[np.float64]
 
@@ -104,10 +104,12 @@ class EpochSums:
             self.belief = self.belief.with_objects(new, sigma_px)
             self.sums.grow(self.belief.point.size)
         self.belief = self.belief.plus(score.belief)
-        self.sums.add(score, self.belief.point.columns(score.belief.point.tracks), scan)
+        columns = self.belief.point.columns(score.belief.point.tracks)
+        self.sums.add(score, columns, scan, by_object=False)
 
     def retired(self, start_ns: int, model: ErrorModel) -> RetiredEpoch:
         """What stays of the epoch: its objects' biases marginalized out."""
-        surplus = self.sums.surplus([], [], model)
+        H = self.belief.information
+        surplus = composed(H + self.sums.surplus([], [], model), None, self.sums.flatness()) - H
         belief, T = self.belief.without(self.belief.point.tracks)
         return RetiredEpoch(start_ns, belief, T @ surplus @ T.T)

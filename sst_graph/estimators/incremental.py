@@ -218,12 +218,11 @@ class Tracker:
         found, missing = self.matcher.match(before, chosen, share=self._share)
         new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        chi2 = self._watch(new, before)
+        chi2, doubt = self._watch(new, before), ""
         if self.alarm.alarm:
             if self._is_change(before):
                 return self._change(before, stamp_ns, chi2)
-            before = smoother.point
-            found, missing = self.matcher.match(before, chosen, share=self._share)
+            doubt = "a single object says that the calibration has changed: a step, or its labels"
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
@@ -239,7 +238,7 @@ class Tracker:
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
-        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new))
+        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not doubt, doubt=doubt)
 
     def _take_covariance(self, smoother: WindowSmoother) -> None:
         """Take over the covariance of a smoother's estimate.
@@ -315,23 +314,15 @@ class Tracker:
     def _is_change(self, before: Point) -> bool:
         """Whether frames past the threshold mean that the calibration has changed.
 
-        Not where a single object says so, for its labels may err for a while; nor where one calibration
-        explains the frames before and since, the young estimate having been wrong.
+        Not where a single object says so: its labels may err for a while. With one object in view, or one
+        that tells far more than the others, that is not decidable.
         """
-        kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
-        smoother, limit = self.smoother, self.config.alarm.chi2
+        kernel, smoother = RobustKernel("geman_mcclure", self.config.alarm.kernel_px), self.smoother
         assert smoother is not None
-
-        def value(point: Point, without: int | None = None) -> float:
-            scores = self.matcher.scores(point, self.watched, kernel, without)
-            return self.alarm.value(scores, self.joint, smoother.model)
-
-        if any(value(before, track) <= limit for track in self.matcher.objects_of(self.watched)):
-            return False
-        self.settle(most=0)
-        if value(smoother.point) <= limit:
-            self.alarm.restart()
-            return False
+        for track in self.matcher.objects_of(self.watched):
+            scores = self.matcher.scores(before, self.watched, kernel, without=track)
+            if self.alarm.value(scores, self.joint, smoother.model) <= self.config.alarm.chi2:
+                return False
         return True
 
     def _compare(self, new: list[int], before: Point) -> None:
@@ -368,7 +359,13 @@ class Tracker:
         )
 
     def _answer(
-        self, stamp_ns: int, reason: str = "", *, chi2: float | None = None, offer: bool = False
+        self,
+        stamp_ns: int,
+        reason: str = "",
+        *,
+        chi2: float | None = None,
+        offer: bool = False,
+        doubt: str = "",
     ) -> TrackUpdate:
         point, covariance = self.point, self.covariance[:7, :7]
         status: TrackStatus = "alarm" if self.alarmed else "starting"
@@ -388,6 +385,7 @@ class Tracker:
             if self.smoother is None
             else sum(e.score.matches for e in self.smoother.entries.values()),
             chi2=chi2,
+            doubt=doubt,
             adopted=offer and self.adoption.offer(point, status == "ok"),
             weak_directions=weak,
         )

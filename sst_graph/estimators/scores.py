@@ -20,6 +20,7 @@ from factors.alignment import weighted_residuals
 from factors.motion import twist_ad
 from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import Gaussian, Point
+from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
 from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.state import object_bias_key
 from sst_graph.problem.trajectory import camera_twist
@@ -68,6 +69,8 @@ class PairScore:
         sums: (n, n) sum of squared scores by side.
         matches: number of matches.
         places: place of its class's bias for each object with a bias, by its track.
+        objects: the matches of each object alone, the twist given.
+        weight, curvature: sums of the matches' weights, and of the robust loss's second derivatives.
     """
 
     belief: Gaussian
@@ -76,6 +79,9 @@ class PairScore:
     sums: FloatArray
     matches: int
     places: Mapping[int, int] = field(default_factory=dict)
+    objects: ObjectBeliefs | None = None
+    weight: float = 1.0
+    curvature: float = 1.0
 
 
 def object_places(pair: PairMatches, classes: Sequence[SemanticClass]) -> dict[int, int]:
@@ -149,12 +155,37 @@ def score_pair(
     gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
     belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
-    side = [
-        np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp) * SIDES + m.sides
-        for c, m in pair.matches.items()
-    ]
-    sides = replace(_side_sums(J, r, roots, np.concatenate(side), share), moved=pair.moved)
-    return PairScore(belief, share * (J.T @ J), sides, sides.scores.T @ sides.scores, len(pair), places)
+    track = np.concatenate(
+        [
+            np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp)
+            for c, m in pair.matches.items()
+        ]
+    )
+    side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
+    sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
+    return PairScore(
+        belief,
+        share * (J.T @ J),
+        sides,
+        sides.scores.T @ sides.scores,
+        len(pair),
+        places,
+        ObjectBeliefs.of(J, r, track, point),
+        float(roots @ roots),
+        _curvature(pair, r, roots),
+    )
+
+
+def _curvature(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> float:
+    """Sum of the robust loss's second derivatives, each weighted as its match is beside the kernel."""
+    r = np.where(root > 1e-6, weighted / np.maximum(root, 1e-6), 0.0)
+    total, start = 0.0, 0
+    for matches in pair.matches.values():
+        some, kernel = slice(start, start + len(matches)), matches.alignment.kernel
+        start += len(matches)
+        plain = root[some] ** 2 / np.maximum(kernel.weight(r[some]), 1e-12)
+        total += float(plain @ kernel.curvature(r[some]))
+    return total
 
 
 def _rows(
@@ -220,6 +251,8 @@ class ScoreSums:
         JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side.
         live: running score of each side seen lately, and the scan that saw it last.
         recent: (k, 6) [side, mean, weights, weights2, within, moved] of the latest sides.
+        objects: what each object says.
+        weight, curvature: sums over all matches, see :class:`PairScore`.
     """
 
     JJ: FloatArray
@@ -227,16 +260,23 @@ class ScoreSums:
     closed: FloatArray
     live: dict[int, tuple[FloatArray, int]] = field(default_factory=dict)
     recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=150))
+    objects: ObjectSums = field(default_factory=lambda: ObjectSums(np.zeros((0, 0))))
+    weight: float = 0.0
+    curvature: float = 0.0
 
     @classmethod
     def empty(cls, n: int) -> ScoreSums:
-        return cls(np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)))
+        nothing = np.zeros((n, n))
+        return cls(nothing, nothing, nothing, objects=ObjectSums(nothing))
 
-    def add(self, score: PairScore, columns: IntArray, scan: int, memory: int = 50) -> None:
+    def add(
+        self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
+    ) -> None:
         """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed.
 
         Args:
             columns: where the pair's unknowns stand among those of the sums.
+            by_object: keep what each object says, too.
         """
         self.JJ, self.frames = self.JJ.copy(), self.frames.copy()
         self.JJ[np.ix_(columns, columns)] += score.JJ
@@ -250,6 +290,15 @@ class ScoreSums:
             row, _ = self.live.pop(side)
             self.closed = self.closed + np.outer(row, row)
         self.recent.append(_recent_rows(score.sides))
+        if by_object and score.objects is not None:
+            self.objects.add(score.objects)
+        self.weight, self.curvature = self.weight + score.weight, self.curvature + score.curvature
+
+    def flatness(self, window: Sequence[PairScore] = ()) -> float:
+        """Mean robust weight over mean curvature, of all matches."""
+        curvature = self.curvature + sum(score.curvature for score in window)
+        weight = self.weight + sum(score.weight for score in window)
+        return weight / curvature if curvature > 0.0 else np.inf
 
     def grow(self, n: int) -> None:
         """Make room for further unknowns, n in all."""
@@ -258,12 +307,12 @@ class ScoreSums:
     def transform(self, T: FloatArray) -> None:
         """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
         self.JJ, self.frames, self.closed = (T @ M @ T.T for M in (self.JJ, self.frames, self.closed))
+        self.objects.transform(T)
         self.live = {side: (T @ row, last) for side, (row, last) in self.live.items()}
 
     def copy(self) -> ScoreSums:
-        return ScoreSums(
-            self.JJ, self.frames, self.closed, dict(self.live), deque(self.recent, self.recent.maxlen)
-        )
+        recent = deque(self.recent, self.recent.maxlen)
+        return replace(self, live=dict(self.live), recent=recent, objects=self.objects.copy())
 
     def error_model(self, window: Iterable[PairScore]) -> ErrorModel:
         """Variances of the error model from the latest frames."""

@@ -18,7 +18,7 @@ from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.problem.graph import GraphConfig
 from sst_graph.problem.state import bias_key, delay_key, object_bias_key
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import ErrorModel
+from sst_graph.uncertainty.covariance import ErrorModel, composed
 
 FloatArray = NDArray[np.float64]
 
@@ -203,13 +203,20 @@ class WindowSmoother:
         Raises:
             EstimationError: a direction without any information.
         """
+        information = self._information()
         try:
-            naive = scaled_inverse(self._information())
+            naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
         point, scores = self.past.point, [entry.score for entry in self.entries.values()]
         columns = [point.columns(score.belief.point.tracks) for score in scores]
         robust = naive + naive @ self.sums.surplus(scores, columns, self.model) @ naive
+        jackknife = None
+        if not self.drift.enabled:
+            found = [score.objects for score in scores if score.objects is not None]
+            point_now = self.past.at(self._point).point
+            jackknife = self.sums.objects.jackknife(found, naive, point_now)
+        robust = composed(robust, jackknife, self.sums.flatness(scores))
         return 0.5 * (robust + robust.T), naive
 
     def live_epochs(self) -> list[RetiredEpoch]:

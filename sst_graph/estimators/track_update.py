@@ -30,6 +30,7 @@ class TrackUpdate:
         reason: why the frame was not accepted; empty where it was.
         matches: silhouette matches in the window.
         chi2: statistic of the change test, over its usual size, or None where it can't be told.
+        doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
         alarm: this frame raised the alarm: the calibration has changed.
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
@@ -44,6 +45,7 @@ class TrackUpdate:
     reason: str = ""
     matches: int = 0
     chi2: float | None = None
+    doubt: str = ""
     alarm: bool = False
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
@@ -68,6 +70,7 @@ class TrackUpdate:
             "reason": self.reason,
             "matches": self.matches,
             "chi2": self.chi2,
+            "doubt": self.doubt,
             "alarm": self.alarm,
             "adopted": self.adopted,
             "weak": [weak.sentence for weak in self.weak_directions],

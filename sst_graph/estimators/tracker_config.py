@@ -41,7 +41,7 @@ class AlarmConfig:
             for a step to stay in sight [px].
         frames: new frames that are compared together.
         chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
-        confirmations: frames in a row past the threshold.
+        confirmations: frames in a row past the threshold; then it must hold without any one object, too.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.

@@ -1,0 +1,119 @@
+"""Leaving out objects one by one: in the window, after it, and after the objects are gone; milestones."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.estimators.gaussian import Gaussian, Point
+from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
+from sst_graph.estimators.settling import Milestones
+
+TRACKS = (4, 7, 9)
+N = 8 + len(TRACKS)
+
+
+def _point() -> Point:
+    return Point(gtsam.Pose3(), 0.05, np.array([0.4]), TRACKS, np.array([0.1, -0.3, 0.2]))
+
+
+def _frame(seed: int, at: Point) -> tuple[ObjectBeliefs, dict[int, tuple[np.ndarray, np.ndarray]]]:
+    """Twenty rows on each object; by track the full rows (20, N) and residuals."""
+    rng, rows, residuals, track, parts = np.random.default_rng(seed), [], [], [], {}
+    for k, name in enumerate(TRACKS):
+        J = np.zeros((20, N))
+        J[:, :7], J[:, 8 + k] = rng.normal(size=(20, 7)), 1.0
+        r = rng.normal(size=20) + 0.5
+        parts[name] = (J, r)
+        rows.append(J)
+        residuals.append(r)
+        track += [name] * 20
+    stacked = np.concatenate(rows), np.concatenate(residuals), np.array(track, dtype=np.intp)
+    return ObjectBeliefs.of(*stacked, at), parts
+
+
+def _whole(*frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    H = np.diag([*[1e-2] * 7, 1.0, 4.0, 4.0, 4.0])
+    H[7, 8:] = H[8:, 7] = -0.3
+    return np.asarray(H + sum(J.T @ J for frame in frames for J, _ in frame.values()))
+
+
+def _expected(H: np.ndarray, *frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """The batch's jackknife, from all rows at once."""
+    steps = []
+    for name in TRACKS:
+        J = np.concatenate([frame[name][0] for frame in frames])
+        r = np.concatenate([frame[name][1] for frame in frames])
+        steps.append(np.linalg.solve(H - J.T @ J, J.T @ r))
+    return np.asarray(2.0 / 3.0 * np.stack(steps).T @ np.stack(steps))
+
+
+def test_the_jackknife_is_the_batch_s_wherever_the_frames_are() -> None:
+    point = _point()
+    (one, rows_1), (two, rows_2) = _frame(1, point), _frame(2, point)
+    H = _whole(rows_1, rows_2)
+    expected = _expected(H, rows_1, rows_2)
+    sums = ObjectSums(np.zeros((N, N)))
+    both = sums.jackknife([one, two], np.linalg.inv(H), point)
+    assert both is not None
+    np.testing.assert_allclose(both, expected, rtol=1e-6, atol=1e-12)
+    sums.add(one)
+    left = sums.jackknife([two], np.linalg.inv(H), point)
+    assert left is not None
+    np.testing.assert_allclose(left, expected, rtol=1e-6, atol=1e-12)
+    sums.add(two)
+    sums.close((4,), H, np.linalg.inv(H), point)
+    assert set(sums.live) == {4} and sums.count == 2
+    closed = sums.jackknife([], np.linalg.inv(H), point)
+    assert closed is not None
+    np.testing.assert_allclose(closed, expected, rtol=1e-6, atol=1e-12)
+
+
+def test_gone_objects_count_on_when_their_biases_are_marginalized_out() -> None:
+    point = _point()
+    frame, rows = _frame(3, point)
+    H = _whole(rows)
+    sums = ObjectSums(np.zeros((N, N)))
+    sums.add(frame)
+    sums.close((), H, np.linalg.inv(H), point)
+    smaller, T = Gaussian(point, H, np.zeros(N)).without([7, 9])
+    sums.transform(T)
+    found = sums.jackknife([], np.linalg.inv(smaller.information), smaller.point)
+    assert found is not None
+    np.testing.assert_allclose(found, _expected(H, rows)[:9, :9], rtol=1e-6, atol=1e-12)
+
+
+def test_residuals_follow_the_estimate() -> None:
+    """Linearized elsewhere, an object says the same: r + J d."""
+    point = _point()
+    d = np.array([*np.full(6, 1e-7), 1e-3, 0.05, 0.1, -0.2, 0.3])
+    frame, rows = _frame(4, point)
+    moved = {name: (J, r + J @ d) for name, (J, r) in rows.items()}
+    H = _whole(rows)
+    expected = _expected(H, moved)
+    there = point.moved(d)
+    found = ObjectSums(np.zeros((N, N))).jackknife([frame], np.linalg.inv(H), there)
+    sums = ObjectSums(np.zeros((N, N)))
+    sums.add(frame)
+    after = sums.jackknife([], np.linalg.inv(H), there)
+    assert found is not None and after is not None
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(after, expected, rtol=1e-5, atol=1e-12)
+
+
+def test_one_object_cannot_be_left_out() -> None:
+    point = Point(gtsam.Pose3(), 0.0, np.zeros(1))
+    J, r = np.eye(8), np.ones(8)
+    frame = ObjectBeliefs.of(J, r, np.zeros(8, dtype=np.intp), point)
+    assert ObjectSums(np.zeros((8, 8))).jackknife([frame], 0.5 * np.eye(8), point) is None
+
+
+@pytest.mark.parametrize(
+    ("start", "window", "times"),
+    [(12, 60, [24, 48, 60, 120, 240]), (30, 60, [60, 120, 240]), (70, 60, [140])],
+)
+def test_settling_gets_rarer(start: int, window: int, times: list[int]) -> None:
+    milestones = Milestones(100, 2 * start, window)
+    reached = [seen for seen in range(start, 260) if milestones.reached(99 + seen)]
+    assert reached == times
