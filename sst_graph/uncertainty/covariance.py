@@ -299,7 +299,7 @@ def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
     J, r = table.J, table.root_weights * table.r
     order = np.argsort(table.objects, kind="stable")
     bounds = np.flatnonzero(np.diff(table.objects[order])) + 1
-    root = np.linalg.cholesky(bread)
+    root = np.asarray(np.linalg.cholesky(bread), dtype=np.float64)
     return np.stack(
         [step_without(root, J[own].T @ J[own], J[own].T @ r[own]) for own in np.split(order, bounds)]
     )
