@@ -319,11 +319,14 @@ class Tracker:
         """
         kernel, smoother = RobustKernel("geman_mcclure", self.config.alarm.kernel_px), self.smoother
         assert smoother is not None
-        for track in self.matcher.objects_of(self.watched):
-            scores = self.matcher.scores(before, self.watched, kernel, without=track)
-            if self.alarm.value(scores, self.joint, smoother.model) <= self.config.alarm.chi2:
-                return False
-        return True
+
+        def value(without: int | None = None) -> float:
+            scores = self.matcher.scores(before, self.watched, kernel, without)
+            return self.alarm.value(scores, self.joint, smoother.model)
+
+        config = self.config.alarm
+        least = max(config.chi2, config.others * value())
+        return all(value(track) > least for track in self.matcher.objects_of(self.watched))
 
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""

@@ -41,7 +41,8 @@ class AlarmConfig:
             for a step to stay in sight [px].
         frames: new frames that are compared together.
         chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
-        confirmations: frames in a row past the threshold; then it must hold without any one object, too.
+        confirmations: frames in a row past the threshold; then it must hold without any one object, too ...
+        others: ... and this share of the statistic must remain.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -52,6 +53,7 @@ class AlarmConfig:
     frames: int = 4
     chi2: float = 25.0
     confirmations: int = 3
+    others: float = 0.45
     baseline: int = 300
     warm_up: int = 15
 
