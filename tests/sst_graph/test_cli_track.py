@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import signal
@@ -72,8 +73,10 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     checkpoint = tmp_path / "tracker.npz"
     command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *OPTIONS]
     command += ["--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ})
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0, env={**os.environ})
     assert process.stdout is not None
+    if hasattr(fcntl, "F_SETPIPE_SZ"):  # a full pipe keeps it from running far ahead of what is read here
+        fcntl.fcntl(process.stdout.fileno(), fcntl.F_SETPIPE_SZ, 4096)
     for line in process.stdout:
         if json.loads(line)["frame"] >= 7:
             break

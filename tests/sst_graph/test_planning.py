@@ -111,9 +111,9 @@ def test_the_fewest_frames_that_are_enough() -> None:
     C = np.diag(np.array([0.001] * 3 + [0.001] * 3 + [0.05]) ** 2)
     one = Proposal("one", np.diag([0.0] * 6 + [1.0 / 0.02**2]))
     found = predict(C, one, 1, LIMITS)
-    # 1 / 0.05^2 + n / 0.02^2 >= 1 / 0.005^2 from n = 15.84 on.
-    assert found.enough == 16
-    assert predict(C, one, 16, LIMITS).worst <= 1.0 < predict(C, one, 15, LIMITS).worst
+    # 1 / 0.05^2 + n / 0.02^2 >= 1 / 0.01^2 from n = 3.84 on.
+    assert found.enough == 4
+    assert predict(C, one, 4, LIMITS).worst <= 1.0 < predict(C, one, 3, LIMITS).worst
     assert predict(C, replace(one, information=np.zeros((7, 7))), 1, LIMITS).enough is None
     assert predict(C, one, 1, LIMITS, search=False).enough is None
     wide = ObservabilityConfig(offset_s=0.1)
