@@ -14,7 +14,7 @@ from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
-from sst_graph.estimators.contest import Contest, choose_start, narrowed, prior_centre, solve_all
+from sst_graph.estimators.contest import REACH, Contest, choose_start, narrowed, prior_centre, solve_all
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion_answer import answer_motion
@@ -245,7 +245,7 @@ def _doubts(
     if config.start.enabled:
         search, around = config.start.search, np.zeros(3) if guess.cTl is None else guess.cTl.translation()
         far = float(np.linalg.norm(solution.state.cTl.translation() - around))
-        if far > (1.25 * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
+        if far > (REACH * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
             what = "the guess" if guess.cTl is not None else "the LiDAR"
             doubts.append(f"the answer lies {far:.2f} m from {what}, farther than was searched")
     for other in others:

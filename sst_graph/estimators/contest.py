@@ -30,7 +30,7 @@ _SAME_DEG = 2.0
 """Solutions closer than this are one [deg]."""
 _FAR_DEG = 20.0
 """A search around one pose finds those that are closer than this [deg]."""
-_REACH = 1.25
+REACH = 1.25
 """Solutions may lie this many times as far from the guess as was searched, along each axis; without a guess,
 in all."""
 
@@ -265,9 +265,9 @@ def _within(poses: Poses, guess: gtsam.Pose3 | None, config: StartConfig) -> NDA
     """(m,) whether the translation stayed where it was searched, and did not run away with the points."""
     search, away = config.search, poses.translations
     if guess is None:
-        return np.asarray(np.linalg.norm(away, axis=1) < _REACH * search.free_translation_m)
+        return np.asarray(np.linalg.norm(away, axis=1) < REACH * search.free_translation_m)
     return np.asarray(
-        (np.abs(away - np.asarray(guess.translation())) < _REACH * search.translation_m).all(axis=1)
+        (np.abs(away - np.asarray(guess.translation())) < REACH * search.translation_m).all(axis=1)
     )
 
 

@@ -27,8 +27,11 @@ from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
     ErrorModel,
+    curvatures_of,
     effective_views,
+    flatness_of,
     spread_beyond,
+    unweighted,
     with_floors,
 )
 
@@ -178,13 +181,12 @@ def score_pair(
 
 def _curvature(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> float:
     """Sum of the robust loss's second derivatives, each weighted as its match is beside the kernel."""
-    r = np.where(root > 1e-6, weighted / np.maximum(root, 1e-6), 0.0)
+    r = unweighted(weighted, root)
     total, start = 0.0, 0
     for matches in pair.matches.values():
-        some, kernel = slice(start, start + len(matches)), matches.alignment.kernel
+        some = slice(start, start + len(matches))
         start += len(matches)
-        plain = root[some] ** 2 / np.maximum(kernel.weight(r[some]), 1e-12)
-        total += float(plain @ kernel.curvature(r[some]))
+        total += float(curvatures_of(matches.alignment.kernel, root[some], r[some]).sum())
     return total
 
 
@@ -231,7 +233,7 @@ def _side_sums(
     """Sums by side of weighted rows J (m, n), weighted residuals and root weights; side (m,)."""
     names, which = np.unique(side, return_inverse=True)
     which = which.reshape(-1)
-    r = np.where(root > 1e-6, weighted / np.maximum(root, 1e-6), 0.0)
+    r = unweighted(weighted, root)
     w = root**2 / share
     weights, weights2, within = (
         np.asarray(np.bincount(which, values), np.float64) for values in (w, w * w, w * r**2)
@@ -298,7 +300,7 @@ class ScoreSums:
         """Mean robust weight over mean curvature, of all matches."""
         curvature = self.curvature + sum(score.curvature for score in window)
         weight = self.weight + sum(score.weight for score in window)
-        return weight / curvature if curvature > 0.0 else np.inf
+        return flatness_of(weight, curvature)
 
     def grow(self, n: int) -> None:
         """Make room for further unknowns, n in all."""

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.alignment import weighted_residuals
+from factors.robust import RobustKernel
 from sst_graph.association.silhouettes import SIDES
 from sst_graph.problem.graph import PairMatches, bias_groups, tracked_objects
 from sst_graph.problem.objects import ObjectId
@@ -74,8 +75,7 @@ class MatchTable:
     @property
     def flatness(self) -> float:
         """Mean robust weight over mean curvature: 1 for least squares, inf where the kernel bends over."""
-        curvature = float(self.curvatures.sum())
-        return float(self.root_weights @ self.root_weights) / curvature if curvature > 0.0 else np.inf
+        return flatness_of(float(self.root_weights @ self.root_weights), float(self.curvatures.sum()))
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def match_table(
             weights.append(root)
             residuals.append(r)
             kernel = matches.alignment.kernel
-            curvatures.append(root**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))
+            curvatures.append(curvatures_of(kernel, root, r))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
             side = (track * SIDES + matches.sides) * 64 + pair.drive
             sides.append(side)
@@ -157,8 +157,23 @@ def _rows(
         block[index, :6], block[index, clock] = J[:, :6], J[:, 6]
         block[index, unknowns.column(key)] = J[:, 13]
         roots[index] = root
-        residuals[index] = np.where(root > 1e-6, r / np.maximum(root, 1e-6), 0.0)
+        residuals[index] = unweighted(r, root)
     return block, roots, residuals
+
+
+def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
+    """(m,) whitened residuals from those multiplied by the roots of their weights; 0 where nothing weighs."""
+    return np.where(roots > 1e-6, r / np.maximum(roots, 1e-6), 0.0)
+
+
+def curvatures_of(kernel: RobustKernel, roots: FloatArray, r: FloatArray) -> FloatArray:
+    """(m,) second derivatives of the robust loss, weighted as matches are beside the kernel."""
+    return np.asarray(roots**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))
+
+
+def flatness_of(weight: float, curvature: float) -> float:
+    """Sum of robust weights over sum of curvatures; inf where the kernel bends over."""
+    return weight / curvature if curvature > 0.0 else np.inf
 
 
 def _views(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
