@@ -328,8 +328,12 @@ def step_without(root: FloatArray, information: FloatArray, score: FloatArray) -
         information, score: (n, n), (n,) J^T J and J^T r of these matches.
     """
     shares, axes = np.linalg.eigh(root.T @ information @ root)
-    moved = (axes.T @ (root.T @ score)) / (1.0 - np.minimum(shares, _LEFT_OUT))
-    return np.asarray(root @ (axes @ moved))
+    return np.asarray(root @ (axes @ (growth_without(shares) * (axes.T @ (root.T @ score)))))
+
+
+def growth_without(shares: FloatArray) -> FloatArray:
+    """How much variances grow along directions of which these shares of the information are left out."""
+    return np.asarray(1.0 / (1.0 - np.minimum(shares, _LEFT_OUT)))
 
 
 def marginal_covariance(
