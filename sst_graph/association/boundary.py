@@ -44,8 +44,7 @@ class BoundaryConfig:
         max_elevation_gap_deg: largest gap between neighbouring rings [deg].
         max_range_m: farthest object [m].
         min_points: objects with fewer points are left out.
-        bottom_edges: find edges towards the ground too. They sharpen roll and height where both sides
-            label the underside alike; hand-drawn outlines often cover the gaps between the wheels.
+        bottom_edges: find edges towards the ground too.
         ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
         max_slope_m: most that the range is carried on from the last return to the edge [m].
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
@@ -57,7 +56,7 @@ class BoundaryConfig:
     max_elevation_gap_deg: float = 0.9
     max_range_m: float = 60.0
     min_points: int = 15
-    bottom_edges: bool = False
+    bottom_edges: bool = True
     ground_margin_m: float = 0.3
     max_slope_m: float = 1.0
     cell_m: float = 0.3
@@ -87,6 +86,11 @@ class Boundaries:
     def __len__(self) -> int:
         return len(self.lPs)
 
+    def joined(self, other: Boundaries) -> Boundaries:
+        """These points and others of the same scan."""
+        names = [field.name for field in fields(self)]
+        return Boundaries(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
     def take(self, index: IntArray) -> Boundaries:
         """Some of the points, by position."""
         parts = {field.name: getattr(self, field.name)[index] for field in fields(self)}
@@ -96,7 +100,7 @@ class Boundaries:
 def find_boundaries(
     scan: Scan, classes: Sequence[SemanticClass], config: BoundaryConfig | None = None
 ) -> dict[SemanticClass, Boundaries]:
-    """Side and top boundary points of each class in a scan; a class without any has no entry."""
+    """Boundary points of each class in a scan; a class without any has no entry."""
     config = config or BoundaryConfig()
     usable = np.linalg.norm(scan.points, axis=1) > 0.5
     points = scan.points[usable].astype(np.float64)

@@ -33,6 +33,7 @@ class MatchConfig:
         mask_sigma_px: deviation of a mask's contour from the object's [px].
         side_sigma_px: error that all matches on one side of one object in one image share [px]; it
             bounds what a side may claim, however many points it has.
+        underside_sigma_px: the same of an object's edge towards the ground [px].
         gate: farthest match, in units of the kernel's scale.
         min_cosine: least agreement between the contour's normal and the way out of the object.
         min_object_share: an object of whose boundary in view less than this share finds a match is left out.
@@ -41,6 +42,7 @@ class MatchConfig:
 
     mask_sigma_px: float = 1.0
     side_sigma_px: float = 0.7
+    underside_sigma_px: float = 1.2
     gate: float = 3.0
     min_cosine: float = 0.5
     min_object_share: float = 0.1
@@ -124,7 +126,11 @@ def match_silhouettes(
             normals=feet.normals[index],
             kernel=kernel,
             c_acceleration=motion.c_acceleration,
-            weights=_shared_weights(points.objects[index] * SIDES + sides, sigmas, config.side_sigma_px),
+            weights=_shared_weights(
+                points.objects[index] * SIDES + sides,
+                sigmas,
+                np.where(points.edges[index] == Edge.BOTTOM, config.underside_sigma_px, config.side_sigma_px),
+            ),
         )
         found[c] = SilhouetteMatches(
             alignment, points.objects[index], sides, index, int(np.count_nonzero(used))
@@ -145,7 +151,7 @@ def _has_a_mask(
     return np.asarray((meets >= config.min_object_share * np.bincount(objects, seen))[objects])
 
 
-def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: float) -> FloatArray:
+def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: FloatArray) -> FloatArray:
     """(n,) weights under which a group's mean counts with sigma^2 / n + shared^2 instead of sigma^2 / n."""
     numbers = np.unique(groups, return_inverse=True)[1].reshape(-1)
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers]

@@ -14,11 +14,20 @@ from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
-from sst_graph.estimators.contest import REACH, Contest, choose_start, narrowed, prior_centre, solve_all
+from sst_graph.estimators.contest import (
+    REACH,
+    Contest,
+    choose_start,
+    narrowed,
+    prior_centre,
+    rivals,
+    solve_all,
+)
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
+from sst_graph.estimators.undersides import with_undersides
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -134,25 +143,29 @@ def answer_joint(
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
     finals = _finals(drives, tracks, contest, guess, config, progress)
+    evidence = {
+        "explained": explained(finals[0]),
+        "concentration": concentration(finals[0], drives, tracks, config.joint),
+    }
+    # 3. Edges towards the ground, where the labels agree about them.
+    best = rivals(finals, guess.cTl, guess.offset_s, config.start)
+    below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
+    config, finals = dataclasses.replace(config, joint=below.joint), below.solutions
     solution = finals[0]
-    # 3. How sure; where the labels tell everything, the motion is heard too.
+    # 4. How sure; where the labels tell everything, the motion is heard too.
     covariance, model, _ = robust_covariance(*_frozen(solution), objects)
     heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
         covariance, model, _ = robust_covariance(*_frozen(solution), objects)
         covariance *= heard.inflation
-    evidence = {
-        "explained": explained(solution),
-        "concentration": concentration(solution, drives, tracks, config.joint),
-    }
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
         covariance[:7, :7],
         _frames_used(drives, solution),
         remarks=_remarks(drives),
-        doubts=(*_doubts(solution, finals[1:], covariance, contest, evidence, guess, config), *heard.doubts),
+        doubts=(*_doubts(solution, finals, covariance, contest, evidence, guess, config), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -164,6 +177,8 @@ def answer_joint(
                 f"{drives[d].name}:{c.name.lower()}": bias
                 for (d, c), bias in solution.state.biases_px.items()
             },
+            "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
+            "undersides": [c.name.lower() for c in below.joint.graph.undersides],
             "motion": heard.diagnostics,
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
             FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), objects, drives, model)),
@@ -207,7 +222,7 @@ def _finals(
     guess: Guess,
     config: CalibrationConfig,
     progress: Progress | None,
-) -> list[JointSolution]:
+) -> Sequence[JointSolution]:
     """Solutions of the whole problem from every finalist, the one that agrees best with the labels first.
 
     Raises:
@@ -222,7 +237,7 @@ def _finals(
 
 def _doubts(
     solution: JointSolution,
-    others: Sequence[JointSolution],
+    finals: Sequence[JointSolution],
     covariance: FloatArray,
     contest: Contest,
     evidence: Mapping[str, float],
@@ -248,13 +263,14 @@ def _doubts(
         if far > (REACH * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
             what = "the guess" if guess.cTl is not None else "the LiDAR"
             doubts.append(f"the answer lies {far:.2f} m from {what}, farther than was searched")
+    best, *others = finals
     for other in others:
         step = np.append(
             gtsam.Pose3.Logmap(solution.state.cTl.between(other.state.cTl)),
             other.state.offsets_s[0] - solution.state.offsets_s[0],
         )
         sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
-        if sigmas > _FAR_SIGMAS and agreement(other) > config.start.rival_ratio * agreement(solution):
+        if sigmas > _FAR_SIGMAS and agreement(other) > config.start.rival_ratio * agreement(best):
             doubts.append(
                 f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "

@@ -11,6 +11,7 @@ from sst_graph.estimators.motion import MotionConfig
 from sst_graph.estimators.paper import PaperConfig
 from sst_graph.estimators.semalign import SemAlignConfig
 from sst_graph.estimators.start import StartConfig
+from sst_graph.estimators.undersides import UndersideConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.observability import ObservabilityConfig
@@ -36,6 +37,7 @@ class CalibrationConfig:
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
+        undersides: when method joint matches edges towards the ground.
         paper: both stages of the paper.
         semalign: sampled starts.
         motion: hand-eye calibration.
@@ -50,6 +52,7 @@ class CalibrationConfig:
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)
+    undersides: UndersideConfig = field(default_factory=UndersideConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)

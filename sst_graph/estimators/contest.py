@@ -154,6 +154,31 @@ def solve_all(
     return sorted(solutions, key=agreement, reverse=True)
 
 
+def rivals(
+    solutions: Sequence[JointSolution],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    config: StartConfig,
+) -> list[tuple[JointSolution, State]]:
+    """The best solution and others elsewhere that agree almost as well, with what their priors centre on.
+
+    Args:
+        solutions: the one that agrees best first.
+    """
+    best = solutions[0]
+    least = config.rival_ratio * agreement(best)
+    chosen = [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
+    return [(solution, prior_centre(solution.state, guess_cTl, guess_offset_s)) for solution in chosen]
+
+
+def _alike(one: State, other: State) -> bool:
+    """Whether two solutions lead to one answer."""
+    step = one.cTl.between(other.cTl)
+    near = float(np.linalg.norm(gtsam.Rot3.Logmap(step.rotation()))) < _ALIKE_RAD
+    near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
+    return near and abs(one.offsets_s[0] - other.offsets_s[0]) <= _ALIKE_S
+
+
 def narrowed(joint: JointConfig) -> JointConfig:
     """Settings from a start that is nearly right: wide kernels would only lead away from it."""
     half = (len(joint.kernel_px) + 1) // 2

@@ -211,6 +211,26 @@ class Gaussian:
         return gtsam.LinearContainerFactor(factor.linearize(values), values)
 
 
+def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
+    """(k, m) steps from each point to another, over [extrinsic, offset, biases]."""
+    turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)
+    rest = np.array([[point.offset_s, *point.biases_px] for point in points]).reshape(len(turns), -1)
+    return np.column_stack([turns, np.array([to.offset_s, *to.biases_px]) - rest])
+
+
+def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
+    """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
+    if not places:
+        return [np.zeros((n, n)) for _ in blocks]
+    where = np.concatenate([(own[:, None] * n + own).reshape(-1) for own in places])
+    return [
+        np.asarray(
+            np.bincount(where, np.concatenate([b.reshape(-1) for b in some]), n * n).reshape(n, n), np.float64
+        )
+        for some in blocks
+    ]
+
+
 def _like(target: Point, source: Point) -> Point:
     """The source's values, with the objects of the target."""
     return replace(source, tracks=target.tracks, object_biases_px=_picked(source, target.tracks))

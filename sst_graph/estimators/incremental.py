@@ -18,7 +18,7 @@ from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm
 from sst_graph.estimators.arrivals import Arrivals
-from sst_graph.estimators.gaussian import Point
+from sst_graph.estimators.gaussian import Point, core_steps
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.settling import Milestones, settle_window
@@ -260,18 +260,19 @@ class Tracker:
         waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
         staleness = self._staleness(smoother)
         known = sorted(staleness, key=staleness.__getitem__, reverse=True)
+        # What cannot wait, and as many others as there is time for: those judged anew, then the stalest.
+        chosen = {number, *waiting[-4:], *(set(numbers[-2:]) & set(known))}
+        chosen |= {n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS}
         stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
-        some = known[: min(max(self.config.renew, stale), self.config.renew_most)]
-        judged = sorted(self.window.judged_anew & set(known))[: self.config.renew_most]
-        leaving = [n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS]
-        return {number, *waiting[-4:], *leaving, *some, *judged} | (set(numbers[-2:]) & set(known))
+        wanted = [*sorted(self.window.judged_anew & set(known)), *known[: max(self.config.renew, stale)]]
+        return chosen | set(list(dict.fromkeys(wanted))[: self.config.renew_most])
 
     def _staleness(self, smoother: WindowSmoother) -> dict[int, float]:
         """How far the estimate has moved since each pair was matched, in standard deviations."""
         if not smoother.entries:
             return {}
-        points = [entry.score.belief.point.core() for entry in smoother.entries.values()]
-        steps = np.stack([point.local(self.point.core()) for point in points])
+        points = [entry.score.belief.point for entry in smoother.entries.values()]
+        steps = core_steps(points, self.point)
         squares = np.einsum("ij,ij->i", steps, np.linalg.solve(self.covariance, steps.T).T)
         return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))
 

@@ -23,9 +23,13 @@ from sst_graph.problem.graph import (
 )
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import Unknowns, marginal_covariance
 
 _LOG = logging.getLogger(__name__)
+
+CONCENTRATION_SCALES = (1.0, 5.0)
+"""Kernels, in units of the last one, whose supports are compared to see how close matches are."""
 
 
 @dataclass(frozen=True)
@@ -132,14 +136,24 @@ def support(solution: JointSolution) -> float:
 
 
 def _support(pairs: Sequence[PairMatches], state: State) -> float:
-    total = 0.0
+    return sum(support_of(pairs, state).values())
+
+
+def support_of(
+    pairs: Sequence[PairMatches], state: State, side: int | None = None
+) -> dict[SemanticClass, float]:
+    """How much agrees with a state, by class: matches, of all sides or one, counted by robust weight."""
+    total: dict[SemanticClass, float] = {}
     for pair in pairs:
         for c, matches in pair.matches.items():
             alignment = matches.alignment
+            if side is not None:
+                alignment = alignment.take(np.flatnonzero(matches.sides == side))
             bias = state.biases_px.get((pair.drive, c), 0.0)
             offset_s, c_twist = state.offset_s(pair.drive), pair.motion.c_twist
             r, _ = residuals(alignment, state.cTl, offset_s, c_twist, bias, jacobians=False)
-            total += float(alignment.kernel.weight(r / alignment.sigmas_px).sum())
+            weight = float(alignment.kernel.weight(r / alignment.sigmas_px).sum())
+            total[c] = total.get(c, 0.0) + weight
     return total
 
 
@@ -151,7 +165,7 @@ def concentration(
     A true pose leaves the masks' own errors, whatever share of the points has a mask; a wrong pose that
     was fitted to some contours leaves all distances.
     """
-    kernel = RobustKernel("geman_mcclure", 5.0 * config.kernel_px[-1])
+    kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * config.kernel_px[-1])
     pairs = associate(drives, tracks, solution.state, kernel, config.graph)
     return support(solution) / max(_support(pairs, solution.state), 1e-9)
 

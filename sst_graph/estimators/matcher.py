@@ -50,7 +50,8 @@ class WindowMatcher:
         for number, pair in pairs.items():
             if len(pair) >= self.config.min_frame_matches:
                 pair = pair if share == 1.0 else with_share(pair, share)
-                score, image = self._score(pair, number, point, share), self.window.images[pair.pair.image]
+                score = self._score(pair, number, point, share, by_object=not self.config.drift.enabled)
+                image = self.window.images[pair.pair.image]
                 found[number] = Found(pair, score, stamps[number], image.index)
         return found, set(numbers) - set(found)
 
@@ -61,7 +62,11 @@ class WindowMatcher:
         pairs, _ = self._pairs(point, chosen, kernel)
         if without is not None:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
-        return [self._score(pair, number, point, 1.0) for number, pair in pairs.items() if len(pair)]
+        return [
+            self._score(pair, number, point, 1.0, by_object=False)
+            for number, pair in pairs.items()
+            if len(pair)
+        ]
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""
@@ -96,8 +101,11 @@ class WindowMatcher:
         pairs = associate([part], self._tracks(part, numbers), state, kernel, self.graph)
         return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
 
-    def _score(self, pair: PairMatches, number: int, point: Point, share: float) -> PairScore:
-        return score_pair(pair, point, self.classes, self.window.tracks[number], self.graph, share)
+    def _score(
+        self, pair: PairMatches, number: int, point: Point, share: float, by_object: bool
+    ) -> PairScore:
+        tracks = self.window.tracks[number]
+        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""

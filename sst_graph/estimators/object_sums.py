@@ -6,14 +6,14 @@ square of the step that the estimate would take without them.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.estimators.gaussian import Gaussian, Point
-from sst_graph.uncertainty.covariance import step_without
+from sst_graph.estimators.gaussian import Gaussian, Point, core_steps
+from sst_graph.uncertainty.covariance import growth_without
 
 FloatArray = NDArray[np.float64]
 
@@ -26,24 +26,33 @@ class ObjectBeliefs:
         point: where the frame is linearized.
         tracks: (k) the objects' tracks.
         information, vector: (k, m, m), (k, m) as of :class:`~sst_graph.estimators.gaussian.Gaussian`.
+        biases_px: (k,) the objects' own biases at the point; empty where they have none.
     """
 
     point: Point
     tracks: tuple[int, ...]
     information: FloatArray
     vector: FloatArray
+    biases_px: FloatArray
 
     @classmethod
     def of(cls, J: FloatArray, r: FloatArray, track: NDArray[np.intp], point: Point) -> ObjectBeliefs:
         """From weighted rows J (m, n) at a point, residuals and tracks (m,)."""
-        names = tuple(int(name) for name in np.unique(track))
+        order = np.argsort(track, kind="stable")
+        bounds = [0, *(np.flatnonzero(np.diff(track[order])) + 1).tolist(), len(track)]
+        rows, residuals = J[order, : point.core_size], r[order]
+        names = tuple(int(track[order[start]]) for start in bounds[:-1])
+        own = bool(point.tracks)
         informations, vectors = [], []
-        for name in names:
-            rows = np.flatnonzero(track == name)
-            own = J[np.ix_(rows, point.columns([name] if name in point.tracks else []))]
-            informations.append(own.T @ own)
-            vectors.append(-own.T @ r[rows])
-        return cls(point, names, np.stack(informations), np.stack(vectors))
+        for name, start, end in zip(names, bounds, bounds[1:], strict=False):
+            part = rows[start:end]
+            if own:
+                column = J[order[start:end], point.core_size + point.tracks.index(name)]
+                part = np.column_stack([part, column])
+            informations.append(part.T @ part)
+            vectors.append(-part.T @ residuals[start:end])
+        biases = np.array([point.object_biases_px[point.tracks.index(name)] for name in names if own])
+        return cls(point, names, np.stack(informations), np.stack(vectors), biases)
 
     def gaussians(self) -> dict[int, Gaussian]:
         """One by one, by track."""
@@ -52,15 +61,10 @@ class ObjectBeliefs:
             for k, track in enumerate(self.tracks)
         }
 
-    def vector_at(self, point: Point) -> FloatArray:
-        """(k, m) the vectors about another, near point."""
-        step = self.point.core().local(point.core())
-        if self.information.shape[1] == len(step):
-            return np.asarray(self.vector - self.information @ step)
-        before, now = _biases(self.point), _biases(point)
-        own = np.array([now.get(track, before[track]) - before[track] for track in self.tracks])
-        steps = np.column_stack([np.tile(step, (len(own), 1)), own])
-        return np.asarray(self.vector - np.einsum("kij,kj->ki", self.information, steps))
+    @classmethod
+    def single(cls, track: int, own: Gaussian) -> ObjectBeliefs:
+        """One object."""
+        return cls(own.point, (track,), own.information[None], own.vector[None], own.point.object_biases_px)
 
 
 @dataclass
@@ -96,9 +100,8 @@ class ObjectSums:
         gone = {track: self.live.pop(track) for track in list(self.live) if track not in seen}
         if not gone:
             return
-        at = [own.at(point) for own in gone.values()]
-        parts = [own.information for own in at], [own.vector for own in at]
-        steps = _steps_without(*parts, list(gone), naive, point)
+        beliefs = [ObjectBeliefs.single(track, own) for track, own in gone.items()]
+        steps = _steps_without(*_summed(beliefs, point), naive, point)
         scores = steps @ information
         self.closed = self.closed + scores.T @ scores
         self.count += len(gone)
@@ -113,21 +116,14 @@ class ObjectSums:
             naive: (n, n) inverse of all information.
             point: the estimate.
         """
-        sums = {track: (own.information, own.at(point).vector) for track, own in self.live.items()}
-        for objects in window:
-            for track, own, vector in zip(
-                objects.tracks, objects.information, objects.vector_at(point), strict=True
-            ):
-                known = sums.get(track)
-                sums[track] = (own, vector) if known is None else (known[0] + own, known[1] + vector)
-        count = len(sums) + self.count
+        beliefs = [*(ObjectBeliefs.single(track, own) for track, own in self.live.items()), *window]
+        total, count = naive @ self.closed @ naive, self.count
+        if beliefs:
+            tracks, informations, vectors = _summed(beliefs, point)
+            steps = _steps_without(tracks, informations, vectors, naive, point)
+            total, count = total + steps.T @ steps, count + len(tracks)
         if count < 2:
             return None
-        total = naive @ self.closed @ naive
-        if sums:
-            informations, vectors = zip(*sums.values(), strict=True)
-            steps = _steps_without(informations, vectors, list(sums), naive, point)
-            total = total + steps.T @ steps
         return np.asarray((count - 1) / count * total)
 
     def copy(self) -> ObjectSums:
@@ -139,26 +135,42 @@ def _restricted(point: Point, track: int) -> Point:
     return point.seen({track: 0}) if track in point.tracks else point.core()
 
 
-def _biases(point: Point) -> Mapping[int, float]:
-    return dict(zip(point.tracks, point.object_biases_px.tolist(), strict=True))
+def _summed(beliefs: Sequence[ObjectBeliefs], point: Point) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+    """(k) tracks, (k, m, m) informations and (k, m) vectors about a point, summed object by object."""
+    counts = [len(part.tracks) for part in beliefs]
+    information = np.concatenate([part.information for part in beliefs])
+    tracks = np.concatenate([part.tracks for part in beliefs])
+    steps = np.repeat(core_steps([part.point for part in beliefs], point), counts, axis=0)
+    if information.shape[1] > steps.shape[1]:
+        before = np.concatenate([part.biases_px for part in beliefs])
+        known = dict(zip(point.tracks, point.object_biases_px.tolist(), strict=True))
+        now = [known.get(track, bias) for track, bias in zip(tracks.tolist(), before.tolist(), strict=True)]
+        steps = np.column_stack([steps, now - before])
+    moved = (information @ steps[:, :, None])[:, :, 0]
+    vectors = np.concatenate([part.vector for part in beliefs]) - moved
+    order = np.argsort(tracks, kind="stable")
+    firsts = np.append(0, np.flatnonzero(np.diff(tracks[order])) + 1)
+    names = tuple(tracks[order[firsts]].tolist())
+    return names, np.add.reduceat(information[order], firsts), np.add.reduceat(vectors[order], firsts)
 
 
 def _steps_without(
-    informations: Sequence[FloatArray],
-    vectors: Sequence[FloatArray],
-    tracks: Sequence[int],
-    naive: FloatArray,
-    point: Point,
+    tracks: Sequence[int], informations: FloatArray, vectors: FloatArray, naive: FloatArray, point: Point
 ) -> FloatArray:
-    """(k, n) how far the linearized estimate moves without each of the objects."""
-    n = len(naive)
-    sigmas = np.sqrt(np.diag(naive))
-    root = sigmas[:, None] * np.linalg.cholesky(naive / np.outer(sigmas, sigmas) + 1e-14 * np.eye(n))
-    steps = []
-    for part, vector, track in zip(informations, vectors, tracks, strict=True):
-        columns = point.columns([track] if track in point.tracks else [])
-        own, score = np.zeros((n, n)), np.zeros(n)
-        own[np.ix_(columns, columns)] = part
-        score[columns] = -vector
-        steps.append(step_without(root, own, score))
-    return np.stack(steps)
+    """(k, n) how far the linearized estimate moves without each of the objects.
+
+    As :func:`~sst_graph.uncertainty.covariance.step_without` in the few columns of an object: with p its
+    information, s its score there, and naive = C C' on them, f(p C C') = C^-T f(C' p C) C'.
+    """
+    sigmas, m = np.sqrt(np.diag(naive)), informations.shape[1]
+    core = point.core_size
+    places = np.array([[*range(core), *([core + point.tracks.index(t)] if m > core else [])] for t in tracks])
+    scaled = naive / np.outer(sigmas, sigmas)
+    scale = sigmas[places]
+    C = np.linalg.cholesky(scaled[places[:, :, None], places[:, None, :]] + 1e-14 * np.eye(m))
+    p = informations * (scale[:, :, None] * scale[:, None, :])
+    Ct = np.swapaxes(C, 1, 2)
+    shares, axes = np.linalg.eigh(Ct @ p @ C)
+    score = np.swapaxes(axes, 1, 2) @ (Ct @ (-vectors * scale)[:, :, None])
+    moved = np.linalg.solve(Ct, axes @ (growth_without(shares)[:, :, None] * score))
+    return np.asarray((np.swapaxes(moved, 1, 2) @ scaled[places])[:, 0, :] * sigmas)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -19,7 +20,7 @@ from factors import GroupedBias, frame_factor, twist_transfer_factor, velocity_f
 from factors.alignment import weighted_residuals
 from factors.motion import twist_ad
 from sst_graph.association.silhouettes import SIDES
-from sst_graph.estimators.gaussian import Gaussian, Point
+from sst_graph.estimators.gaussian import Gaussian, Point, scattered
 from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
 from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.state import object_bias_key
@@ -59,6 +60,12 @@ class SideSums:
     weights2: FloatArray
     within: FloatArray
     moved: bool = True
+
+    @cached_property
+    def rows(self) -> FloatArray:
+        """(k, 6) [side, mean, weights, weights2, within, moved]."""
+        moved = np.full(len(self.sides), float(self.moved))
+        return np.column_stack([self.sides, self.means, self.weights, self.weights2, self.within, moved])
 
 
 @dataclass(frozen=True)
@@ -139,12 +146,14 @@ def score_pair(
     tracks: Mapping[tuple[SemanticClass, int], int],
     config: GraphConfig,
     share: float = 1.0,
+    by_object: bool = True,
 ) -> PairScore:
     """Linearize a pair at the point its matches were made at: its silhouettes and its motion.
 
     Args:
         tracks: number of the track of each (class, object) of the scan.
         share: factor that the weights of all matches carry beside their own.
+        by_object: tell what each object alone says, too.
     """
     places = object_places(pair, classes)
     point = point.seen(places)
@@ -153,30 +162,35 @@ def score_pair(
     A = np.concatenate([J, JV], axis=1)
     H, g = A.T @ A, -A.T @ r
     n = point.size
+    JJ = share * H[:n, :n]
     columns = [*range(7), *range(n, n + 6)]
     H[np.ix_(columns, columns)] += _motion_information(pair, point, config)
     gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
     belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
-    track = np.concatenate(
-        [
-            np.array([tracks[c, int(number)] for number in m.objects], dtype=np.intp)
-            for c, m in pair.matches.items()
-        ]
-    )
+    track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
     return PairScore(
         belief,
-        share * (J.T @ J),
+        JJ,
         sides,
         sides.scores.T @ sides.scores,
         len(pair),
         places,
-        ObjectBeliefs.of(J, r, track, point),
+        ObjectBeliefs.of(J, r, track, point) if by_object else None,
         float(roots @ roots),
         _curvature(pair, r, roots),
     )
+
+
+def _tracks_of(
+    pair: PairMatches, c: SemanticClass, tracks: Mapping[tuple[SemanticClass, int], int]
+) -> IntArray:
+    """(m,) track of the object of each match of a class."""
+    if c in pair.tracks:
+        return pair.tracks[c]
+    return np.array([tracks[c, int(number)] for number in pair.matches[c].objects], dtype=np.intp)
 
 
 def _curvature(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> float:
@@ -239,8 +253,7 @@ def _side_sums(
         np.asarray(np.bincount(which, values), np.float64) for values in (w, w * w, w * r**2)
     )
     means = np.bincount(which, w * r) / np.maximum(weights, 1e-12)
-    scores = np.zeros((len(names), J.shape[1]))
-    np.add.at(scores, which, J * root[:, None])
+    scores = _summed_rows(J * root[:, None], side)
     within = np.maximum(within - weights * means**2, 0.0)
     return SideSums(names, scores, means, weights, weights2, within)
 
@@ -291,7 +304,7 @@ class ScoreSums:
         for side in [side for side, (_, last) in self.live.items() if last < scan - memory]:
             row, _ = self.live.pop(side)
             self.closed = self.closed + np.outer(row, row)
-        self.recent.append(_recent_rows(score.sides))
+        self.recent.append(score.sides.rows)
         if by_object and score.objects is not None:
             self.objects.add(score.objects)
         self.weight, self.curvature = self.weight + score.weight, self.curvature + score.curvature
@@ -318,7 +331,7 @@ class ScoreSums:
 
     def error_model(self, window: Iterable[PairScore]) -> ErrorModel:
         """Variances of the error model from the latest frames."""
-        rows = [*self.recent, *(_recent_rows(score.sides) for score in window)]
+        rows = [*self.recent, *(score.sides.rows for score in window)]
         return fit_sides(np.concatenate(rows))
 
     def surplus(
@@ -331,25 +344,27 @@ class ScoreSums:
             columns: where their unknowns stand.
         """
         n = len(self.JJ)
-        total = (model.match - 1.0) * self.JJ + model.side_frame * self.frames
+        JJ, frames = scattered(n, columns, [score.JJ for score in window], [score.sums for score in window])
+        total = (model.match - 1.0) * (self.JJ + JJ) + model.side_frame * (self.frames + frames)
         sides = [np.array(list(self.live), dtype=np.intp), *(score.sides.sides for score in window)]
         rows = np.zeros((sum(len(part) for part in sides), n))
         for i, (row, _) in enumerate(self.live.values()):
             rows[i] = row
         start = len(self.live)
         for score, own in zip(window, columns, strict=True):
-            total[np.ix_(own, own)] += (model.match - 1.0) * score.JJ + model.side_frame * score.sums
             rows[start : start + len(score.sides.sides), own] = score.sides.scores
             start += len(score.sides.sides)
-        names, which = np.unique(np.concatenate(sides), return_inverse=True)
-        by_side = np.zeros((len(names), n))
-        np.add.at(by_side, which.reshape(-1), rows)
+        by_side = _summed_rows(rows, np.concatenate(sides))
         return np.asarray(total + model.side * (self.closed + by_side.T @ by_side))
 
 
-def _recent_rows(sides: SideSums) -> FloatArray:
-    moved = np.full(len(sides.sides), float(sides.moved))
-    return np.column_stack([sides.sides, sides.means, sides.weights, sides.weights2, sides.within, moved])
+def _summed_rows(rows: FloatArray, names: IntArray) -> FloatArray:
+    """(k, n) sums of rows (m, n) of the same name (m,)."""
+    if len(names) == 0:
+        return rows
+    order = np.argsort(names, kind="stable")
+    firsts = np.append(0, np.flatnonzero(np.diff(names[order])) + 1)
+    return np.asarray(np.add.reduceat(rows[order], firsts))
 
 
 def fit_sides(rows: FloatArray) -> ErrorModel:

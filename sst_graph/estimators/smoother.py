@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
+from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse, scattered
 from sst_graph.estimators.scores import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.problem.graph import GraphConfig
@@ -187,10 +187,9 @@ class WindowSmoother:
             if i > 0:
                 walk = self.walk(self._seconds(i))
                 information = replace(self.past, information=information).drifted(walk).information
-            for entry in self.entries.values():
-                if entry.epoch == epoch.number:
-                    columns = point.columns(entry.score.belief.point.tracks)
-                    information[np.ix_(columns, columns)] += entry.score.belief.information
+            seen = [e.score.belief for e in self.entries.values() if e.epoch == epoch.number]
+            columns = [point.columns(belief.point.tracks) for belief in seen]
+            information += scattered(point.size, columns, [belief.information for belief in seen])[0]
         return information
 
     def _seconds(self, i: int) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from sst_graph.association.boundary import Boundaries, BoundaryConfig, find_boundaries
+from sst_graph.association.boundary import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.association.contour import ContourMap
 from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
@@ -51,10 +51,11 @@ class ScanFeatures:
     Attributes:
         index: of its frame in the drive.
         stamp_ns: LiDAR-clock stamp.
-        boundaries: boundary points of each class.
+        boundaries: boundary points of each class, without those towards the ground.
         lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
         depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
             features are not tracked [m], [s].
+        undersides: boundary points of each class towards the ground, of objects that have others too.
     """
 
     index: int
@@ -65,6 +66,7 @@ class ScanFeatures:
     offsets_s: FloatArray
     depth_lPs: NDArray[np.float32]
     depth_offsets_s: NDArray[np.float32]
+    undersides: dict[SemanticClass, Boundaries] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -162,15 +164,33 @@ def scan_features(
     if config.use_visual_odometry:
         near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
         depth = near[:: max(1, len(scan.points) // 30_000)]
+    boundaries, undersides = _apart(find_boundaries(scan, classes, config.boundary))
     return ScanFeatures(
         index,
         scan.stamp_ns,
-        find_boundaries(scan, classes, config.boundary),
+        boundaries,
         scan.points[chosen].astype(np.float64),
         scan.classes[chosen],
         offsets[chosen].astype(np.float64),
         scan.points[depth],
         offsets[depth],
+        undersides,
+    )
+
+
+def _apart(
+    found: dict[SemanticClass, Boundaries],
+) -> tuple[dict[SemanticClass, Boundaries], dict[SemanticClass, Boundaries]]:
+    """Boundary points, and apart from them those towards the ground."""
+    boundaries, undersides = {}, {}
+    for c, points in found.items():
+        down = points.edges == Edge.BOTTOM
+        boundaries[c] = points.take(np.flatnonzero(~down))
+        known = np.isin(points.objects, boundaries[c].objects)
+        undersides[c] = points.take(np.flatnonzero(down & known))
+    return (
+        {c: points for c, points in boundaries.items() if len(points)},
+        {c: points for c, points in undersides.items() if len(points)},
     )
 
 

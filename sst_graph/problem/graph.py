@@ -14,7 +14,7 @@ from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries
 from sst_graph.association.pairing import Pair, pair_by_time
 from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
-from sst_graph.problem.drive import Drive
+from sst_graph.problem.drive import Drive, ScanFeatures
 from sst_graph.problem.objects import ObjectId, moving_objects
 from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
 from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
@@ -29,6 +29,8 @@ class GraphConfig:
 
     Attributes:
         match: how boundary points meet contours.
+        undersides: classes whose edges towards the ground are matched too. They sharpen roll and height where
+            both sides label the underside alike; hand-drawn outlines often cover the gap above the ground.
         max_interval_periods: farthest pair in true time, in image periods.
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
@@ -42,6 +44,7 @@ class GraphConfig:
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
+    undersides: tuple[SemanticClass, ...] = ()
     max_interval_periods: float = 1.0
     bias_sigma_px: float = 3.0
     object_bias_sigma_px: float = 0.5
@@ -142,7 +145,7 @@ def associate(
                 tracks.standing(
                     number,
                     pair.scan,
-                    drive.scans[pair.scan].boundaries,
+                    _outlines(drive.scans[pair.scan], config.undersides),
                     config.mover_reach_m,
                     offset_s + pair.base_tau_s,
                 ),
@@ -162,6 +165,12 @@ def associate(
                 )
                 found.append(PairMatches(number, pair, l_twist, motion, matches, on))
     return found
+
+
+def _outlines(scan: ScanFeatures, undersides: Sequence[SemanticClass]) -> Mapping[SemanticClass, Boundaries]:
+    """A scan's boundary points, of some classes with those towards the ground."""
+    some = {c: scan.undersides[c] for c in undersides if c in scan.undersides}
+    return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
 def _objects_of(

@@ -1,0 +1,115 @@
+"""Edges towards the ground: matched only where image and LiDAR labels mean the same by them.
+
+They tell roll and height better than any other edge. But some labels end an object at its body, others
+at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Nothing but
+the data tells which: where the two sorts of labels agree, most undersides lie within the narrow kernel of
+the last iterations; where they do not, distances are spread as widely as a kernel can see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from factors.robust import RobustKernel
+from sst_graph.association.boundary import Edge
+from sst_graph.association.silhouettes import SIDE_OF
+from sst_graph.estimators.contest import solve_all
+from sst_graph.estimators.joint import (
+    CONCENTRATION_SCALES,
+    JointConfig,
+    JointSolution,
+    support_of,
+)
+from sst_graph.problem.drive import Drive, Progress
+from sst_graph.problem.graph import Tracks, associate
+from sst_graph.problem.state import State
+from sst_graph.types import SemanticClass
+
+_BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
+
+
+@dataclass(frozen=True)
+class UndersideConfig:
+    """When edges towards the ground are matched.
+
+    Attributes:
+        use: ``auto`` where the labels agree about them, class by class.
+        min_concentration: ... which is so where this share of what a kernel five times as wide matches
+            remains under the last one.
+        min_support: ... and so many matches remain, each counted by its robust weight.
+        kernel_px: scales of the robust kernel, outer iteration by outer iteration [px].
+    """
+
+    use: Literal["auto", "always", "never"] = "auto"
+    min_concentration: float = 0.7
+    min_support: float = 30.0
+    kernel_px: tuple[float, ...] = (5.0, 4.0, 3.0)
+
+
+@dataclass(frozen=True)
+class WithUndersides:
+    """Joint solutions after their undersides were looked at.
+
+    Attributes:
+        solutions: with them among the matches, or as they were; the one that agrees best first.
+        joint: settings that lead to it.
+        concentration: of the undersides of each class that has any.
+    """
+
+    solutions: Sequence[JointSolution]
+    joint: JointConfig
+    concentration: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+
+def with_undersides(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    finals: Sequence[tuple[JointSolution, State]],
+    joint: JointConfig,
+    config: UndersideConfig,
+    progress: Progress | None = None,
+) -> WithUndersides:
+    """Joint solutions with the edges towards the ground, of classes whose labels agree about them.
+
+    Args:
+        finals: solutions without them, the best first, and what the weak priors of each are centred on.
+
+    Raises:
+        EstimationError: too few matches at any step.
+    """
+    solutions = [solution for solution, _ in finals]
+    if config.use == "never":
+        return WithUndersides(solutions, joint)
+    concentration = underside_concentration(drives, tracks, solutions[0].state, joint, config)
+    least = config.min_concentration if config.use == "auto" else 0.0
+    chosen = tuple(c for c, share in concentration.items() if share >= least)
+    if not chosen:
+        return WithUndersides(solutions, joint, concentration)
+    joint = replace(joint, graph=replace(joint.graph, undersides=chosen))
+    last = replace(joint, kernel_px=config.kernel_px)
+    fuller = solve_all(drives, [(one.state, centre) for one, centre in finals], last, tracks, progress)
+    return WithUndersides(fuller, joint, concentration)
+
+
+def underside_concentration(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
+) -> dict[SemanticClass, float]:
+    """Support of each class's undersides under the last kernel as a share of that under a wide one.
+
+    Classes with too little support under the last kernel are left out.
+    """
+    classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
+    graph = replace(joint.graph, undersides=tuple(sorted(classes)))
+    narrow, wide = (
+        support_of(
+            associate(
+                drives, tracks, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1]), graph
+            ),
+            state,
+            _BOTTOM,
+        )
+        for scale in CONCENTRATION_SCALES
+    )
+    return {c: narrow[c] / wide[c] for c in sorted(narrow) if narrow[c] >= config.min_support}
