@@ -88,14 +88,14 @@ def test_bottom_half_way_to_the_ring_that_meets_the_ground(ground_m: float) -> N
     points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), rho * np.tan(elevation)], axis=1)
     classes = np.where(below, OTHER, scan.classes).astype(np.uint8)
     cut = replace(scan, points=points.astype(np.float32), classes=classes)
-    found = found_in(cut, BoundaryConfig(bottom_edges=True))
+    found = found_in(cut)
     bottom = found.take(np.flatnonzero(found.edges == Edge.BOTTOM))
     assert len(bottom) == np.count_nonzero(np.abs(AZIMUTHS) < np.radians(5.0))
     last = ELEVATIONS[low - 1e-9 < ELEVATIONS][0]
     between = 0.5 * (np.tan(last) + np.tan(last - np.radians(RING_DEG))) * 10.0
     np.testing.assert_allclose(bottom.lPs[:, 2], between, atol=2e-4)
     np.testing.assert_array_less(bottom.outward[:, 2], bottom.lPs[:, 2])
-    assert Edge.BOTTOM not in found_in(cut).edges
+    assert Edge.BOTTOM not in found_in(cut, BoundaryConfig(bottom_edges=False)).edges
 
 
 def test_nothing_where_the_neighbour_is_nearer_or_as_far() -> None:
