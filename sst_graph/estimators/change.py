@@ -63,6 +63,7 @@ class Change:
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
         self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
+        self.bent = smoother.bent
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
         self.sums = smoother.sums.copy()
@@ -98,7 +99,7 @@ class Change:
             self._remove.append(self.ids.pop(scan))
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
-            self.past = self.past.plus(entry.score.belief)
+            self.past, self.bent = self.past.plus(entry.score.belief), self.bent.plus(entry.score.bent)
             columns, drift = self.past.point.columns(entry.score.belief.point.tracks), self._smoother.drift
             self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
@@ -114,7 +115,8 @@ class Change:
             new.update({t: place for t, place in found.score.places.items() if t not in known})
         if not new:
             return
-        self.past = self.past.with_objects(new, self._smoother.graph.object_bias_sigma_px)
+        sigma_px = self._smoother.graph.object_bias_sigma_px
+        self.past, self.bent = (b.with_objects(new, sigma_px) for b in (self.past, self.bent))
         self.sums.grow(self.past.point.size)
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
@@ -129,6 +131,7 @@ class Change:
             self._close_objects()
         if gone:
             self.past, T = self.past.without(gone)
+            self.bent, _ = self.bent.without(gone)
             self.sums.transform(T)
 
     def _close_objects(self) -> None:
@@ -214,15 +217,15 @@ class Change:
         self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model))
         self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.transform(self.past.transition(variances))
-        self.past = self.past.drifted(variances)
+        self.past, self.bent = self.past.drifted(variances), self.bent.drifted(variances)
         self._remove += new.links or ()
         self.epochs = (replace(new, links=None), *self.epochs[2:])
 
     def _replace_past(self) -> None:
         self._remove.append(self.past_id)
-        self.past = self.past.at(self.point)
+        self.past, self.bent = self.past.at(self.point), self.bent.at(self.point)
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
-        self._add(self.past.factor(keys), "past", 0)
+        self._add(self.bent.factor(keys), "past", 0)
 
     def _add(self, factor: gtsam.NonlinearFactor, kind: str, number: int) -> None:
         self._graph.add(factor)

@@ -35,7 +35,7 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 3
+VERSION = 4
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -223,6 +223,7 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
 def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
     sums = smoother.sums
     _put_gaussian(arrays, "past", smoother.past)
+    _put_gaussian(arrays, "bent", smoother.bent)
     _put_gaussian(arrays, "prior", smoother.prior)
     _put_point(arrays, "point", smoother.point)
     arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"] = sums.JJ, sums.frames, sums.closed
@@ -261,6 +262,7 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
         sums,
         ErrorModel(*head["model"]),
         _gaussian(arrays, "prior"),
+        _gaussian(arrays, "bent"),
     )
 
 

@@ -158,7 +158,11 @@ class Tracker:
     def _take_scan(self, scan: Scan) -> int:
         """Features and motion of a scan into the window; its number."""
         check_scan(scan, self.window)
-        prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
+        calibration = self.config.calibration
+        prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
+        if not calibration.joint.graph.undersides:
+            boundary = dataclasses.replace(prepare.boundary, bottom_edges=False)
+            prepare = dataclasses.replace(prepare, boundary=boundary)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
         self.last_scan = scan
@@ -262,10 +266,11 @@ class Tracker:
         known = sorted(staleness, key=staleness.__getitem__, reverse=True)
         # What cannot wait, and as many others as there is time for: those judged anew, then the stalest.
         chosen = {number, *waiting[-4:], *(set(numbers[-2:]) & set(known))}
-        chosen |= {n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS}
+        leaving = [n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS]
         stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
-        wanted = [*sorted(self.window.judged_anew & set(known)), *known[: max(self.config.renew, stale)]]
-        return chosen | set(list(dict.fromkeys(wanted))[: self.config.renew_most])
+        some = known[: max(self.config.renew - len(leaving), stale)]
+        wanted = [*sorted(self.window.judged_anew & set(known)), *some]
+        return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[: self.config.renew_most])
 
     def _staleness(self, smoother: WindowSmoother) -> dict[int, float]:
         """How far the estimate has moved since each pair was matched, in standard deviations."""

@@ -39,6 +39,9 @@ from sst_graph.uncertainty.covariance import (
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+_LEAST_BEND = 0.2
+"""Least curvature, over the weight, with which the gradient of a pair is taken to follow."""
+
 
 @dataclass(frozen=True)
 class SideSums:
@@ -74,6 +77,8 @@ class PairScore:
 
     Attributes:
         belief: on [extrinsic, offset, biases, and the biases of the objects it sees].
+        bent: the same with the robust loss's second derivatives in place of the weights: how the gradient of
+            matches that cannot be made anew follows an estimate that moves on.
         JJ: (n, n) sum of J'J of its matches, times their common share.
         sides: by side.
         sums: (n, n) sum of squared scores by side.
@@ -84,6 +89,7 @@ class PairScore:
     """
 
     belief: Gaussian
+    bent: Gaussian
     JJ: FloatArray
     sides: SideSums
     sums: FloatArray
@@ -159,29 +165,38 @@ def score_pair(
     point = point.seen(places)
     J, JV, r, roots = _rows(pair, point, classes)
     # [unknowns, twist]: silhouettes, then the twist that odometry tells.
-    A = np.concatenate([J, JV], axis=1)
+    A, n = np.concatenate([J, JV], axis=1), point.size
     H, g = A.T @ A, -A.T @ r
-    n = point.size
-    JJ = share * H[:n, :n]
+    curvature = _curvatures(pair, r, roots)
+    weight, bend = float(roots @ roots), float(curvature.sum())
+    motion = np.zeros_like(H)
     columns = [*range(7), *range(n, n + 6)]
-    H[np.ix_(columns, columns)] += _motion_information(pair, point, config)
-    gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
-    information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
-    belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
+    motion[np.ix_(columns, columns)] = _motion_information(pair, point, config)
+    belief = _without_twist(point, H + motion, g)
+    bent = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
     return PairScore(
         belief,
-        JJ,
+        bent,
+        share * H[:n, :n],
         sides,
         sides.scores.T @ sides.scores,
         len(pair),
         places,
         ObjectBeliefs.of(J, r, track, point) if by_object else None,
-        float(roots @ roots),
-        _curvature(pair, r, roots),
+        weight,
+        bend,
     )
+
+
+def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> Gaussian:
+    """The belief on the unknowns, from information and vector over [unknowns, twist]."""
+    n = point.size
+    gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
+    information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
+    return Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
 
 
 def _tracks_of(
@@ -193,15 +208,14 @@ def _tracks_of(
     return np.array([tracks[c, int(number)] for number in pair.matches[c].objects], dtype=np.intp)
 
 
-def _curvature(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> float:
-    """Sum of the robust loss's second derivatives, each weighted as its match is beside the kernel."""
-    r = unweighted(weighted, root)
-    total, start = 0.0, 0
+def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> FloatArray:
+    """(m,) the robust loss's second derivatives, each weighted as its match is beside the kernel."""
+    r, parts, start = unweighted(weighted, root), [], 0
     for matches in pair.matches.values():
         some = slice(start, start + len(matches))
         start += len(matches)
-        total += float(curvatures_of(matches.alignment.kernel, root[some], r[some]).sum())
-    return total
+        parts.append(curvatures_of(matches.alignment.kernel, root[some], r[some]))
+    return np.concatenate(parts)
 
 
 def _rows(

@@ -56,10 +56,11 @@ class WindowSmoother:
         sums: ScoreSums | None = None,
         model: ErrorModel | None = None,
         prior: Gaussian | None = None,
+        bent: Gaussian | None = None,
     ) -> None:
-        """past: prior, or what an earlier run left behind (with its sums, error model and prior)."""
+        """past: prior, or what an earlier run left behind (with sums, error model, prior, bent past)."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.past = past
+        self.past, self.bent = past, bent or past
         self.prior = prior or past
         self.sums = sums or ScoreSums.empty(past.point.size)
         self.entries: dict[int, Entry] = {}
@@ -69,7 +70,7 @@ class WindowSmoother:
         self.ids: dict[int, int] = {}
         self.twists: dict[int, TwistFactor] = {}
         self.isam, self.past_id = self._begun()
-        self._point = past.mean()
+        self._point = self.bent.mean()
         self.epoch_sums = EpochSums.empty(past.point)
 
     @property
@@ -96,8 +97,8 @@ class WindowSmoother:
     def _begun(self) -> tuple[gtsam.ISAM2, int]:
         isam, graph, values = gtsam.ISAM2(_parameters()), gtsam.NonlinearFactorGraph(), gtsam.Values()
         keys = self.keys(self._epochs[0].number, self.past.point.tracks)
-        graph.add(self.past.factor(keys))
-        insert_point(values, keys, self.past.mean())
+        graph.add(self.bent.factor(keys))
+        insert_point(values, keys, self.bent.mean())
         result = isam.update(graph, values)
         return isam, int(result.getNewFactorsIndices()[0])
 
@@ -130,7 +131,7 @@ class WindowSmoother:
     def _take(self, change: Change) -> None:
         self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
         self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
-        self.past, self.sums = change.past, change.sums
+        self.past, self.bent, self.sums = change.past, change.bent, change.sums
         self.epoch_sums, self._point = change.epoch_sums, change.point
         self.retired += change.retired
         if self.entries or self.sums.recent:

@@ -84,7 +84,7 @@ class TrackerConfig:
     Attributes:
         calibration: classes, preparation, start, matches and limits, as for ``calibrate``.
         window: scans whose matches are renewed.
-        renew: scans of the window matched anew at each frame, besides the newest.
+        renew: scans of the window matched anew at each frame, besides the newest: first the one about to leave.
         renew_most: as many while the estimate moves.
         stale_sigmas: a match is stale where the estimate has moved farther since, in standard deviations.
         start_scans: scans before the first batch solution is tried, and between attempts.
@@ -104,8 +104,8 @@ class TrackerConfig:
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     window: int = 60
     renew: int = 1
-    renew_most: int = 6
-    stale_sigmas: float = 0.2
+    renew_most: int = 4
+    stale_sigmas: float = 0.3
     start_scans: int = 12
     restart_scans: int = 8
     start_attempts: int = 4

@@ -91,7 +91,8 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
     ones, fifty = np.ones(4), np.full(4, 50.0)
     sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
-    return PairScore(Gaussian(point, J.T @ J, -J.T @ r), J.T @ J, sides, scores.T @ scores, 200)
+    belief = Gaussian(point, J.T @ J, -J.T @ r)
+    return PairScore(belief, belief, J.T @ J, sides, scores.T @ scores, 200)
 
 
 def _model() -> ErrorModel:
