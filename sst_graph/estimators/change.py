@@ -63,7 +63,7 @@ class Change:
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
         self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
-        self.bent = smoother.bent
+        self.bent, self.undecided = smoother.bent, smoother.undecided
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
         self.sums = smoother.sums.copy()
@@ -83,7 +83,8 @@ class Change:
         self._tie_twists()
         self._close_epochs()
         self._bury()
-        if self.past is not self._smoother.past:
+        self._decide()
+        if self.past is not self._smoother.past or self.bent is not self._smoother.bent:
             self._replace_past()
         # 2. Everything at once.
         result = self.isam.update(self._graph, self._values, self._remove)
@@ -100,6 +101,8 @@ class Change:
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
             self.past, self.bent = self.past.plus(entry.score.belief), self.bent.plus(entry.score.bent)
+            if entry.other is not None:
+                self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
             columns, drift = self.past.point.columns(entry.score.belief.point.tracks), self._smoother.drift
             self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
@@ -118,6 +121,9 @@ class Change:
         sigma_px = self._smoother.graph.object_bias_sigma_px
         self.past, self.bent = (b.with_objects(new, sigma_px) for b in (self.past, self.bent))
         self.sums.grow(self.past.point.size)
+        self.undecided = self.undecided.through(
+            np.eye(self.past.point.size, len(self.bent.vector) - len(new))
+        )
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
             self._values.insert(object_bias_key(0, track), np.array([bias]))
@@ -131,8 +137,15 @@ class Change:
             self._close_objects()
         if gone:
             self.past, T = self.past.without(gone)
-            self.bent, _ = self.bent.without(gone)
+            self.bent, bent_T = self.bent.without(gone)
             self.sums.transform(T)
+            self.undecided = self.undecided.through(bent_T)
+
+    def _decide(self) -> None:
+        """Pairings of scans that have left, by the time offset that the new matches were made at."""
+        points = [found.score.belief.point for found in self._found.values()]
+        at = points[0] if points else self._smoother.point
+        self.undecided, self.bent = self.undecided.decided(self.bent, at.offset_s)
 
     def _close_objects(self) -> None:
         """Objects that are gone for good are no longer kept one by one."""
@@ -164,7 +177,7 @@ class Change:
             self._add(silhouettes_factor(pair, smoother.classes, smoother.keys(epoch), key), "pair", scan)
             if not (self.isam.valueExists(key) or self._values.exists(key)):
                 self._values.insert(key, pair.motion.c_twist)
-            self.entries[scan] = Entry(pair, new.score, epoch, new.image)
+            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other)
 
     def _tie_twists(self) -> None:
         """Odometry's word on each image's twist, by the first scan that meets the image, as in the batch."""
@@ -223,7 +236,9 @@ class Change:
 
     def _replace_past(self) -> None:
         self._remove.append(self.past_id)
+        before = self.bent.point
         self.past, self.bent = self.past.at(self.point), self.bent.at(self.point)
+        self.undecided = self.undecided.moved(before.local(self.bent.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
         self._add(self.bent.factor(keys), "past", 0)
 

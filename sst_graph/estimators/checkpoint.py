@@ -28,6 +28,7 @@ from sst_graph.estimators.settling import Milestones
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
+from sst_graph.estimators.undecided import Undecided
 from sst_graph.estimators.window import Sighting, Window
 from sst_graph.files import atomic_write_bytes
 from sst_graph.problem.drive import ScanFeatures, image_features
@@ -224,6 +225,8 @@ def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
     sums = smoother.sums
     _put_gaussian(arrays, "past", smoother.past)
     _put_gaussian(arrays, "bent", smoother.bent)
+    for name, value in vars(smoother.undecided).items():
+        arrays[f"undecided/{name}"] = value
     _put_gaussian(arrays, "prior", smoother.prior)
     _put_point(arrays, "point", smoother.point)
     arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"] = sums.JJ, sums.frames, sums.closed
@@ -253,7 +256,7 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
     sums.objects = ObjectSums(arrays["sums/objects/closed"], count, live)
     for (side, last), row in zip(arrays["sums/sides"].reshape(-1, 2), arrays["sums/live"], strict=True):
         sums.live[int(side)] = (row, int(last))
-    return WindowSmoother(
+    smoother = WindowSmoother(
         _gaussian(arrays, "past"),
         head["start_ns"],
         tracker.classes,
@@ -264,6 +267,9 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
         _gaussian(arrays, "prior"),
         _gaussian(arrays, "bent"),
     )
+    parts = {name: arrays[f"undecided/{name}"] for name in vars(smoother.undecided)}
+    smoother.undecided = Undecided(**parts)
+    return smoother
 
 
 def _put_point(arrays: Arrays, name: str, point: Point) -> None:

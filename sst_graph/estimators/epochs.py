@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.scores import PairScore, ScoreSums
+from sst_graph.estimators.undecided import Other
 from sst_graph.problem.graph import PairMatches
 from sst_graph.uncertainty.covariance import ErrorModel, composed
 
@@ -24,12 +25,14 @@ class Found:
         score: their belief and sums.
         stamp_ns: of the scan.
         image: number of the image; scans that meet the same one share its twist.
+        other: what the scan says with its other image, where the pairing is not certain and the scan leaves.
     """
 
     pair: PairMatches
     score: PairScore
     stamp_ns: int
     image: int
+    other: Other | None = None
 
 
 @dataclass(frozen=True)
@@ -41,12 +44,14 @@ class Entry:
         score: its belief and sums at the point of the matches.
         epoch: which calibration it sees.
         image: number of its image.
+        other: what the scan says with its other image.
     """
 
     pair: PairMatches
     score: PairScore
     epoch: int
     image: int
+    other: Other | None = None
 
 
 @dataclass(frozen=True)

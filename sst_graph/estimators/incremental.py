@@ -219,7 +219,8 @@ class Tracker:
         before = smoother.point
         # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
         chosen = self._to_match(number, smoother)
-        found, missing = self.matcher.match(before, chosen, share=self._share)
+        sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
+        found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
         new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         chi2, doubt = self._watch(new, before), ""
@@ -339,8 +340,7 @@ class Tracker:
         if not new:
             return
         in_use = self.adoption.adopted or self._guess_point()
-        candidate = self.matcher.cost(before, new)
-        other = candidate
+        other = candidate = self.matcher.cost(before, new)
         if in_use is not None and float(np.abs(before.core().local(in_use.core())).max()) > 0.0:
             other = self.matcher.cost(in_use, new)
         self.adoption.compare(candidate, other)

@@ -13,6 +13,7 @@ from sst_graph.estimators.epochs import Found
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.scores import PairScore, score_pair, with_share
 from sst_graph.estimators.tracker_config import TrackerConfig
+from sst_graph.estimators.undecided import REACH_SIGMAS, Other
 from sst_graph.estimators.window import Window
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import PairMatches, Tracks, associate
@@ -36,11 +37,14 @@ class WindowMatcher:
         chosen: Collection[int] | None,
         kernel: RobustKernel | None = None,
         share: float = 1.0,
+        offset_sigma_s: float = 0.0,
     ) -> tuple[dict[int, Found], set[int]]:
         """Matches of some scans (None: all) at a point, and the scans that have none.
 
         Args:
             share: factor on the weights of all matches.
+            offset_sigma_s: standard deviation of the time offset; where its image is not certain, the scan
+                that leaves a full window next is matched with the other one too [s].
         """
         pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
         if kernel is None:
@@ -53,7 +57,34 @@ class WindowMatcher:
                 score = self._score(pair, number, point, share, by_object=not self.config.drift.enabled)
                 image = self.window.images[pair.pair.image]
                 found[number] = Found(pair, score, stamps[number], image.index)
+        oldest, full = self.window.first_scan, len(self.window.scans) == self.config.window
+        if oldest in found and full and offset_sigma_s > 0.0:
+            other = self._other(point, found[oldest], oldest, kernel or self.kernel, offset_sigma_s)
+            found[oldest] = replace(found[oldest], other=other)
         return found, set(numbers) - set(found)
+
+    def _other(
+        self, point: Point, found: Found, number: int, kernel: RobustKernel, offset_sigma_s: float
+    ) -> Other | None:
+        """What a scan says with the image on its other side, if the offset may still lead there."""
+        images = {image.index: k for k, image in enumerate(self.window.images)}
+        used = images[found.image]
+        stamps = [image.stamp_ns for image in self.window.images]
+        early = stamps[used] + round(point.offset_s * 1e9) <= found.stamp_ns
+        position = used + 1 if early else used - 1
+        if not 0 <= position < len(stamps):
+            return None
+        middle_s = (found.stamp_ns - 0.5 * (stamps[used] + stamps[position])) * 1e-9
+        if abs(point.offset_s - middle_s) > REACH_SIGMAS * offset_sigma_s:
+            return None
+        part, numbers = self.window.drive(lambda k: k == number)
+        part = replace(part, images=(self.window.images[position],))
+        tracks, state = self._tracks(part, numbers), point.state(self.classes)
+        pairs = associate([part], tracks, state, kernel, self.graph)
+        if not pairs or len(pairs[0]) < self.config.min_frame_matches:
+            return None
+        score = self._score(pairs[0], number, point, 1.0, by_object=False)
+        return Other(score.bent, middle_s, early)
 
     def scores(
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: int | None = None

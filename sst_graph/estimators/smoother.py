@@ -15,6 +15,7 @@ from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredE
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse, scattered
 from sst_graph.estimators.scores import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
+from sst_graph.estimators.undecided import Undecided
 from sst_graph.problem.graph import GraphConfig
 from sst_graph.problem.state import bias_key, delay_key, object_bias_key
 from sst_graph.types import SemanticClass
@@ -61,6 +62,7 @@ class WindowSmoother:
         """past: prior, or what an earlier run left behind (with sums, error model, prior, bent past)."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
         self.past, self.bent = past, bent or past
+        self.undecided = Undecided.none(past.point.size)
         self.prior = prior or past
         self.sums = sums or ScoreSums.empty(past.point.size)
         self.entries: dict[int, Entry] = {}
@@ -132,6 +134,7 @@ class WindowSmoother:
         self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
         self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
         self.past, self.bent, self.sums = change.past, change.bent, change.sums
+        self.undecided = change.undecided
         self.epoch_sums, self._point = change.epoch_sums, change.point
         self.retired += change.retired
         if self.entries or self.sums.recent:

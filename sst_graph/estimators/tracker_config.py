@@ -84,7 +84,7 @@ class TrackerConfig:
     Attributes:
         calibration: classes, preparation, start, matches and limits, as for ``calibrate``.
         window: scans whose matches are renewed.
-        renew: scans of the window matched anew at each frame, besides the newest: first the one about to leave.
+        renew: scans of the window matched anew at each frame, besides the newest; the next to leave first.
         renew_most: as many while the estimate moves.
         stale_sigmas: a match is stale where the estimate has moved farther since, in standard deviations.
         start_scans: scans before the first batch solution is tried, and between attempts.
