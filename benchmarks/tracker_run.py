@@ -4,7 +4,7 @@
     python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
 
 A short simulated drive (no time offset) is played forth and back under rising stamps: a drive reversed in
-time is a drive. Times are CPU seconds of this process, for a busy machine must not count.
+time is a drive. Times are CPU seconds of this process on one thread, for a busy machine must not count.
 """
 
 from __future__ import annotations
@@ -62,6 +62,7 @@ def main() -> None:
     parser.add_argument("--step", choices=("none", "knock", "clock"), default="none")
     parser.add_argument("--step-at", type=int, default=0)
     args = parser.parse_args()
+    cv2.setNumThreads(1)
     drive = simulate(
         SimulationConfig(
             seed=args.seed,

@@ -25,6 +25,7 @@ from sst_graph.estimators.contest import (
 )
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
+from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
 from sst_graph.estimators.undersides import with_undersides
@@ -165,7 +166,7 @@ def answer_joint(
         covariance[:7, :7],
         _frames_used(drives, solution),
         remarks=_remarks(drives),
-        doubts=(*_doubts(solution, finals, covariance, contest, evidence, guess, config), *heard.doubts),
+        doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -239,13 +240,12 @@ def _doubts(
     solution: JointSolution,
     finals: Sequence[JointSolution],
     covariance: FloatArray,
-    contest: Contest,
     evidence: Mapping[str, float],
     guess: Guess,
     config: CalibrationConfig,
 ) -> tuple[str, ...]:
     """Why the joint estimate may be wrong altogether."""
-    doubts = [] if contest.doubt is None else [contest.doubt]
+    doubts = []
     if not solution.converged:
         doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
     for share, least, what in (
@@ -265,16 +265,13 @@ def _doubts(
             doubts.append(f"the answer lies {far:.2f} m from {what}, farther than was searched")
     best, *others = finals
     for other in others:
-        step = np.append(
-            gtsam.Pose3.Logmap(solution.state.cTl.between(other.state.cTl)),
-            other.state.offsets_s[0] - solution.state.offsets_s[0],
-        )
+        step = difference(solution.state, other.state)
         sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
         if sigmas > _FAR_SIGMAS and agreement(other) > config.start.rival_ratio * agreement(best):
             doubts.append(
                 f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "
-                "that explains the labels almost as well"
+                "that explains the labels almost as well: record more varied scenes or give a closer guess"
             )
     return tuple(doubts)
 

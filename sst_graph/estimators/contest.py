@@ -40,15 +40,14 @@ class Contest:
     """Outcome of a contest.
 
     Attributes:
-        finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first.
+        finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first, then one
+            that is nearly as good and not near it, where there is one.
         leads: the winner and those of the others, with the support of a finalist, that are far from it.
-        doubt: why the winner may be the wrong one; None where nothing speaks for another.
         score: of the search's best candidate.
     """
 
     finalists: tuple[tuple[gtsam.Pose3, float], ...]
     leads: tuple[tuple[gtsam.Pose3, float], ...]
-    doubt: str | None
     score: float
 
 
@@ -97,7 +96,7 @@ def hold_contest(
     """
     if not config.enabled:
         start = ((candidates[0].cTl, candidates[0].offset_s),)
-        return Contest(start, start, None, candidates[0].score)
+        return Contest(start, start, candidates[0].score)
     # 1. All candidates under wide kernels, on some of the points.
     few = [_thinned(drive, config.contest_scans) for drive in drives]
     field = Field.of(few, tracks, classes, _simple(joint.graph, config))
@@ -127,8 +126,11 @@ def hold_contest(
         if rank > config.finalist_ratio * ranks[0]
     ]
     leads = tuple(_far_apart(finalists)[: config.leads])
-    doubt = _doubt(_cTls(poses), ranks, config)
-    return Contest(tuple(finalists[: config.finalists]), leads, doubt, candidates[0].score)
+    rival, most = _rival(_cTls(poses), ranks, config), config.finalists
+    if rival is not None:
+        finalists.insert(1, finalists.pop(rival))
+        most += 1
+    return Contest(tuple(finalists[:most]), leads, candidates[0].score)
 
 
 def solve_all(
@@ -160,13 +162,13 @@ def rivals(
     guess_offset_s: float,
     config: StartConfig,
 ) -> list[tuple[JointSolution, State]]:
-    """The best solution and others elsewhere that agree almost as well, with what their priors centre on.
+    """The best solution and others elsewhere that agree well, too, with what their priors centre on.
 
     Args:
         solutions: the one that agrees best first.
     """
     best = solutions[0]
-    least = config.rival_ratio * agreement(best)
+    least = config.finalist_ratio * agreement(best)
     chosen = [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
     return [(solution, prior_centre(solution.state, guess_cTl, guess_offset_s)) for solution in chosen]
 
@@ -309,14 +311,9 @@ def _turn_deg(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
     return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation()))))
 
 
-def _doubt(cTls: Sequence[gtsam.Pose3], ranks: FloatArray, config: StartConfig) -> str | None:
-    """Whether another pose is nearly as good as the first one."""
-    for other, rank in zip(cTls[1:], ranks[1:], strict=True):
-        degrees = _turn_deg(cTls[0], other)
-        share = rank / max(ranks[0], 1e-9)
-        if degrees > _SAME_DEG and share > config.rival_ratio:
-            return (
-                f"a pose {degrees:.0f} deg away explains the labels almost as well (score {share:.2f} of the "
-                "best one's): record more varied scenes or give a closer guess"
-            )
+def _rival(cTls: Sequence[gtsam.Pose3], ranks: FloatArray, config: StartConfig) -> int | None:
+    """Which other pose, not near the first one, is nearly as good; None where none is."""
+    for number, (other, rank) in enumerate(zip(cTls[1:], ranks[1:], strict=True), 1):
+        if _turn_deg(cTls[0], other) > _SAME_DEG and rank > config.rival_ratio * ranks[0]:
+            return number
     return None

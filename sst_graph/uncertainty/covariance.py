@@ -298,7 +298,7 @@ def composed(covariance: FloatArray, jackknife: FloatArray | None, flatness: flo
     return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
 
 
-_MODEL_SHARE, _OBJECT_SHARE = 0.42, 0.2
+_MODEL_SHARE, _OBJECT_SHARE = 0.37, 0.18
 """Parts of the covariance under the error model, and of the jackknife over objects, in the answer's: set on
 simulated drives so that the normalised error squared is neither too large on drives with few or moving
 vehicles, where the model alone is too sure, nor too small on the others."""
