@@ -314,7 +314,7 @@ class Tracker:
         if not new or not self.config.alarm.enabled or self.smoother is None:
             return None
         kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
-        scores = self.matcher.scores(before, new, kernel)
+        scores = self.matcher.scores(before, new, kernel, self.window.restless())
         self.watched.extend(new)
         return self.alarm.check(scores, self.joint, self.smoother.model)
 
@@ -322,18 +322,19 @@ class Tracker:
         """Whether frames past the threshold mean that the calibration has changed.
 
         Not where a single object says so: its labels may err for a while. With one object in view, or one
-        that tells far more than the others, that is not decidable.
+        that tells far more than the others, that is not decidable. Objects that moved lately are not asked.
         """
-        kernel, smoother = RobustKernel("geman_mcclure", self.config.alarm.kernel_px), self.smoother
+        config, smoother, restless = self.config.alarm, self.smoother, self.window.restless()
+        kernel = RobustKernel("geman_mcclure", config.kernel_px)
         assert smoother is not None
 
-        def value(without: int | None = None) -> float:
-            scores = self.matcher.scores(before, self.watched, kernel, without)
+        def value(*without: int) -> float:
+            scores = self.matcher.scores(before, self.watched, kernel, {*without, *restless})
             return self.alarm.value(scores, self.joint, smoother.model)
 
-        config = self.config.alarm
-        least = max(config.chi2, config.others * value())
-        return all(value(track) > least for track in self.matcher.objects_of(self.watched))
+        whole, asked = value(), self.matcher.objects_of(self.watched) - restless
+        least = max(config.chi2, config.others * whole)
+        return whole > least and all(value(track) > least for track in asked)
 
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""

@@ -87,11 +87,11 @@ class WindowMatcher:
         return Other(score.bent, middle_s, early)
 
     def scores(
-        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: int | None = None
+        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
     ) -> list[PairScore]:
-        """What some scans say at a point, all their objects but the one of track ``without``."""
+        """What some scans say at a point, all their objects but those of the tracks ``without``."""
         pairs, _ = self._pairs(point, chosen, kernel)
-        if without is not None:
+        if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
         return [
             self._score(pair, number, point, 1.0, by_object=False)
@@ -103,10 +103,10 @@ class WindowMatcher:
         """Tracks of all objects of some scans."""
         return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
 
-    def _leaving_out(self, pair: PairMatches, number: int, track: int) -> PairMatches:
+    def _leaving_out(self, pair: PairMatches, number: int, out: Collection[int]) -> PairMatches:
         tracks, matches, own = self.window.tracks[number], {}, {}
         for c, m in pair.matches.items():
-            kept = np.flatnonzero([tracks[c, int(name)] != track for name in m.objects])
+            kept = np.flatnonzero([tracks[c, int(name)] not in out for name in m.objects])
             if len(kept):
                 part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index")}
                 matches[c] = replace(m, alignment=m.alignment.take(kept), **part)

@@ -151,6 +151,14 @@ class Window:
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
             self.judged_anew.add(sighting.scan)
 
+    def restless(self) -> set[int]:
+        """Tracks of the objects that were judged to move in any of their latest sightings.
+
+        While an object starts or stops, no line fits its places, and it may pass for one that stands.
+        """
+        sightings = self.sightings.items()
+        return {track for track, seen in sightings if any(self._speed(sighting) > 0.0 for sighting in seen)}
+
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, float]]:
         """Tracks of the objects of some scans, and speeds of the moving ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}

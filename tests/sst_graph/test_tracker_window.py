@@ -96,6 +96,20 @@ def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
     assert before and before <= later
 
 
+def test_an_object_that_moved_lately_is_restless() -> None:
+    """Number 3 stops at 1.2 s: it may pass for one that stands, and is restless for a while."""
+    drive = _drive(40)
+    window, restless = Window(CAMERA, 50), {}
+    for k, scan in enumerate(drive.scans):
+        window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
+        names = {track: number for (_, number), track in window.tracks[k].items()}
+        restless[k] = {names[track] for track in window.restless() if track in names}
+        assert {n for _, n in window.moving.get(k, {})} <= restless[k]
+    assert 3 not in {n for _, n in window.moving.get(20, {})} and 3 in restless[20]
+    assert 3 not in restless[39] and {1, 2} <= restless[39]
+    assert all(0 not in names for names in restless.values())
+
+
 def test_nothing_grows_with_the_drive() -> None:
     short, long = _window(_drive(70), 10), _window(_drive(140), 10)
     for window in (short, long):
