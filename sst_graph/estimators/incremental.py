@@ -391,9 +391,7 @@ class Tracker:
             status=status,
             accepted=not reason,
             reason=reason,
-            matches=0
-            if self.smoother is None
-            else sum(e.score.matches for e in self.smoother.entries.values()),
+            matches=0 if self.smoother is None else self.smoother.matches,
             chi2=chi2,
             doubt=doubt,
             adopted=offer and self.adoption.offer(point, status == "ok"),
