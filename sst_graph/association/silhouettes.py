@@ -23,6 +23,8 @@ SIDES = 4
 """An object has a left, a right, a top and a bottom side."""
 SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
 """Side by kind of edge and whether the way out of the object runs to the right."""
+BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
+"""The side towards the ground."""
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from factors.robust import RobustKernel
-from sst_graph.association.boundary import Edge
-from sst_graph.association.silhouettes import SIDE_OF
+from sst_graph.association.silhouettes import BOTTOM
 from sst_graph.estimators.contest import solve_all
 from sst_graph.estimators.joint import (
     CONCENTRATION_SCALES,
@@ -26,8 +25,6 @@ from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import Tracks, associate
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
-
-_BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 
 
 @dataclass(frozen=True)
@@ -108,7 +105,7 @@ def underside_concentration(
                 drives, tracks, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1]), graph
             ),
             state,
-            _BOTTOM,
+            BOTTOM,
         )
         for scale in CONCENTRATION_SCALES
     )

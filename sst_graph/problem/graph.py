@@ -13,10 +13,24 @@ from factors import GroupedBias, delay_prior, frame_factor, twist_transfer_facto
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries
 from sst_graph.association.pairing import Pair, pair_by_time
-from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
+from sst_graph.association.silhouettes import (
+    BOTTOM,
+    MatchConfig,
+    Motion,
+    SilhouetteMatches,
+    match_silhouettes,
+)
 from sst_graph.problem.drive import Drive, ScanFeatures
 from sst_graph.problem.objects import ObjectId, moving_objects
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
+from sst_graph.problem.state import (
+    EXTRINSIC,
+    State,
+    bias_key,
+    delay_key,
+    object_bias_key,
+    twist_key,
+    underside_track,
+)
 from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
 
@@ -35,6 +49,8 @@ class GraphConfig:
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
             of a class the same bias.
+        underside_bias_sigma_px: deviation of the mask bias that the undersides of a class share from the
+            class's, where objects have biases of their own [px].
         delay_sigma_s: prior deviation of the time offset from the guess [s].
         rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
         rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
@@ -48,6 +64,7 @@ class GraphConfig:
     max_interval_periods: float = 1.0
     bias_sigma_px: float = 3.0
     object_bias_sigma_px: float = 0.5
+    underside_bias_sigma_px: float = 2.0
     delay_sigma_s: float = 0.3
     rest_sigma_rad: float = 1.0
     rest_sigma_m: float = 0.5
@@ -176,13 +193,14 @@ def _outlines(scan: ScanFeatures, undersides: Sequence[SemanticClass]) -> Mappin
 def _objects_of(
     matches: Mapping[SemanticClass, SilhouetteMatches], scan: int, tracks: Mapping[ObjectId, int] | None
 ) -> dict[SemanticClass, NDArray[np.intp]]:
-    """Track of the object of each match, by class; empty without tracks."""
+    """Track whose mask bias each match has, by class: its object's or the undersides'; may be empty."""
     if tracks is None:
         return {}
-    return {
-        c: np.array([tracks[scan, c, int(number)] for number in m.objects], dtype=np.intp)
-        for c, m in matches.items()
-    }
+    found = {}
+    for c, m in matches.items():
+        own = np.array([tracks[scan, c, int(number)] for number in m.objects], dtype=np.intp)
+        found[c] = np.where(m.sides == BOTTOM, underside_track(c), own)
+    return found
 
 
 def _camera_motion(l_twist: TwistSample | None, cTl: gtsam.Pose3) -> Motion:
@@ -260,9 +278,12 @@ def _add_biases(
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))
     if not (tracked := tracked_objects(pairs)):
         return
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, config.object_bias_sigma_px)
     for drive, c, track in tracked:
         key = object_bias_key(drive, track)
+        sigma_px = (
+            config.underside_bias_sigma_px if track == underside_track(c) else config.object_bias_sigma_px
+        )
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_px)
         graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))
         values.insert(key, np.array([state.object_bias_px(drive, track, c)]))
 

@@ -31,6 +31,11 @@ def bias_key(drive: int, semantic_class: SemanticClass) -> int:
     return int(gtsam.symbol("B", drive * 256 + int(semantic_class)))
 
 
+def underside_track(semantic_class: SemanticClass) -> int:
+    """Stands for the undersides of a class among the tracks of its objects: they share a mask bias."""
+    return _IMAGES_PER_DRIVE - 256 + int(semantic_class)
+
+
 def object_bias_key(drive: int, track: int) -> int:
     """Key of the mask bias of one object, by its track (``Vector(1)``, px)."""
     return int(gtsam.symbol("O", drive * _IMAGES_PER_DRIVE + track))
