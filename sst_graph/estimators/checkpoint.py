@@ -7,7 +7,7 @@ import json
 import zlib
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -31,12 +31,12 @@ from sst_graph.estimators.tracker_start import Guess
 from sst_graph.estimators.undecided import Undecided
 from sst_graph.estimators.window import Sighting, Window
 from sst_graph.files import atomic_write_bytes
-from sst_graph.problem.drive import ScanFeatures, image_features
+from sst_graph.problem.drive import ScanFeatures, apart, image_features, outlines
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 4
+VERSION = 5
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -62,6 +62,7 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "watched": list(tracker.watched),
         "milestones": [tracker.milestones.first, tracker.milestones.next],
         "inflation": tracker.inflation,
+        "undersides": [int(c) for c in tracker.matcher.graph.undersides],
         "alarm": [tracker.alarm.raised, tracker.alarm.quiet],
         "window": _put_window(arrays, tracker.window),
         "smoother": None if tracker.smoother is None else _put_smoother(arrays, tracker.smoother),
@@ -119,6 +120,8 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     tracker.guess = _guess(head["guess"])
     tracker.alarmed, tracker.attempts, tracker.waited = head["alarmed"], head["attempts"], head["waited"]
     tracker.inflation = head["inflation"]
+    undersides = tuple(SemanticClass(c) for c in head["undersides"])
+    tracker.matcher.graph = replace(tracker.matcher.graph, undersides=undersides)
     first, following = head["milestones"]
     tracker.milestones = Milestones(first, following, tracker.config.window)
     tracker.watched.extend(head["watched"])
@@ -151,7 +154,7 @@ def _put_window(arrays: Arrays, window: Window) -> dict[str, Any]:
         place = f"scan/{number}"
         arrays[f"{place}/lPs"], arrays[f"{place}/classes"] = scan.lPs, scan.classes
         arrays[f"{place}/offsets_s"] = scan.offsets_s
-        for c, boundaries in scan.boundaries.items():
+        for c, boundaries in outlines(scan, scan.undersides).items():
             for name in _BOUNDARY:
                 arrays[f"{place}/{int(c)}/{name}"] = getattr(boundaries, name)
         tracks = [[int(c), number_, track] for (c, number_), track in window.tracks[number].items()]
@@ -191,12 +194,15 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
     window, camera, nothing = tracker.window, tracker.camera, np.zeros((0, 3), np.float32)
     for number, index, stamp_ns, classes, tracks in head["scans"]:
         place = f"scan/{number}"
-        boundaries = {
+        found = {
             SemanticClass(c): Boundaries(**{name: arrays[f"{place}/{c}/{name}"] for name in _BOUNDARY})
             for c in classes
         }
         lPs, labels, offsets_s = (arrays[f"{place}/{name}"] for name in ("lPs", "classes", "offsets_s"))
-        features = ScanFeatures(index, stamp_ns, boundaries, lPs, labels, offsets_s, nothing, nothing[:, 0])
+        boundaries, below = apart(found)
+        features = ScanFeatures(
+            index, stamp_ns, boundaries, lPs, labels, offsets_s, nothing, nothing[:, 0], below
+        )
         window.scans.append((number, features))
         window.tracks[number] = {(SemanticClass(c), n): track for c, n, track in tracks}
     for i, (index, stamp_ns) in enumerate(head["images"]):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import custom_factor
-from sst_graph.problem.state import State
+from sst_graph.problem.state import State, underside_track
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -25,7 +25,7 @@ class Point:
     Attributes:
         cTl: extrinsic.
         offset_s: time offset [s].
-        biases_px: (c,) mask bias of each class [px].
+        biases_px: (2 c,) mask bias of each class, then that of each class's undersides [px].
         tracks: objects with a mask bias of their own, by the number of their track.
         object_biases_px: (k,) those biases [px].
     """
@@ -35,6 +35,11 @@ class Point:
     biases_px: FloatArray
     tracks: tuple[int, ...] = ()
     object_biases_px: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def unbiased(cls, cTl: gtsam.Pose3, offset_s: float, classes: Sequence[SemanticClass]) -> Point:
+        """With mask biases of 0."""
+        return cls(cTl, offset_s, np.zeros(2 * len(classes)))
 
     @property
     def size(self) -> int:
@@ -96,8 +101,10 @@ class Point:
 
     def state(self, classes: Sequence[SemanticClass]) -> State:
         """As the state that matches are made at."""
-        biases = {(0, c): float(bias) for c, bias in zip(classes, self.biases_px, strict=True)}
-        return State(self.cTl, (self.offset_s,), biases)
+        of_class, below = np.split(self.biases_px, 2)
+        biases = {(0, c): float(bias) for c, bias in zip(classes, of_class, strict=True)}
+        shared = {(0, underside_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
+        return State(self.cTl, (self.offset_s,), biases, shared)
 
 
 @dataclass(frozen=True)

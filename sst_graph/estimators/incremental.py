@@ -93,8 +93,7 @@ class Tracker:
         """The present estimate, or the guess."""
         if self.smoother is not None:
             return self.smoother.point
-        biases = np.zeros(len(self.classes))
-        return Point(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, biases)
+        return Point.unbiased(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, self.classes)
 
     @property
     def adopted(self) -> Point | None:
@@ -160,7 +159,7 @@ class Tracker:
         check_scan(scan, self.window)
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
-        if not calibration.joint.graph.undersides:
+        if calibration.undersides.use == "never":
             boundary = dataclasses.replace(prepare.boundary, bottom_edges=False)
             prepare = dataclasses.replace(prepare, boundary=boundary)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
@@ -195,6 +194,7 @@ class Tracker:
                 self.guess = Guess(self.guess.cTl, self.guess.offset_s)
             return self._answer(stamp_ns, f"no start yet: {error}")
         calibration = config.calibration
+        self.matcher.look_below(point)
         start_ns = drive.scans[0].stamp_ns
         prior = prior_belief(point, self.guess, self.classes, calibration.joint.graph)
         smoother = WindowSmoother(prior, start_ns, self.classes, calibration.joint.graph, config.drift)
@@ -292,6 +292,7 @@ class Tracker:
         if smoother is None:
             return False
         self.window.judge_all()
+        self.matcher.look_below(smoother.point)
         alive = self.window.objects.live
         try:
             rests = settle_window(
@@ -349,7 +350,7 @@ class Tracker:
     def _guess_point(self) -> Point | None:
         if self.guess.cTl is None:
             return None
-        return Point(self.guess.cTl, self.guess.offset_s, np.zeros(len(self.classes)))
+        return Point.unbiased(self.guess.cTl, self.guess.offset_s, self.classes)
 
     def _change(self, point: Point, stamp_ns: int, chi2: float | None) -> TrackUpdate:
         """The calibration has changed: begin again from the frames since, near the last estimate."""

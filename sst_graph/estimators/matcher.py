@@ -14,8 +14,9 @@ from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.scores import PairScore, score_pair, with_share
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.undecided import REACH_SIGMAS, Other
+from sst_graph.estimators.undersides import agreed_undersides
 from sst_graph.estimators.window import Window
-from sst_graph.problem.drive import Drive
+from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.graph import PairMatches, Tracks, associate
 
 
@@ -30,6 +31,14 @@ class WindowMatcher:
         self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
         self._twists: tuple[int, Tracks] | None = None
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
+
+    def look_below(self, point: Point) -> None:
+        """Match edges towards the ground from now on, of classes whose labels agree about them."""
+        joint = self.config.calibration.joint
+        drive, numbers = self.window.drive()
+        tracks, state = self._tracks(drive, numbers), point.state(self.classes)
+        chosen, _ = agreed_undersides([drive], tracks, state, joint, self.config.calibration.undersides)
+        self.graph = replace(joint.graph, undersides=chosen)
 
     def match(
         self,
@@ -120,7 +129,8 @@ class WindowMatcher:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:
             pairs, _ = self._pairs(point, chosen, self.kernel)
-        points = {number: sum(map(len, scan.boundaries.values())) for number, scan in self.window.scans}
+        below = self.graph.undersides
+        points = {n: sum(map(len, outlines(scan, below).values())) for n, scan in self.window.scans}
         counted = [(pair, points[number]) for number, pair in pairs.items()]
         return mean_cost(counted, point, self.classes, self.kernel, self.graph)
 

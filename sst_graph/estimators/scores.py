@@ -23,7 +23,7 @@ from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import Gaussian, Point, scattered
 from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
 from sst_graph.problem.graph import GraphConfig, PairMatches
-from sst_graph.problem.state import object_bias_key
+from sst_graph.problem.state import object_bias_key, underside_track
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
@@ -100,9 +100,15 @@ class PairScore:
     curvature: float = 1.0
 
 
-def object_places(pair: PairMatches, classes: Sequence[SemanticClass]) -> dict[int, int]:
-    """Place of its class's bias for each object of a pair that has a bias of its own."""
-    return {int(track): classes.index(c) for c, tracks in pair.tracks.items() for track in np.unique(tracks)}
+def object_places(
+    pair: PairMatches, classes: Sequence[SemanticClass], tracks: Mapping[tuple[SemanticClass, int], int]
+) -> dict[int, int]:
+    """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
+    return {
+        tracks[c, int(number)]: classes.index(c)
+        for c in pair.tracks
+        for number in np.unique(pair.matches[c].objects)
+    }
 
 
 def silhouettes_factor(
@@ -161,7 +167,7 @@ def score_pair(
         share: factor that the weights of all matches carry beside their own.
         by_object: tell what each object alone says, too.
     """
-    places = object_places(pair, classes)
+    places = object_places(pair, classes, tracks)
     point = point.seen(places)
     J, JV, r, roots = _rows(pair, point, classes)
     # [unknowns, twist]: silhouettes, then the twist that odometry tells.
@@ -203,8 +209,6 @@ def _tracks_of(
     pair: PairMatches, c: SemanticClass, tracks: Mapping[tuple[SemanticClass, int], int]
 ) -> IntArray:
     """(m,) track of the object of each match of a class."""
-    if c in pair.tracks:
-        return pair.tracks[c]
     return np.array([tracks[c, int(number)] for number in pair.matches[c].objects], dtype=np.intp)
 
 
@@ -229,8 +233,10 @@ def _rows(
         columns = np.full(len(alignment), 7 + place)
         if objects is not None:
             names, groups = np.unique(objects, return_inverse=True)
-            own = np.array([point.tracks.index(int(track)) for track in names])[groups.reshape(-1)]
-            biases, columns = point.object_biases_px[own], point.core_size + own
+            below = 7 + len(classes) + place
+            own = [below if t == underside_track(c) else point.columns([int(t)])[-1] for t in names]
+            columns = np.array(own)[groups.reshape(-1)]
+            biases = np.concatenate([point.biases_px, point.object_biases_px])[columns - 7]
         r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, biases)
         block = np.zeros((len(r), point.size))
         block[:, :7] = J[:, :7]

@@ -17,7 +17,7 @@ from sst_graph.estimators.scores import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
 from sst_graph.problem.graph import GraphConfig
-from sst_graph.problem.state import bias_key, delay_key, object_bias_key
+from sst_graph.problem.state import bias_key, delay_key, object_bias_key, underside_track
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel, composed
 
@@ -93,6 +93,7 @@ class WindowSmoother:
     def keys(self, epoch: int, tracks: Sequence[int] = ()) -> list[int]:
         """Keys of [E, D, biases..., biases of some objects...] of an epoch."""
         biases = [bias_key(0, c) for c in self.classes]
+        biases += [object_bias_key(0, underside_track(c)) for c in self.classes]
         objects = [object_bias_key(0, track) for track in tracks]
         return [int(gtsam.symbol("E", epoch)), delay_key(epoch), *biases, *objects]
 
@@ -182,7 +183,7 @@ class WindowSmoother:
         """(m,) variances of the random walk of [extrinsic, offset, biases] over some seconds."""
         drift = self.drift
         rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.offset_s]
-        return np.asarray(seconds * np.square([*rates, *[0.0] * len(self.classes)]))
+        return np.asarray(seconds * np.square([*rates, *[0.0] * len(self.prior.point.biases_px)]))
 
     def _information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent."""

@@ -40,7 +40,7 @@ def tracker_result(
             "scans": tracker.window.next_scan,
             "matches": last.matches,
             "mask_bias_px": dict(
-                zip([c.name.lower() for c in tracker.classes], tracker.point.biases_px.tolist(), strict=True)
+                zip([c.name.lower() for c in tracker.classes], tracker.point.biases_px.tolist(), strict=False)
             ),
             "error_model": None
             if model is None

@@ -113,7 +113,7 @@ def _solution(drive: Drive, candidate: Candidate, config: TrackerConfig) -> _Sol
     state = solution.state
     _check_pairs(drive, candidate.offset_s, len(solution.pairs), state.offset_s(0), config)
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    point = Point(state.cTl, state.offset_s(0), np.array(biases))
+    point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
     return _Solved(_cost(drive, point, config), point)
 
 
@@ -145,8 +145,14 @@ def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, conf
 def prior_belief(
     point: Point, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
 ) -> Gaussian:
-    """The batch's own weak priors around the guess, linearized at a point: biases around 0."""
+    """The batch's own weak priors around the guess, linearized at a point.
+
+    A class's mask bias is around 0, that of its undersides around the class's.
+    """
     sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
-    information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * len(classes)]))
-    centre = Point(guess.cTl or point.cTl, guess.offset_s, np.zeros(len(classes)))
+    k = len(classes)
+    information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * k, *[np.inf] * k]))
+    tie = config.underside_bias_sigma_px**-2.0 * np.eye(k)
+    information[7:, 7:] += np.block([[tie, -tie], [-tie, tie]])
+    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes)
     return Gaussian(point, information, information @ point.local(centre))

@@ -77,17 +77,24 @@ def with_undersides(
         EstimationError: too few matches at any step.
     """
     solutions = [solution for solution, _ in finals]
-    if config.use == "never":
-        return WithUndersides(solutions, joint)
-    concentration = underside_concentration(drives, tracks, solutions[0].state, joint, config)
-    least = config.min_concentration if config.use == "auto" else 0.0
-    chosen = tuple(c for c, share in concentration.items() if share >= least)
+    chosen, concentration = agreed_undersides(drives, tracks, solutions[0].state, joint, config)
     if not chosen:
         return WithUndersides(solutions, joint, concentration)
     joint = replace(joint, graph=replace(joint.graph, undersides=chosen))
     last = replace(joint, kernel_px=config.kernel_px)
     fuller = solve_all(drives, [(one.state, centre) for one, centre in finals], last, tracks, progress)
     return WithUndersides(fuller, joint, concentration)
+
+
+def agreed_undersides(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
+) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
+    """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
+    if config.use == "never":
+        return (), {}
+    concentration = underside_concentration(drives, tracks, state, joint, config)
+    least = config.min_concentration if config.use == "auto" else 0.0
+    return tuple(c for c, share in concentration.items() if share >= least), concentration
 
 
 def underside_concentration(

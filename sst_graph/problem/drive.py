@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -164,7 +164,7 @@ def scan_features(
     if config.use_visual_odometry:
         near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
         depth = near[:: max(1, len(scan.points) // 30_000)]
-    boundaries, undersides = _apart(find_boundaries(scan, classes, config.boundary))
+    boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary))
     return ScanFeatures(
         index,
         scan.stamp_ns,
@@ -178,7 +178,7 @@ def scan_features(
     )
 
 
-def _apart(
+def apart(
     found: dict[SemanticClass, Boundaries],
 ) -> tuple[dict[SemanticClass, Boundaries], dict[SemanticClass, Boundaries]]:
     """Boundary points, and apart from them those towards the ground."""
@@ -192,6 +192,12 @@ def _apart(
         {c: points for c, points in boundaries.items() if len(points)},
         {c: points for c, points in undersides.items() if len(points)},
     )
+
+
+def outlines(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
+    """A scan's boundary points, of some classes with those towards the ground."""
+    some = {c: scan.undersides[c] for c in undersides if c in scan.undersides}
+    return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
 def _sample(scan: Scan, most: int) -> NDArray[np.intp]:

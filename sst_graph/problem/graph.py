@@ -20,7 +20,7 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
-from sst_graph.problem.drive import Drive, ScanFeatures
+from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.objects import ObjectId, moving_objects
 from sst_graph.problem.state import (
     EXTRINSIC,
@@ -162,7 +162,7 @@ def associate(
                 tracks.standing(
                     number,
                     pair.scan,
-                    _outlines(drive.scans[pair.scan], config.undersides),
+                    outlines(drive.scans[pair.scan], config.undersides),
                     config.mover_reach_m,
                     offset_s + pair.base_tau_s,
                 ),
@@ -182,12 +182,6 @@ def associate(
                 )
                 found.append(PairMatches(number, pair, l_twist, motion, matches, on))
     return found
-
-
-def _outlines(scan: ScanFeatures, undersides: Sequence[SemanticClass]) -> Mapping[SemanticClass, Boundaries]:
-    """A scan's boundary points, of some classes with those towards the ground."""
-    some = {c: scan.undersides[c] for c in undersides if c in scan.undersides}
-    return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
 def _objects_of(

@@ -11,9 +11,12 @@ import pytest
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators.joint import solve_joint
+from sst_graph.estimators.undersides import with_undersides
 from sst_graph.problem.drive import prepare_drive
+from sst_graph.problem.graph import Tracks
 from sst_graph.problem.objects import moving_objects, object_tracks
-from sst_graph.problem.state import State
+from sst_graph.problem.state import State, underside_track
+from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import robust_covariance
 
 
@@ -35,11 +38,11 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
         )
     )
     default = TrackerConfig(start_scans=10)
-    start = dataclasses.replace(default.calibration.start, enabled=False)
+    search = dataclasses.replace(default.calibration.start, enabled=False)
     joint = default.calibration.joint
     graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
     joint = dataclasses.replace(joint, graph=graph)
-    calibration = dataclasses.replace(default.calibration, start=start, joint=joint)
+    calibration = dataclasses.replace(default.calibration, start=search, joint=joint)
     config = dataclasses.replace(default, calibration=calibration)
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
     for frame in street:
@@ -49,7 +52,12 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     # The batch from the same start, run until it rests.
     drive = prepare_drive(street, calibration.classes, calibration.prepare)
     joint = dataclasses.replace(calibration.joint, step_sigmas=0.02, max_outer=80)
-    solution = solve_joint([drive], State(street.truth.cTl, (0.04,)), joint)
+    start = State(street.truth.cTl, (0.04,))
+    plain = solve_joint([drive], start, joint)
+    twists = Tracks([drive], [object_tracks(drive)] if by_object else None)
+    below = with_undersides([drive], twists, [(plain, start)], joint, calibration.undersides)
+    assert tracker.matcher.graph.undersides == below.joint.graph.undersides == calibration.classes
+    solution = below.solutions[0]
     state = solution.state
     turn = gtsam.Pose3.Logmap(tracker.point.cTl.between(state.cTl))
     step = np.append(turn, state.offset_s(0) - tracker.point.offset_s)
@@ -65,7 +73,9 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     assert found == tracks
     assert moving and found_moving == pytest.approx(moving)
     ours = dict(zip(tracker.point.tracks, tracker.point.object_biases_px, strict=True))
-    theirs = {track: bias for (_, track), bias in state.object_biases_px.items()}
+    shared = underside_track(SemanticClass.VEHICLE)
+    assert tracker.point.biases_px[1] == pytest.approx(state.object_biases_px[0, shared], abs=0.2)
+    theirs = {track: bias for (_, track), bias in state.object_biases_px.items() if track != shared}
     assert len(theirs) > 5 and {track: ours[track] for track in theirs} == pytest.approx(theirs, abs=0.2)
     expected, *_ = robust_covariance(solution.graph, solution.values, solution.pairs, state, [tracks])
     ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
