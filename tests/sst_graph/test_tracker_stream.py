@@ -221,6 +221,11 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
     assert resumed.point.offset_s == kept.point.offset_s
     np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)
+    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.undersides
+    for (_, a), (_, b) in zip(resumed.window.scans, kept.window.scans, strict=True):
+        assert {c: len(points) for c, points in a.undersides.items()} == {
+            c: len(points) for c, points in b.undersides.items()
+        }
     for frame in frames[20:]:
         kept.add(frame)
         resumed.add(frame)
