@@ -42,7 +42,6 @@ class TwistTrack:
         self._epoch = motions[0].from_ns
         middles = [0.5 * (m.from_ns - self._epoch + m.to_ns - self._epoch) * 1e-9 for m in motions]
         self._middles = np.array(middles)
-        self._lengths = np.array([m.seconds for m in motions])
         self._twists = np.stack([m.mean_twist for m in motions])
         self._covariances = np.stack([m.covariance / m.seconds**2 for m in motions])
 
