@@ -23,7 +23,7 @@ from sst_graph.estimators.epochs import RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.object_sums import ObjectSums
-from sst_graph.estimators.scores import ScoreSums
+from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.settling import Milestones
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig

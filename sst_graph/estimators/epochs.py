@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.estimators.gaussian import Gaussian, Point
-from sst_graph.estimators.scores import PairScore, ScoreSums
+from sst_graph.estimators.score_sums import ScoreSums
+from sst_graph.estimators.scores import PairScore
 from sst_graph.estimators.undecided import Other
 from sst_graph.problem.graph import PairMatches
 from sst_graph.uncertainty.covariance import ErrorModel, composed

@@ -13,7 +13,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse, scattered
-from sst_graph.estimators.scores import ScoreSums
+from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
 from sst_graph.problem.graph import GraphConfig

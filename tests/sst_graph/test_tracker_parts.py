@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm, chi_square
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
-from sst_graph.estimators.scores import PairScore, ScoreSums, SideSums, fit_sides
+from sst_graph.estimators.score_sums import ScoreSums, fit_sides
+from sst_graph.estimators.scores import PairScore, SideSums
 from sst_graph.estimators.tracker_config import AdoptionConfig, AlarmConfig, TrackerConfig
 from sst_graph.uncertainty.covariance import ErrorModel
 

@@ -1,0 +1,144 @@
+"""The cluster-robust covariance, frame by frame: sums that stay small however long the drive.
+
+The batch's model (:mod:`sst_graph.uncertainty.covariance`) needs, of all matches, the sum of J'J, the
+sums of the scores over each side of an object within a frame, and over each side in all frames. A frame
+that leaves the window adds to these and is forgotten; sides that were not seen lately are closed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.estimators.gaussian import scattered
+from sst_graph.estimators.object_sums import ObjectSums
+from sst_graph.estimators.scores import PairScore, summed_rows
+from sst_graph.uncertainty.covariance import (
+    ErrorModel,
+    effective_views,
+    flatness_of,
+    spread_beyond,
+    with_floors,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass
+class ScoreSums:
+    """The sums over all frames that have left the window, in the columns of the belief that took them in.
+
+    Attributes:
+        JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side.
+        live: running score of each side seen lately, and the scan that saw it last.
+        recent: (k, 6) [side, mean, weights, weights2, within, moved] of the latest sides.
+        objects: what each object says.
+        weight, curvature: sums over all matches, see :class:`PairScore`.
+    """
+
+    JJ: FloatArray
+    frames: FloatArray
+    closed: FloatArray
+    live: dict[int, tuple[FloatArray, int]] = field(default_factory=dict)
+    recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=150))
+    objects: ObjectSums = field(default_factory=lambda: ObjectSums(np.zeros((0, 0))))
+    weight: float = 0.0
+    curvature: float = 0.0
+
+    @classmethod
+    def empty(cls, n: int) -> ScoreSums:
+        nothing = np.zeros((n, n))
+        return cls(nothing, nothing, nothing, objects=ObjectSums(nothing))
+
+    def add(
+        self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
+    ) -> None:
+        """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed.
+
+        Args:
+            columns: where the pair's unknowns stand among those of the sums.
+            by_object: keep what each object says, too.
+        """
+        self.JJ, self.frames = self.JJ.copy(), self.frames.copy()
+        self.JJ[np.ix_(columns, columns)] += score.JJ
+        self.frames[np.ix_(columns, columns)] += score.sums
+        rows = np.zeros((len(score.sides.sides), len(self.JJ)))
+        rows[:, columns] = score.sides.scores
+        for side, row in zip(score.sides.sides.tolist(), rows, strict=True):
+            before = self.live.get(side)
+            self.live[side] = (row if before is None else before[0] + row, scan)
+        for side in [side for side, (_, last) in self.live.items() if last < scan - memory]:
+            row, _ = self.live.pop(side)
+            self.closed = self.closed + np.outer(row, row)
+        self.recent.append(score.sides.rows)
+        if by_object and score.objects is not None:
+            self.objects.add(score.objects)
+        self.weight, self.curvature = self.weight + score.weight, self.curvature + score.curvature
+
+    def flatness(self, window: Sequence[PairScore] = ()) -> float:
+        """Mean robust weight over mean curvature, of all matches."""
+        curvature = self.curvature + sum(score.curvature for score in window)
+        weight = self.weight + sum(score.weight for score in window)
+        return flatness_of(weight, curvature)
+
+    def grow(self, n: int) -> None:
+        """Make room for further unknowns, n in all."""
+        self.transform(np.eye(n, len(self.JJ)))
+
+    def transform(self, T: FloatArray) -> None:
+        """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
+        self.JJ, self.frames, self.closed = (T @ M @ T.T for M in (self.JJ, self.frames, self.closed))
+        self.objects.transform(T)
+        self.live = {side: (T @ row, last) for side, (row, last) in self.live.items()}
+
+    def copy(self) -> ScoreSums:
+        recent = deque(self.recent, self.recent.maxlen)
+        return replace(self, live=dict(self.live), recent=recent, objects=self.objects.copy())
+
+    def error_model(self, window: Iterable[PairScore]) -> ErrorModel:
+        """Variances of the error model from the latest frames."""
+        rows = [*self.recent, *(score.sides.rows for score in window)]
+        return fit_sides(np.concatenate(rows))
+
+    def surplus(
+        self, window: Sequence[PairScore], columns: Sequence[IntArray], model: ErrorModel
+    ) -> FloatArray:
+        """(n, n) variance of the score beyond that of independent matches.
+
+        Args:
+            window: pairs beside those taken in.
+            columns: where their unknowns stand.
+        """
+        n = len(self.JJ)
+        JJ, frames = scattered(n, columns, [score.JJ for score in window], [score.sums for score in window])
+        total = (model.match - 1.0) * (self.JJ + JJ) + model.side_frame * (self.frames + frames)
+        sides = [np.array(list(self.live), dtype=np.intp), *(score.sides.sides for score in window)]
+        rows = np.zeros((sum(len(part) for part in sides), n))
+        for i, (row, _) in enumerate(self.live.values()):
+            rows[i] = row
+        start = len(self.live)
+        for score, own in zip(window, columns, strict=True):
+            rows[start : start + len(score.sides.sides), own] = score.sides.scores
+            start += len(score.sides.sides)
+        by_side = summed_rows(rows, np.concatenate(sides))
+        return np.asarray(total + model.side * (self.closed + by_side.T @ by_side))
+
+
+def fit_sides(rows: FloatArray) -> ErrorModel:
+    """The batch's error model from the rows of sides, (k, 6) as in :class:`ScoreSums`."""
+    sides = np.unique(rows[:, 0], return_inverse=True)[1].reshape(-1)
+    means, weights, weights2, within, moved = rows[:, 1:].T
+    freedom = float((weights - weights2 / np.maximum(weights, 1e-12)).sum())
+    match = max(0.05, float(within.sum()) / max(freedom, 1e-9))
+    count = weights**2 / np.maximum(weights2, 1e-12)
+    side_frame = spread_beyond(means, match / count, sides)
+    v = 1.0 / (match / count + side_frame)
+    total = np.bincount(sides, v)
+    side_means = np.bincount(sides, v * means) / np.maximum(total, 1e-12)
+    side = spread_beyond(side_means, 1.0 / total, np.zeros(len(total), dtype=np.intp), centre=0.0)
+    return with_floors(side, side_frame, match, effective_views(sides, weights, moved > 0.5))
