@@ -11,7 +11,7 @@ from factors import alignment_cost
 from factors.robust import RobustKernel
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_config import AdoptionConfig
-from sst_graph.problem.drive import Drive, outlines
+from sst_graph.problem.drive import Drive, outline_size
 from sst_graph.problem.graph import GraphConfig, PairMatches, Tracks, associate
 from sst_graph.types import SemanticClass
 
@@ -57,8 +57,8 @@ def held_out_cost(
     A point that finds no contour costs as much as the farthest match.
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
-    points = [sum(map(len, outlines(scan, config.undersides).values())) for scan in drive.scans]
-    return mean_cost([(pair, points[pair.pair.scan]) for pair in pairs], point, classes, kernel, config)
+    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.undersides)) for pair in pairs]
+    return mean_cost(counted, point, classes, kernel, config)
 
 
 def mean_cost(

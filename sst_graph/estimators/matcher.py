@@ -16,7 +16,7 @@ from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.undecided import REACH_SIGMAS, Other
 from sst_graph.estimators.undersides import agreed_undersides
 from sst_graph.estimators.window import Window
-from sst_graph.problem.drive import Drive, outlines
+from sst_graph.problem.drive import Drive, outline_size
 from sst_graph.problem.graph import PairMatches, Tracks, associate
 
 
@@ -129,9 +129,8 @@ class WindowMatcher:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:
             pairs, _ = self._pairs(point, chosen, self.kernel)
-        below = self.graph.undersides
-        points = {n: sum(map(len, outlines(scan, below).values())) for n, scan in self.window.scans}
-        counted = [(pair, points[number]) for number, pair in pairs.items()]
+        scans, below = dict(self.window.scans), self.graph.undersides
+        counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
         return mean_cost(counted, point, self.classes, self.kernel, self.graph)
 
     def _pairs(

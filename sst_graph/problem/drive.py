@@ -200,6 +200,12 @@ def outlines(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> dict[
     return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
+def outline_size(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> int:
+    """Number of the points of :func:`outlines`."""
+    below = sum(len(points) for c, points in scan.undersides.items() if c in undersides)
+    return below + sum(map(len, scan.boundaries.values()))
+
+
 def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
     """Evenly spread indices of at most ``most`` points of every known class, 2 to 60 m away."""
     distance = np.linalg.norm(scan.points, axis=1)
