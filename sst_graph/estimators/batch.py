@@ -248,8 +248,11 @@ def _doubts(
     doubts = []
     if not solution.converged:
         doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+    limit = np.radians(config.observability.rotation_deg)
+    vague = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > limit**2
+    least_explained = max(config.start.min_explained, config.start.min_explained_vague if vague else 0.0)
     for share, least, what in (
-        (evidence["explained"], config.start.min_explained, "of the boundary points in view meet a contour"),
+        (evidence["explained"], least_explained, "of the boundary points in view meet a contour"),
         (evidence["concentration"], config.start.min_concentration, "of the matches are close ones"),
     ):
         if config.start.enabled and share < least:

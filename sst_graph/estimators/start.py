@@ -49,6 +49,8 @@ class StartConfig:
         rival_ratio: a different solution whose agreement with the labels is at least this fraction of the
             best one's makes the answer ambiguous.
         min_explained: least share of the boundary points in view that must meet a contour ...
+        min_explained_vague: ... where the rotation is not observable: with so little in view, a pose that
+            leaves more of it unexplained may be a wrong one ...
         min_concentration: ... and of the matches that must be close
             (:func:`~sst_graph.estimators.joint.concentration`); an answer with less may be wrong altogether.
         min_class_points: fewest points of the searched classes that make a frame worth looking at.
@@ -72,6 +74,7 @@ class StartConfig:
     min_object_share: float = 0.3
     rival_ratio: float = 0.9
     min_explained: float = 0.2
+    min_explained_vague: float = 0.45
     min_concentration: float = 0.6
     min_class_points: int = 30
 

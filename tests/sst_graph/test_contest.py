@@ -144,6 +144,21 @@ def test_an_answer_with_little_behind_it_is_doubted(changes: dict[str, float], r
     assert 0.0 < result.diagnostics["explained"] < 1.0 and 0.0 < result.diagnostics["concentration"] < 1.0
 
 
+def test_more_must_be_explained_where_the_rotation_is_not_observable() -> None:
+    config = CalibrationConfig(start=replace(START, min_explained_vague=0.99))
+    clear, doubted = (
+        calibrate_prepared(
+            [prepared_street()],
+            turned(2.0, -1.0, 2.0),
+            replace(config, observability=replace(config.observability, rotation_deg=limit)),
+        )
+        for limit in (90.0, 1e-3)
+    )
+    reason = "boundary points in view meet a contour"
+    assert not any(reason in sentence for sentence in clear.reasons)
+    assert doubted.status == "not_converged" and any(reason in sentence for sentence in doubted.reasons)
+
+
 def test_leads_are_far_apart_and_the_winner_comes_first() -> None:
     starts = [(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0)]
     assert [round(off_deg(cTl)) for cTl, _ in _far_apart(starts)] == [0, 60, 120]
