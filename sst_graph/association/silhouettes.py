@@ -131,7 +131,7 @@ def match_silhouettes(
             weights=_shared_weights(
                 points.objects[index] * SIDES + sides,
                 sigmas,
-                np.where(points.edges[index] == Edge.BOTTOM, config.underside_sigma_px, config.side_sigma_px),
+                np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px),
             ),
         )
         found[c] = SilhouetteMatches(

@@ -28,7 +28,7 @@ from sst_graph.estimators.joint import JointSolution, agreement, concentration, 
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
-from sst_graph.estimators.undersides import with_undersides
+from sst_graph.estimators.undersides import with_undersides, without_undersides
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -90,6 +90,8 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
         prepare = dataclasses.replace(prepare, use_visual_odometry=False)
+    if config.method != "joint" or config.undersides.use == "never":
+        prepare = without_undersides(prepare)
     return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
 
 

@@ -158,10 +158,8 @@ class Change:
         kept |= {track for track in self.sums.objects.live if track in self._alive}
         if all(track in kept for track in self.sums.objects.live):
             return
-        information = self.past.information.copy()
-        for entry in self.entries.values():
-            columns = self.past.point.columns(entry.score.belief.point.tracks)
-            information[np.ix_(columns, columns)] += entry.score.belief.information
+        seen = [entry.score.belief for entry in self.entries.values()]
+        information = self.past.information_with(seen)
         point = self.past.at(self.point).point
         self.sums.objects.close(kept, information, scaled_inverse(information), point)
 

@@ -135,6 +135,11 @@ class Gaussian:
         vector[columns] += other.vector
         return Gaussian(self.point, information, vector)
 
+    def information_with(self, others: Sequence[Gaussian]) -> FloatArray:
+        """(n, n) information of this belief and others, whose objects are all known here."""
+        columns = [self.point.columns(other.point.tracks) for other in others]
+        return self.information + scattered(self.point.size, columns, [o.information for o in others])[0]
+
     def with_objects(self, places: Mapping[int, int], sigma_px: float) -> Gaussian:
         """The belief with biases of further objects, each within ``sigma_px`` of its class's.
 

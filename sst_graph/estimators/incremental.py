@@ -26,6 +26,7 @@ from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
+from sst_graph.estimators.undersides import without_undersides
 from sst_graph.estimators.window import Window
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
@@ -160,8 +161,7 @@ class Tracker:
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
         if calibration.undersides.use == "never":
-            boundary = dataclasses.replace(prepare.boundary, bottom_edges=False)
-            prepare = dataclasses.replace(prepare, boundary=boundary)
+            prepare = without_undersides(prepare)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
         self.last_scan = scan

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse, scattered
+from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
@@ -187,15 +187,14 @@ class WindowSmoother:
 
     def _information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent."""
-        information, point = self.past.information.copy(), self.past.point
+        belief = self.past
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 walk = self.walk(self._seconds(i))
-                information = replace(self.past, information=information).drifted(walk).information
+                belief = belief.drifted(walk)
             seen = [e.score.belief for e in self.entries.values() if e.epoch == epoch.number]
-            columns = [point.columns(belief.point.tracks) for belief in seen]
-            information += scattered(point.size, columns, [belief.information for belief in seen])[0]
-        return information
+            belief = replace(belief, information=belief.information_with(seen))
+        return belief.information
 
     def _seconds(self, i: int) -> float:
         """From the start of epoch i - 1 to that of epoch i [s]."""

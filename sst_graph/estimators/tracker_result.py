@@ -39,9 +39,10 @@ def tracker_result(
         diagnostics={
             "scans": tracker.window.next_scan,
             "matches": last.matches,
-            "mask_bias_px": dict(
-                zip([c.name.lower() for c in tracker.classes], tracker.point.biases_px.tolist(), strict=False)
-            ),
+            "mask_bias_px": {
+                c.name.lower(): bias
+                for (_, c), bias in tracker.point.state(tracker.classes).biases_px.items()
+            },
             "error_model": None
             if model is None
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},

@@ -21,7 +21,7 @@ from sst_graph.estimators.joint import (
     JointSolution,
     support_of,
 )
-from sst_graph.problem.drive import Drive, Progress
+from sst_graph.problem.drive import Drive, PrepareConfig, Progress
 from sst_graph.problem.graph import Tracks, associate
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
@@ -43,6 +43,11 @@ class UndersideConfig:
     min_concentration: float = 0.7
     min_support: float = 30.0
     kernel_px: tuple[float, ...] = (5.0, 4.0, 3.0)
+
+
+def without_undersides(prepare: PrepareConfig) -> PrepareConfig:
+    """Settings for those who never match edges towards the ground: they are not looked for."""
+    return replace(prepare, boundary=replace(prepare.boundary, bottom_edges=False))
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from factors.alignment import Alignment
 from factors.camera import PinholeCamera
 from factors.robust import RobustKernel
+from sst_graph.association.boundary import BoundaryConfig
 from sst_graph.association.silhouettes import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import (
@@ -26,6 +27,7 @@ from sst_graph.types import CameraImage, Scan, SemanticClass
 FloatArray = NDArray[np.float64]
 
 VEHICLES = (SemanticClass.VEHICLE,)
+_PREPARE = PrepareConfig(boundary=BoundaryConfig(bottom_edges=False))
 SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
 """In somebody else's graph nobody corrects the information afterwards: a side of an object counts once."""
 SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
@@ -94,7 +96,7 @@ def align_frame(
     """
     if (lTs is None) != (from_ns is None):
         raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
-    points = scan_features(0, scan, classes, PrepareConfig()) if isinstance(scan, Scan) else scan
+    points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
     found = match_silhouettes(
         {c: boundaries for c, boundaries in points.boundaries.items() if c in classes},
