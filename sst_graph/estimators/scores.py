@@ -65,12 +65,12 @@ class PairScore:
         belief: on [extrinsic, offset, biases, and the biases of the objects it sees].
         bent: the same with the robust loss's second derivatives in place of the weights: how the gradient of
             matches that cannot be made anew follows an estimate that moves on.
-        JJ: (n, n) sum of J'J of its matches, times their common share.
+        JJ: (n, n) sum of J'J of its matches, motion marginalised out, times their common share.
         sides: by side.
         sums: (n, n) sum of squared scores by side.
         matches: number of matches.
         places: place of its class's bias for each object with a bias, by its track.
-        objects: the matches of each object alone, the twist given.
+        objects: the matches of each object alone.
         weight, curvature: sums of the matches' weights, and of the robust loss's second derivatives.
     """
 
@@ -164,15 +164,16 @@ def score_pair(
     motion = np.zeros_like(H)
     columns = [*range(7), *range(n, n + 6)]
     motion[np.ix_(columns, columns)] = _motion_information(pair, point, config)
-    belief = _without_twist(point, H + motion, g)
-    bent = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
+    belief, gain = _without_twist(point, H + motion, g)
+    bent, _ = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
+    J = J - JV @ gain  # as the answer follows a residual, the twist following the answer
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
     return PairScore(
         belief,
         bent,
-        share * H[:n, :n],
+        share * (J.T @ J),
         sides,
         sides.scores.T @ sides.scores,
         len(pair),
@@ -183,12 +184,14 @@ def score_pair(
     )
 
 
-def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> Gaussian:
-    """The belief on the unknowns, from information and vector over [unknowns, twist]."""
+def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian, FloatArray]:
+    """The belief on the unknowns, from information and vector over [unknowns, twist]; (6, n) what an unknown
+    takes off the twist."""
     n = point.size
     gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
-    return Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
+    belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
+    return belief, gain[:, :n]
 
 
 def _tracks_of(

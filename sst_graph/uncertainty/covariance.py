@@ -20,7 +20,7 @@ too (a jackknife over objects), and the covariance takes a part of both.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 from factors.alignment import weighted_residuals
 from factors.robust import RobustKernel
 from sst_graph.association.silhouettes import SIDES
-from sst_graph.problem.graph import PairMatches, bias_groups, tracked_objects
+from sst_graph.problem.graph import PairMatches, bias_groups, state_from, tracked_objects
 from sst_graph.problem.objects import ObjectId
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key
+from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -53,7 +53,8 @@ class MatchTable:
     """All weighted matches over the unknowns [extrinsic 6, offsets, biases].
 
     Attributes:
-        J: (m, n) rows multiplied by sqrt(robust weight) / sigma.
+        J: (m, n) rows multiplied by sqrt(robust weight) / sigma, motion marginalised out: the bread times a
+            row is how the answer follows the residual.
         root_weights: (m,) sqrt(robust weight).
         curvatures: (m,) second derivative of the robust loss (its slope over the residual is the weight).
         r: (m,) whitened residuals, unweighted.
@@ -102,17 +103,26 @@ class Unknowns:
 
 
 def match_table(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
     pairs: Sequence[PairMatches],
     state: State,
     tracks: Sequence[dict[ObjectId, int]],
     unknowns: Unknowns,
 ) -> MatchTable:
-    """All matches of the frozen graph at a state, with the clusters they belong to."""
+    """All matches of the frozen graph at its optimum, with the clusters they belong to.
+
+    Args:
+        state: that the matches were made at.
+        tracks: of each drive's objects.
+    """
+    motion = _Motion(values, _twist_responses(graph, values, unknowns))
+    state = state_from(values, state, pairs)
     blocks, weights, residuals, curvatures = [], [], [], []
     sides, frames, objects, moving = [], [], [], []
     for number, pair in enumerate(pairs):
         for c, matches in pair.matches.items():
-            block, root, r = _rows(pair, c, state, unknowns)
+            block, root, r = _rows(pair, c, state, unknowns, motion)
             blocks.append(block)
             weights.append(root)
             residuals.append(r)
@@ -137,10 +147,20 @@ def match_table(
     )
 
 
+@dataclass(frozen=True)
+class _Motion:
+    """The twists at the optimum, and how each follows the other unknowns (6, n), by the twist's key."""
+
+    values: gtsam.Values
+    responses: Mapping[int, FloatArray]
+
+
 def _rows(
-    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns
+    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Motion
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted Jacobian rows, roots of the weights, and whitened residuals of one class in one pair."""
+    V_key = twist_key(pair.drive, pair.pair.image)
+    c_twist, response = motion.values.atVector(V_key), motion.responses[V_key]
     alignment = pair.matches[c].alignment
     block = np.zeros((len(alignment), unknowns.size))
     roots, residuals = np.zeros(len(alignment)), np.zeros(len(alignment))
@@ -151,14 +171,27 @@ def _rows(
         if some is not None:
             bias = state.object_bias_px(pair.drive, int(pair.tracks[c][index[0]]), c)
         r, J, _ = weighted_residuals(
-            alignment.take(index), state.cTl, state.offset_s(pair.drive), pair.motion.c_twist, bias
+            alignment.take(index), state.cTl, state.offset_s(pair.drive), c_twist, bias
         )
         root = np.abs(J[:, 13]) * alignment.sigmas_px[index]
-        block[index, :6], block[index, clock] = J[:, :6], J[:, 6]
-        block[index, unknowns.column(key)] = J[:, 13]
+        block[index] = J[:, 7:13] @ response
+        block[index, :6] += J[:, :6]
+        block[index, clock] += J[:, 6]
+        block[index, unknowns.column(key)] += J[:, 13]
         roots[index] = root
         residuals[index] = unweighted(r, root)
     return block, roots, residuals
+
+
+def _twist_responses(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
+) -> dict[int, FloatArray]:
+    """(6, n) how the optimum of each twist follows the unknowns, by the twist's key."""
+    hessian, n = graph.linearize(values).hessian(_ordering(values, unknowns))[0], unknowns.size
+    return {
+        key: -np.linalg.solve(hessian[at : at + 6, at : at + 6], hessian[at : at + 6, :n])
+        for at, key in zip(range(n, len(hessian), 6), _twists(values, unknowns), strict=True)
+    }
 
 
 def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
@@ -275,7 +308,7 @@ def robust_covariance(
     """Covariance (n, n) of [extrinsic 6, offsets, biases], the error model behind it, and the columns."""
     unknowns = Unknowns.of(state, pairs)
     bread = marginal_covariance(graph, values, unknowns)
-    table = match_table(pairs, state, tracks, unknowns)
+    table = match_table(graph, values, pairs, state, tracks, unknowns)
     model = fit_error_model(table)
     surplus = score_variance(table, model) - table.J.T @ table.J
     covariance = bread + bread @ surplus @ bread
@@ -356,6 +389,11 @@ def _ordering(values: gtsam.Values, unknowns: Unknowns) -> gtsam.Ordering:
     ordering = gtsam.Ordering()
     for key in unknowns.keys:
         ordering.push_back(key)
-    for key in set(values.keys()) - set(unknowns.keys):
+    for key in _twists(values, unknowns):
         ordering.push_back(key)
     return ordering
+
+
+def _twists(values: gtsam.Values, unknowns: Unknowns) -> list[int]:
+    """Keys of the motion: every other unknown of the graph."""
+    return sorted(set(values.keys()) - set(unknowns.keys))

@@ -92,7 +92,7 @@ def frame_gains(
 ) -> tuple[FrameInformation, ...]:
     """What each pair brought, in the order of the pairs; pairs that share an image count as one."""
     unknowns = Unknowns.of(state, pairs)
-    table = match_table(pairs, state, tracks, unknowns)
+    table = match_table(graph, values, pairs, state, tracks, unknowns)
     prior, twisted = _frame_information(graph, values, unknowns)
     groups = _groups(pairs)
     parts = [_part(table, rows, *twisted[key], model) for key, (_, rows) in groups.items()]

@@ -58,7 +58,7 @@ def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
     graph, values = joint_graph(some, state, CONFIG)
     unknowns = Unknowns.of(state, some)
     bread = marginal_covariance(graph, values, unknowns)
-    table = match_table(some, state, objects, unknowns)
+    table = match_table(graph, values, some, state, objects, unknowns)
     surplus = score_variance(table, gains(motion)[0]) - table.J.T @ table.J
     return (bread + bread @ surplus @ bread)[:7, :7]
 
@@ -94,7 +94,7 @@ def test_a_view_is_the_frame_alone(motion: str) -> None:
 def test_the_offset_follows_from_the_twist() -> None:
     _, state, pairs, objects = matched("constant")
     unknowns = Unknowns.of(state, pairs)
-    table = match_table(pairs, state, objects, unknowns)
+    table = match_table(*joint_graph(pairs, state, CONFIG), pairs, state, objects, unknowns)
     start = 0
     for pair, frame in zip(pairs, gains("constant")[1], strict=True):
         J = table.J[start : start + len(pair)]
