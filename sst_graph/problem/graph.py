@@ -20,6 +20,7 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
+from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.objects import ObjectId, moving_objects
 from sst_graph.problem.state import (
@@ -106,9 +107,13 @@ class Tracks:
     """Twist tracks of all drives, and tracks of their objects where those are given; made once."""
 
     def __init__(
-        self, drives: Sequence[Drive], objects: Sequence[Mapping[ObjectId, int]] | None = None
+        self,
+        drives: Sequence[Drive],
+        objects: Sequence[Mapping[ObjectId, int]] | None = None,
+        smoother: MotionSmoother | None = None,
     ) -> None:
-        self._tracks: list[TwistTrack | None] = [drive.lidar_track() for drive in drives]
+        """smoother: of a single drive whose motions grow."""
+        self._tracks: list[TwistTrack | None] = [drive.lidar_track(smoother) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._moving: Sequence[Mapping[ObjectId, float]] = [

@@ -56,7 +56,8 @@ class TwistTrack:
         slope = (self._twists[i + 1] - self._twists[i]) / span
         fraction = float(np.clip((t - self._middles[i]) / span, -0.5, 1.5))
         a, b = 1.0 - fraction, fraction
-        covariance = a * a * self._covariances[i] + b * b * self._covariances[i + 1]
+        # As if both erred together, which smoothed motions nearly do.
+        covariance = abs(a) * self._covariances[i] + abs(b) * self._covariances[i + 1]
         if not 0.0 <= fraction <= 1.0:
             overshoot = span * (max(-fraction, fraction - 1.0))
             covariance = covariance + np.diag((slope * overshoot) ** 2)

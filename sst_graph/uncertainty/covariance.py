@@ -189,7 +189,7 @@ def _twist_responses(
     """(6, n) how the optimum of each twist follows the unknowns, by the twist's key."""
     hessian, n = graph.linearize(values).hessian(_ordering(values, unknowns))[0], unknowns.size
     return {
-        key: -np.linalg.solve(hessian[at : at + 6, at : at + 6], hessian[at : at + 6, :n])
+        key: np.asarray(-np.linalg.solve(hessian[at : at + 6, at : at + 6], hessian[at : at + 6, :n]))
         for at, key in zip(range(n, len(hessian), 6), _twists(values, unknowns), strict=True)
     }
 

@@ -1,0 +1,223 @@
+"""Motions of a sensor on a vehicle, smoothed forth and back.
+
+Registration errs at each stamp: a pose that is 1 cm too far ahead makes one interval too long and the next
+too short. A vehicle's twist does not jump like that, so most of it can be told apart: the twist is an
+integrated Wiener process (white jerk), observed as its mean over each interval plus the difference of two
+pose errors,
+
+    z_k = w_k + (n_{k+1} - n_k) / h_k,
+
+each of the six axes by itself. How rough the motion is, and by how much the claimed covariance errs, is told
+by the motions themselves: both are averaged over under their posterior (Saerkkae, Bayesian Filtering and
+Smoothing, 2013, ch. 4, 8 and 12).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.types import RelativeMotion
+
+FloatArray = NDArray[np.float64]
+
+_SHORTEST = 5
+"""Fewest motions in a row that tell how smooth they are."""
+_ROUGHNESS = np.logspace(-5.0, 3.0, 9)
+"""Candidates for the variance that the jerk adds to the twist in an interval, over the noise's."""
+_SCALES = 2.0 ** np.arange(-4, 2)
+"""Candidates for the true over the claimed covariance: what is far beyond the claim is motion, not noise."""
+_PRIOR_WEIGHT = 4.0
+"""So many motions' worth of belief that the claimed covariance is right."""
+_DIFFUSE = (1e8, 1e6)
+"""Variances of twist and acceleration before the first motion, in units of the noise."""
+
+
+def smoothed(motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
+    """The motions without the noise that a vehicle cannot follow; standstill and failures stay as they are.
+
+    Args:
+        motions: consecutive, stamps rising; exactly none at all where the sensor stands.
+
+    Returns:
+        As many motions; the covariance of a smoothed one is diagonal, and nearly common to its neighbours.
+    """
+    return MotionSmoother().smoothed(motions)
+
+
+class MotionSmoother:
+    """:func:`smoothed` for motions of which some are new in each call.
+
+    What is known of a motion hardly changes once a ``reach`` of others has followed; then it stays as it is.
+    """
+
+    def __init__(self, reach: int | None = None) -> None:
+        """reach: how many of the latest motions are smoothed anew in each call; None: all."""
+        self._reach = reach
+        self._runs: list[_Run] = []
+
+    def smoothed(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
+        """As :func:`smoothed`; a motion that an earlier call had is known by being the same object."""
+        result, runs = list(motions), []
+        for start, end in _ranges(motions):
+            run, first = self._going_on(motions[start:end])
+            run.smooth(self._reach)
+            result[start:end] = run.smoothed[first:]
+            runs.append(run)
+        self._runs = runs
+        return result
+
+    def _going_on(self, motions: Sequence[RelativeMotion]) -> tuple[_Run, int]:
+        """A run that ends with these motions, an earlier one if it can be, and where in it they begin."""
+        for run in self._runs:
+            places = [i for i, motion in enumerate(run.motions) if motion is motions[0]]
+            if places:
+                pairs = zip(run.motions[places[0] :], motions, strict=False)
+                known = next((i for i, (a, b) in enumerate(pairs) if a is not b), len(motions))
+                run.cut(places[0] + known)
+                run.extend(motions[len(run.motions) - places[0] :])
+                return run, places[0]
+        run = _Run(motions[0])
+        run.extend(motions)
+        return run, 0
+
+
+def _ranges(motions: Sequence[RelativeMotion]) -> Iterator[tuple[int, int]]:
+    """Ranges of usable, moving motions in a row that are long enough."""
+    usable = [motion.ok and bool(motion.mean_twist.any()) for motion in motions]
+    edges = np.flatnonzero(np.diff(np.array([False, *usable, False], dtype=np.int8)))
+    for start, end in edges.reshape(-1, 2).tolist():
+        if end - start >= _SHORTEST:
+            yield start, end
+
+
+@dataclass(frozen=True)
+class _Step:
+    """The filter after a motion, for each axis and roughness (6, r).
+
+    Attributes:
+        mean, covariance: (6, r, 4), (6, r, 4, 4) of [twist, acceleration, pose errors before and after].
+        transition, diffusion: (4, 4), (6, r, 4, 4) that led here from the motion before.
+        squares, log_sizes: (6, r) sums so far of squared, whitened innovations, and of their log variances.
+    """
+
+    mean: FloatArray
+    covariance: FloatArray
+    transition: FloatArray
+    diffusion: FloatArray
+    squares: FloatArray
+    log_sizes: FloatArray
+
+
+class _Run:
+    """Motions in a row, filtered forth and smoothed back.
+
+    Inside, lengths of time are in units of the first interval, twists in units of its noise.
+    """
+
+    def __init__(self, first: RelativeMotion) -> None:
+        self.motions: list[RelativeMotion] = []
+        self.smoothed: list[RelativeMotion] = []
+        self._steps: list[_Step] = []
+        self._seconds = first.seconds
+        self._sigmas = np.sqrt(np.diag(first.covariance)) / first.seconds
+
+    def cut(self, length: int) -> None:
+        """Forget all motions but the first ones."""
+        del self.motions[length:], self.smoothed[length:], self._steps[length:]
+
+    def extend(self, motions: Sequence[RelativeMotion]) -> None:
+        """Take in the motions that follow."""
+        for motion in motions:
+            predicted = self._predicted(motion) if self.motions else self._beginning(motion)
+            self._steps.append(self._updated(predicted, motion))
+            self.motions.append(motion)
+            self.smoothed.append(motion)
+
+    def smooth(self, reach: int | None) -> None:
+        """Smooth the latest motions, all where ``reach`` is None."""
+        last = self._steps[-1]
+        mean, covariance = last.mean, last.covariance
+        weights = self._weights(last)
+        for k in range(len(self._steps) - 1, -1, -1):
+            self.smoothed[k] = self._answer(k, mean[..., 0], covariance[..., 0, 0], *weights)
+            if k == 0 or (reach is not None and k <= len(self._steps) - reach):
+                return
+            # Rauch, Tung, Striebel.
+            step, before = self._steps[k], self._steps[k - 1]
+            F, P = step.transition, before.covariance
+            ahead = F @ P @ F.T + step.diffusion
+            gain = np.swapaxes(np.linalg.solve(ahead, F @ P), -1, -2)
+            mean = before.mean + (gain @ (mean - before.mean @ F.T)[..., None])[..., 0]
+            covariance = P + gain @ (covariance - ahead) @ np.swapaxes(gain, -1, -2)
+
+    def _beginning(self, motion: RelativeMotion) -> _Step:
+        """What is known before the first motion."""
+        shape = (6, len(_ROUGHNESS))
+        covariance = np.zeros((*shape, 4, 4))
+        covariance[..., 0, 0], covariance[..., 1, 1] = _DIFFUSE
+        covariance[..., 2, 2] = covariance[..., 3, 3] = self._pose_variances(motion)[:, None]
+        nothing = np.zeros(shape)
+        return _Step(np.zeros((*shape, 4)), covariance, np.eye(4), np.zeros((*shape, 4, 4)), nothing, nothing)
+
+    def _predicted(self, motion: RelativeMotion) -> _Step:
+        before, last = self._steps[-1], self.motions[-1]
+        step = 0.5 * (motion.to_ns + motion.from_ns - last.to_ns - last.from_ns) * 1e-9 / self._seconds
+        F = np.zeros((4, 4))
+        F[:2, :2] = [[1.0, step], [0.0, 1.0]]
+        F[2, 3] = 1.0
+        Q = np.zeros_like(before.covariance)
+        jerk = np.array([[step**3 / 3.0, step**2 / 2.0], [step**2 / 2.0, step]])
+        Q[..., :2, :2] = 3.0 * _ROUGHNESS[:, None, None] * jerk
+        Q[..., 3, 3] = self._pose_variances(motion)[:, None]
+        covariance = F @ before.covariance @ F.T + Q
+        return _Step(before.mean @ F.T, covariance, F, Q, before.squares, before.log_sizes)
+
+    def _updated(self, predicted: _Step, motion: RelativeMotion) -> _Step:
+        seconds = motion.seconds / self._seconds
+        h = np.array([1.0, 0.0, -1.0 / seconds, 1.0 / seconds])
+        claimed = self._pose_variances(motion)
+        before = self._pose_variances(self.motions[-1]) if self.motions else claimed
+        rest = np.maximum(claimed - before, 0.0) / seconds**2
+        innovation = (motion.mean_twist / self._sigmas)[:, None] - predicted.mean @ h
+        cross = predicted.covariance @ h
+        size = cross @ h + rest[:, None]
+        gain = cross / size[..., None]
+        return replace(
+            predicted,
+            mean=predicted.mean + gain * innovation[..., None],
+            covariance=predicted.covariance - gain[..., :, None] * cross[..., None, :],
+            squares=predicted.squares + innovation**2 / size,
+            log_sizes=predicted.log_sizes + np.log(size),
+        )
+
+    def _pose_variances(self, motion: RelativeMotion) -> FloatArray:
+        """(6,) of the error at the end of a motion: half of what the motion claims."""
+        return np.asarray(0.5 * np.diag(motion.covariance) / (self._sigmas * self._seconds) ** 2)
+
+    def _weights(self, last: _Step) -> tuple[FloatArray, FloatArray]:
+        """(6, r) posterior of the roughness, and the mean scale of the noise's covariance under each."""
+        freedom = len(self._steps) - 2 + _PRIOR_WEIGHT
+        squares = (last.squares + _PRIOR_WEIGHT)[..., None] / _SCALES
+        log_posterior = -0.5 * (last.log_sizes[..., None] + freedom * np.log(_SCALES) + squares)
+        shares = np.exp(log_posterior - log_posterior.max(axis=(1, 2), keepdims=True))
+        by_roughness = shares.sum(axis=2)
+        scale = (shares * _SCALES).sum(axis=2) / np.maximum(by_roughness, 1e-300)
+        return by_roughness / by_roughness.sum(axis=1, keepdims=True), scale
+
+    def _answer(
+        self, k: int, twists: FloatArray, variances: FloatArray, shares: FloatArray, scale: FloatArray
+    ) -> RelativeMotion:
+        """Motion k from its twists and their variances (6, r) under each roughness."""
+        motion, mean = self.motions[k], (shares * twists).sum(axis=1)
+        spread = scale * np.maximum(variances, 0.0) + (twists - mean[:, None]) ** 2
+        unit = self._sigmas * motion.seconds
+        return replace(
+            motion,
+            aTb=gtsam.Pose3.Expmap(unit * mean),
+            covariance=np.diag(unit**2 * (shares * spread).sum(axis=1)),
+        )
