@@ -22,12 +22,15 @@ class StandingConfig:
         certainty: the speed plus this many of its sigmas must stay below twice ``max_speed_mps``.
         rest_sigma_rad, rest_sigma_m: sigmas of the motion of a sensor that stands [rad, m].
         min_motions: fewest consecutive motions at rest that make a stop.
+        longest_stretch: as many motions in a row may be judged as one, for noise alone lets a single one
+            seem to move.
     """
 
     max_speed_mps: float = 0.07
     max_turn_radps: float = 0.03
     certainty: float = 2.0
     min_motions: int = 2
+    longest_stretch: int = 4
     rest_sigma_rad: float = 2e-5
     rest_sigma_m: float = 2e-4
 
@@ -42,7 +45,7 @@ def standing_frames(
     failed, or is known too poorly to tell rest from rolling, is never at rest.
     """
     config = config or StandingConfig()
-    at_rest = np.array([_at_rest(motion, config) for motion in motions], np.bool_)
+    at_rest = _at_rest(motions, config)
     at_rest &= _run_lengths(at_rest) >= config.min_motions
     before = np.concatenate([at_rest[:1], at_rest])
     after = np.concatenate([at_rest, at_rest[-1:]])
@@ -63,16 +66,30 @@ def at_rest(motions: Sequence[RelativeMotion], config: StandingConfig | None = N
     ]
 
 
-def _at_rest(motion: RelativeMotion, config: StandingConfig) -> bool:
-    """Whether a motion is surely below the speeds of the configuration."""
-    if not motion.ok:
-        return False
-    twist = motion.mean_twist
-    turn, speed = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
-    if speed >= config.max_speed_mps or turn >= config.max_turn_radps:
-        return False
-    sigma = float(np.sqrt(np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1])) / motion.seconds
-    return speed + config.certainty * sigma < 2.0 * config.max_speed_mps
+def _at_rest(motions: Sequence[RelativeMotion], config: StandingConfig) -> NDArray[np.bool_]:
+    """(n,) whether motions, or stretches of them, are surely below the speeds of the configuration."""
+    found = np.zeros(len(motions), np.bool_)
+    if not motions:
+        return found
+    seconds = np.array([motion.seconds for motion in motions])
+    steps = np.stack([motion.mean_twist for motion in motions]) * seconds[:, None]
+    covariances = np.stack([motion.covariance[3:, 3:] for motion in motions])
+    sigmas_m = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
+    speeds = np.linalg.norm(steps[:, 3:], axis=1) / seconds
+    # A single motion may be at rest only if its noise allows it.
+    may = speeds < config.max_speed_mps + config.certainty * sigmas_m / seconds
+    may &= np.array([motion.ok for motion in motions])
+    for length in range(1, min(config.longest_stretch, len(motions)) + 1):
+        windows = np.arange(len(motions) - length + 1)[:, None] + np.arange(length)
+        time = seconds[windows].sum(axis=1)
+        mean = steps[windows].sum(axis=1) / time[:, None]
+        turn, speed = np.linalg.norm(mean[:, :3], axis=1), np.linalg.norm(mean[:, 3:], axis=1)
+        # The poses inside a stretch do not matter: its error is that of its two ends.
+        sigma = sigmas_m[windows].max(axis=1) / time
+        slow = (speed < config.max_speed_mps) & (turn < config.max_turn_radps)
+        sure = speed + config.certainty * sigma < 2.0 * config.max_speed_mps
+        found[windows[slow & sure & may[windows].all(axis=1)]] = True
+    return found
 
 
 def _run_lengths(flags: NDArray[np.bool_]) -> NDArray[np.int64]:

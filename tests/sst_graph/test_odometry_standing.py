@@ -62,3 +62,16 @@ def test_false_alarms_at_a_slow_roll_with_noise() -> None:
     rng = np.random.default_rng(0)
     speeds = (0.25 + rng.normal(0.0, 0.05, 2000)).tolist()
     assert not standing_frames(motions_at(speeds, sigma_mps=0.05)).any()
+
+
+def test_noise_of_one_motion_does_not_set_a_standing_sensor_rolling() -> None:
+    """Pose errors of 5 mm: every motion seems to go at 5 cm/s or more, forth and back."""
+    found, rolling = [], []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        poses = 0.005 * rng.normal(size=13)
+        for speed, frames in ((0.0, found), (0.3, rolling)):
+            seen = np.diff(poses) / 0.1 + speed
+            frames.append(standing_frames(motions_at(seen.tolist(), sigma_mps=0.07)))
+    assert np.mean(found) > 0.9
+    assert not np.any(rolling)
