@@ -52,10 +52,10 @@ class JointConfig:
     graph: GraphConfig = field(default_factory=GraphConfig)
     kernel_px: tuple[float, ...] = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
     max_outer: int = 40
-    step_sigmas: float = 0.2
+    step_sigmas: float = 0.1
     full_steps: int = 6
     circle_sigmas: float = 1.5
-    inner_iterations: int = 4
+    inner_iterations: int = 2
     min_matches: int = 30
 
 
