@@ -62,11 +62,16 @@ class ObservabilityConfig:
         rotation_deg: of any rotation [deg].
         translation_m: of any translation [m].
         offset_s: of the time offset [s].
+        pair_correlation: a translation and the time offset that are correlated as closely as this hardly
+            separate, as at constant speed: what does separate them is small ...
+        pair_share: ... and must tell them to this share of the limits.
     """
 
     rotation_deg: float = 0.5
     translation_m: float = 0.05
     offset_s: float = 0.01
+    pair_correlation: float = 0.98
+    pair_share: float = 0.5
 
 
 def weak_directions(
@@ -77,7 +82,7 @@ def weak_directions(
     The eigenvectors of the (7, 7) covariance, each unknown measured in its own limit: an eigenvalue above
     1 is a combination known worse than the limits allow.
     """
-    limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
+    limits = limits_of_unknowns(covariance, config)
     scaled = covariance / np.outer(limits, limits)
     values, vectors = np.linalg.eigh(scaled)
     found = []
@@ -86,6 +91,21 @@ def weak_directions(
             break
         found.append(_describe(limits * vector * np.sqrt(value), cTl, advice))
     return tuple(found)
+
+
+def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
+    """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
+    limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
+    if _paired(covariance) >= config.pair_correlation:
+        limits[3:] *= config.pair_share
+    return limits
+
+
+def _paired(covariance: FloatArray) -> float:
+    """Multiple correlation of the time offset with the translation, 0 to 1."""
+    cross = covariance[3:6, 6]
+    explained = float(cross @ np.linalg.solve(covariance[3:6, 3:6], cross)) / float(covariance[6, 6])
+    return float(np.sqrt(min(max(explained, 0.0), 1.0)))
 
 
 def _describe(step: FloatArray, cTl: gtsam.Pose3, advice: Advice) -> WeakDirection:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sst_graph.result import CalibrationResult
 from sst_graph.uncertainty.frame_information import FrameInformation, with_offset
-from sst_graph.uncertainty.observability import ObservabilityConfig
+from sst_graph.uncertainty.observability import ObservabilityConfig, limits_of_unknowns
 
 FloatArray = NDArray[np.float64]
 
@@ -194,7 +194,7 @@ def predicted_covariance(covariance: FloatArray, information: FloatArray) -> Flo
 
 def worst_ratio(covariance: FloatArray, limits: ObservabilityConfig) -> float:
     """Sigma of the direction known worst, each unknown measured in its limit."""
-    scale = np.array([np.radians(limits.rotation_deg)] * 3 + [limits.translation_m] * 3 + [limits.offset_s])
+    scale = limits_of_unknowns(covariance, limits)
     return float(np.sqrt(np.linalg.eigvalsh(_scaled(covariance, scale))[-1]))
 
 

@@ -39,6 +39,17 @@ def test_forward_against_delay() -> None:
     np.testing.assert_allclose(weak.vector, expected / np.linalg.norm(expected), atol=0.01)
 
 
+def test_what_hardly_separates_must_be_known_better() -> None:
+    """4 cm alone are within the limit of 5 cm; tied to the time offset, as at constant speed, they are not."""
+    alone = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0])
+    tied = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.005])
+    sure = np.diag(np.array([np.radians(0.05)] * 3 + [0.005] * 3 + [0.0003]) ** 2)
+    assert weak_directions(sure + np.outer(alone, alone), CTL, CONFIG) == ()
+    (weak,) = weak_directions(sure + np.outer(tied, tied), CTL, CONFIG)
+    assert "shifted forward" in weak.sentence and "4.0 cm, 5.0 ms" in weak.sentence
+    assert weak_directions(sure + np.outer(0.5 * tied, 0.5 * tied), CTL, CONFIG) == ()
+
+
 def test_the_other_sign_of_the_delay() -> None:
     (weak,) = weak_directions(with_direction(np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0, -0.05])), CTL, CONFIG)
     # Forward and earlier is the same line as backward and later.
