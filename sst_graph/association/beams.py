@@ -72,7 +72,7 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     labels = recover_rings(elevation, rho) if rings is None else rings
     ring, median_elevation = _rank_by_elevation(labels, elevation)
     keys = Beams.key(ring, azimuth)
-    order = np.argsort(keys)
+    order = np.argsort(keys, kind="stable")  # points come nearly in order
     steps = np.diff(keys[order])
     steps = steps[steps < _APART - 2.0 * np.pi]
     step = float(np.median(steps)) if len(steps) else 0.0
@@ -130,21 +130,27 @@ def _cone_heights(z: FloatArray, rho: FloatArray, ring: IntArray, rings: int) ->
     """
     counts = np.bincount(ring, minlength=rings)
     some = np.flatnonzero(counts)
-    starts = (np.cumsum(counts) - counts)[some]
+    lengths = counts[some]
+    starts = np.cumsum(lengths) - lengths
     terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho])
-    weight = 1.0 / np.maximum(rho, 1.0)
-    base = weight
+    base = 1.0 / np.maximum(rho, 1.0)
+    weight, weighted = base, np.empty_like(terms)
     height = np.zeros(rings)
-    for _ in range(_ROUNDS):
-        w2 = weight**2
-        s = np.zeros((5, rings))
-        s[:, some] = np.add.reduceat(w2 * terms, starts, axis=1) if len(some) else 0.0
+    for _ in range(_ROUNDS if len(some) else 0):
+        np.multiply(terms, weight**2, out=weighted)
+        s = np.add.reduceat(weighted, starts, axis=1)
         det = s[0] * s[2] - s[1] ** 2
         safe = np.where(det > 1e-9 * np.maximum(s[0] * s[2], 1e-12), det, np.inf)
-        slope = (s[0] * s[4] - s[1] * s[3]) / safe
-        height = (s[2] * s[3] - s[1] * s[4]) / safe
-        error = z - slope[ring] * rho - height[ring]
-        weight = base / (1.0 + np.square(error / _CONE_NOISE_M))
+        slope, tip = (s[0] * s[4] - s[1] * s[3]) / safe, (s[2] * s[3] - s[1] * s[4]) / safe
+        height[some] = tip
+        error = np.repeat(slope, lengths)
+        error *= rho
+        np.subtract(z, error, out=error)
+        error -= np.repeat(tip, lengths)
+        error /= _CONE_NOISE_M
+        error *= error
+        error += 1.0
+        weight = base / error
     nearest, farthest = np.full(rings, np.inf), np.zeros(rings)
     if len(some):
         nearest[some] = np.minimum.reduceat(rho, starts)

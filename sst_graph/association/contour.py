@@ -106,14 +106,17 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
 
     The border runs half way between an inside pixel's centre and its outside neighbour's.
     """
-    outside = 1 - inside
-    distance = np.asarray(cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
-    x, y, width, height = cv2.boundingRect(inside)
-    box = (slice(max(0, y - 1), y + height + 1), slice(max(0, x - 1), x + width + 1))
-    region = np.ascontiguousarray(inside[box])
-    inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance = np.asarray(cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
     distance -= 0.5
-    distance[box] = np.where(region > 0, 0.5 - inner, distance[box])
+    # The nearest pixel outside touches the same part of the region: each stretch of columns on its own.
+    occupied = np.concatenate([[False], inside.any(axis=0), [False]])
+    for start, end in np.flatnonzero(occupied[1:] != occupied[:-1]).reshape(-1, 2).tolist():
+        left = max(0, start - 1)
+        _, y, _, height = cv2.boundingRect(np.ascontiguousarray(inside[:, start:end]))
+        box = (slice(max(0, y - 1), y + height + 1), slice(left, end + 1))
+        region = np.ascontiguousarray(inside[box])
+        inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        np.subtract(0.5, inner, out=distance[box], where=region > 0)
     return distance
 
 

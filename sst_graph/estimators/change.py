@@ -175,7 +175,7 @@ class Change:
             self._add(silhouettes_factor(pair, smoother.classes, smoother.keys(epoch), key), "pair", scan)
             if not (self.isam.valueExists(key) or self._values.exists(key)):
                 self._values.insert(key, pair.motion.c_twist)
-            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other)
+            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other, new.left_out)
 
     def _tie_twists(self) -> None:
         """Odometry's word on each image's twist, by the first scan that meets the image, as in the batch."""

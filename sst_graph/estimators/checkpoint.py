@@ -24,11 +24,12 @@ from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.object_sums import ObjectSums
 from sst_graph.estimators.score_sums import ScoreSums
-from sst_graph.estimators.settling import Milestones
+from sst_graph.estimators.settling import Milestones, Settling
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
 from sst_graph.estimators.undecided import Undecided
+from sst_graph.estimators.undersides import UndersideSupport
 from sst_graph.estimators.window import Sighting, Window
 from sst_graph.files import atomic_write_bytes
 from sst_graph.problem.drive import ScanFeatures, apart, image_features, outlines
@@ -36,7 +37,7 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 5
+VERSION = 6
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -61,6 +62,7 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "waited": tracker.waited,
         "watched": list(tracker.watched),
         "milestones": [tracker.milestones.first, tracker.milestones.next],
+        "settling": None if tracker.settling is None else _settling_document(tracker.settling),
         "inflation": tracker.inflation,
         "undersides": [int(c) for c in tracker.matcher.graph.undersides],
         "alarm": [tracker.alarm.raised, tracker.alarm.quiet],
@@ -141,6 +143,8 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     if head["smoother"] is not None:
         smoother = _get_smoother(arrays, head["smoother"], tracker)
         tracker.resume(smoother, set(head["smoother"]["entries"]), _point(arrays, "point"))
+        if head["settling"] is not None:
+            tracker.settling = _settling(head["settling"], tracker)
     tracker.covariance = arrays["covariance"]
     tracker.arrivals.rows.extend(arrays["arrivals"])
     if tracker.smoother is not None:
@@ -299,6 +303,25 @@ def _put_gaussian(arrays: Arrays, name: str, belief: Gaussian) -> None:
 
 def _gaussian(arrays: Arrays, name: str) -> Gaussian:
     return Gaussian(_point(arrays, name), arrays[f"{name}/information"], arrays[f"{name}/vector"])
+
+
+def _settling_document(settling: Settling) -> dict[str, Any]:
+    below, support = settling.below, None
+    if below is not None:
+        classes = sorted({*below.narrow, *below.wide})
+        support = [[int(c), below.narrow.get(c, 0.0), below.wide.get(c, 0.0)] for c in classes]
+    return {"below": support, "passes": settling.passes, "done": sorted(settling.done)}
+
+
+def _settling(document: Mapping[str, Any], tracker: Tracker) -> Settling:
+    tracker.window.held = tracker.window.first_scan == tracker.milestones.first
+    settling, support = Settling(tracker.matcher, tracker.config.settle_scans), document["below"]
+    settling.passes, settling.done = document["passes"], set(document["done"])
+    settling.below = None
+    if support is not None:
+        narrow, wide = ({SemanticClass(row[0]): row[i] for row in support} for i in (1, 2))
+        settling.below = UndersideSupport(narrow, wide)
+    return settling
 
 
 def _guess_document(guess: Guess) -> dict[str, Any]:

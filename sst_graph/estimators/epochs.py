@@ -12,6 +12,7 @@ from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.scores import PairScore
 from sst_graph.estimators.undecided import Other
 from sst_graph.problem.graph import PairMatches
+from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel, composed
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +28,7 @@ class Found:
         stamp_ns: of the scan.
         image: number of the image; scans that meet the same one share its twist.
         other: what the scan says with its other image, where the pairing is not certain and the scan leaves.
+        left_out: objects that were judged to move too far.
     """
 
     pair: PairMatches
@@ -34,6 +36,7 @@ class Found:
     stamp_ns: int
     image: int
     other: Other | None = None
+    left_out: frozenset[tuple[SemanticClass, int]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,7 @@ class Entry:
         epoch: which calibration it sees.
         image: number of its image.
         other: what the scan says with its other image.
+        left_out: objects that were judged to move too far.
     """
 
     pair: PairMatches
@@ -53,6 +57,7 @@ class Entry:
     epoch: int
     image: int
     other: Other | None = None
+    left_out: frozenset[tuple[SemanticClass, int]] = frozenset()
 
 
 @dataclass(frozen=True)

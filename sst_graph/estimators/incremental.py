@@ -18,15 +18,17 @@ from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.alarm import Joint, StepAlarm
 from sst_graph.estimators.arrivals import Arrivals
-from sst_graph.estimators.gaussian import Point, core_steps
+from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.matcher import WindowMatcher
-from sst_graph.estimators.settling import Milestones, settle_window
+from sst_graph.estimators.renewal import scans_to_match
+from sst_graph.estimators.settling import Milestones, Settling, settle_window
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
 from sst_graph.estimators.undersides import without_undersides
+from sst_graph.estimators.watch import Watch
 from sst_graph.estimators.window import Window
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
@@ -40,8 +42,6 @@ FloatArray = NDArray[np.float64]
 
 _UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
-_FRESH_SIGMAS = 0.02
-"""A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
 
 class Tracker:
@@ -78,6 +78,7 @@ class Tracker:
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
         self.watched: deque[int] = deque(maxlen=self.config.alarm.frames)
         self.milestones = Milestones(0, self.config.window, self.config.window)
+        self.settling: Settling | None = None
         self.arrivals = Arrivals()
         self.alarmed = False
         self.attempts = 0
@@ -218,14 +219,23 @@ class Tracker:
         assert smoother is not None
         before = smoother.point
         # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
-        chosen = self._to_match(number, smoother)
+        chosen = scans_to_match(
+            number,
+            self.matcher,
+            smoother,
+            self.entered,
+            self.covariance,
+            self.config,
+            self.settling,
+        )
         sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
         found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
         new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         chi2, doubt = self._watch(new, before), ""
         if self.alarm.alarm:
-            if self._is_change(before):
+            watch = Watch(self.matcher, self.alarm, self.watched, self.window.restless())
+            if watch.is_change(before, self.joint, smoother.model):
                 return self._change(before, stamp_ns, chi2)
             doubt = "a single object says that the calibration has changed: a step, or its labels"
         self._compare(new, before)
@@ -235,8 +245,7 @@ class Tracker:
             smoother.update(found, missing, first, self.window.objects.live)
             self.window.judged_anew -= chosen
         self.entered.extend(new)
-        if self.milestones.reached(number) and not self.config.drift.enabled:
-            self.settle(most=0)
+        self._begin_or_end_settling(number)
         self._take_covariance(smoother)
         if new:
             self.arrivals.take(number, self.covariance[:7, :7])
@@ -259,28 +268,24 @@ class Tracker:
         share = np.trace(np.linalg.solve(naive[:m, :m], self.covariance)) / m
         self.inflation = max(1.0, float(share))
 
-    def _to_match(self, number: int, smoother: WindowSmoother) -> set[int]:
-        """Scans to match: the newest, those still without a pair, the oldest, and some in turn."""
-        numbers = [n for n, _ in self.window.scans]
-        waiting = [n for n in numbers if n not in smoother.entries and n not in self.entered]
-        staleness = self._staleness(smoother)
-        known = sorted(staleness, key=staleness.__getitem__, reverse=True)
-        # What cannot wait, and as many others as there is time for: those judged anew, then the stalest.
-        chosen = {number, *waiting[-4:], *(set(numbers[-2:]) & set(known))}
-        leaving = [n for n in numbers[:1] if staleness.get(n, 1.0) > _FRESH_SIGMAS]
-        stale = sum([value > self.config.stale_sigmas for value in staleness.values()])
-        some = known[: max(self.config.renew - len(leaving), stale)]
-        wanted = [*sorted(self.window.judged_anew & set(known)), *some]
-        return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[: self.config.renew_most])
+    def begin_settling(self) -> None:
+        """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
+        self.window.judge_all()
+        self.settling = Settling(self.matcher, self.config.settle_scans)
+        self.window.held = self.window.first_scan == self.milestones.first
 
-    def _staleness(self, smoother: WindowSmoother) -> dict[int, float]:
-        """How far the estimate has moved since each pair was matched, in standard deviations."""
-        if not smoother.entries:
-            return {}
-        points = [entry.score.belief.point for entry in smoother.entries.values()]
-        steps = core_steps(points, self.point)
-        squares = np.einsum("ij,ij->i", steps, np.linalg.solve(self.covariance, steps.T).T)
-        return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))
+    def stop_settling(self) -> None:
+        """Leave a settling, if there is one, as it is."""
+        self.settling, self.window.held = None, False
+
+    def _begin_or_end_settling(self, number: int) -> None:
+        """Begin to settle where it is time to."""
+        if self.settling is not None and self.settling.ended:
+            # What came while it settled has been matched, too.
+            self.milestones.reached(number)
+            self.stop_settling()
+        elif self.settling is None and not self.config.drift.enabled and self.milestones.reached(number):
+            self.begin_settling()
 
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
@@ -291,6 +296,7 @@ class Tracker:
         smoother, joint = self.smoother, self.config.calibration.joint
         if smoother is None:
             return False
+        self.stop_settling()
         self.window.judge_all()
         self.matcher.look_below(smoother.point)
         alive = self.window.objects.live
@@ -319,24 +325,6 @@ class Tracker:
         self.watched.extend(new)
         return self.alarm.check(scores, self.joint, self.smoother.model)
 
-    def _is_change(self, before: Point) -> bool:
-        """Whether frames past the threshold mean that the calibration has changed.
-
-        Not where a single object says so: its labels may err for a while. With one object in view, or one
-        that tells far more than the others, that is not decidable. Objects that moved lately are not asked.
-        """
-        config, smoother, restless = self.config.alarm, self.smoother, self.window.restless()
-        kernel = RobustKernel("geman_mcclure", config.kernel_px)
-        assert smoother is not None
-
-        def value(*without: int) -> float:
-            scores = self.matcher.scores(before, self.watched, kernel, {*without, *restless})
-            return self.alarm.value(scores, self.joint, smoother.model)
-
-        whole, asked = value(), self.matcher.objects_of(self.watched) - restless
-        least = max(config.chi2, config.others * whole)
-        return whole > least and all(value(track) > least for track in asked)
-
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""
         if not new:
@@ -356,6 +344,7 @@ class Tracker:
         """The calibration has changed: begin again from the frames since, near the last estimate."""
         _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
         self.guess = Guess(point.cTl, point.offset_s, search=False)
+        self.stop_settling()
         self.smoother, self.alarmed = None, True
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
         # Frames before the first that was past the threshold may be from before the change.

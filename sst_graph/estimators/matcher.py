@@ -14,10 +14,11 @@ from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.scores import PairScore, score_pair, with_share
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.undecided import REACH_SIGMAS, Other
-from sst_graph.estimators.undersides import agreed_undersides
+from sst_graph.estimators.undersides import UndersideSupport, underside_support
 from sst_graph.estimators.window import Window
 from sst_graph.problem.drive import Drive, outline_size
 from sst_graph.problem.graph import PairMatches, Tracks, associate
+from sst_graph.types import SemanticClass
 
 
 class WindowMatcher:
@@ -34,11 +35,19 @@ class WindowMatcher:
 
     def look_below(self, point: Point) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree about them."""
-        joint = self.config.calibration.joint
-        drive, numbers = self.window.drive()
+        if self.config.calibration.undersides.use != "never":
+            self.match_below(self.support_below(point, None))
+
+    def support_below(self, point: Point, chosen: Collection[int] | None) -> UndersideSupport:
+        """What the edges towards the ground of some scans (None: all) say about their labels at a point."""
+        drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         tracks, state = self._tracks(drive, numbers), point.state(self.classes)
-        chosen, _ = agreed_undersides([drive], tracks, state, joint, self.config.calibration.undersides)
-        self.graph = replace(joint.graph, undersides=chosen)
+        return underside_support([drive], tracks, state, self.config.calibration.joint)
+
+    def match_below(self, support: UndersideSupport) -> None:
+        """Match edges towards the ground from now on, of classes whose labels agree as this support says."""
+        chosen, _ = support.agreed(self.config.calibration.undersides)
+        self.graph = replace(self.config.calibration.joint.graph, undersides=chosen)
 
     def match(
         self,
@@ -53,7 +62,7 @@ class WindowMatcher:
         Args:
             share: factor on the weights of all matches.
             offset_sigma_s: standard deviation of the time offset; where its image is not certain, the scan
-                that leaves a full window next is matched with the other one too [s].
+                that leaves the window next is matched with the other one too [s].
         """
         pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
         if kernel is None:
@@ -65,11 +74,12 @@ class WindowMatcher:
                 pair = pair if share == 1.0 else with_share(pair, share)
                 score = self._score(pair, number, point, share, by_object=not self.config.drift.enabled)
                 image = self.window.images[pair.pair.image]
-                found[number] = Found(pair, score, stamps[number], image.index)
-        oldest, full = self.window.first_scan, len(self.window.scans) == self.config.window
-        if oldest in found and full and offset_sigma_s > 0.0:
-            other = self._other(point, found[oldest], oldest, kernel or self.kernel, offset_sigma_s)
-            found[oldest] = replace(found[oldest], other=other)
+                out = self.left_out(pair, number, point.offset_s)
+                found[number] = Found(pair, score, stamps[number], image.index, left_out=out)
+        for number in self.window.leaving():
+            if number in found and offset_sigma_s > 0.0:
+                other = self._other(point, found[number], number, kernel or self.kernel, offset_sigma_s)
+                found[number] = replace(found[number], other=other)
         return found, set(numbers) - set(found)
 
     def _other(
@@ -107,6 +117,12 @@ class WindowMatcher:
             for number, pair in pairs.items()
             if len(pair)
         ]
+
+    def left_out(
+        self, pair: PairMatches, number: int, offset_s: float
+    ) -> frozenset[tuple[SemanticClass, int]]:
+        """The objects of a scan that are not matched with the image of a pair, for they move."""
+        return self.window.left_out(number, offset_s + pair.pair.base_tau_s, self.graph.mover_reach_m)
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""

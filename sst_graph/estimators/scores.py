@@ -188,7 +188,7 @@ def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian
     """The belief on the unknowns, from information and vector over [unknowns, twist]; (6, n) what an unknown
     takes off the twist."""
     n = point.size
-    gain = np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]]))
+    gain = np.asarray(np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]])), np.float64)
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
     belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
     return belief, gain[:, :n]

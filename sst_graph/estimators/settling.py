@@ -1,4 +1,8 @@
-"""The whole window solved again as the batch does, from a wide kernel to the narrowest."""
+"""The whole window solved again as the batch does, from a wide kernel to the narrowest.
+
+At the end of a drive at once (:func:`settle_window`); while frames come, a little with each
+(:class:`Settling`).
+"""
 
 from __future__ import annotations
 
@@ -8,11 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from factors.robust import RobustKernel
+from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.smoother import WindowSmoother
+from sst_graph.estimators.undersides import UndersideSupport
 
 _RESTS_SIGMAS = 0.02
 """A whole step shorter than this is rest."""
+_PASSES = 2
+"""How often a running tracker matches the whole window anew when it settles."""
 
 
 @dataclass
@@ -86,3 +94,52 @@ def settle_window(
         at = smoother.point.moved(back)
     smoother.rest_at(at)
     return False
+
+
+class Settling:
+    """One settling of a running tracker: the whole window is matched anew, some scans with each frame.
+
+    First the edges towards the ground are looked at; then each scan is matched, the oldest first, at the
+    estimate as it is by then, and all once more.
+
+    Attributes:
+        below: support of the edges towards the ground so far; None when it is known.
+        passes: how often all are still to be matched.
+        done: scans that were asked, or matched, in this pass.
+    """
+
+    def __init__(self, matcher: WindowMatcher, scans: int) -> None:
+        """scans: that are matched with each frame."""
+        self._matcher, self._scans = matcher, scans
+        self.passes = _PASSES
+        never = matcher.config.calibration.undersides.use == "never"
+        self.below = None if never else UndersideSupport()
+        self.done: set[int] = set()
+
+    @property
+    def ended(self) -> bool:
+        """Whether all is done."""
+        return self.passes == 0
+
+    def advance(self, point: Point) -> list[int] | None:
+        """The scans to match with this frame; None while the edges towards the ground are looked at."""
+        numbers = [number for number, _ in self._matcher.window.scans]
+        waiting = [number for number in numbers if number not in self.done]
+        looking, below = self.below is not None, self.below
+        # To look below is to match twice.
+        some = waiting[: max(1, self._scans // 2) if looking else self._scans]
+        if below is not None:
+            self.below = below.plus(self._matcher.support_below(point, some))
+        self.done.update(some)
+        if len(some) == len(waiting):
+            self._next()
+        return None if looking else some
+
+    def _next(self) -> None:
+        """All scans have been matched."""
+        self.done.clear()
+        if self.below is None:
+            self.passes -= 1
+        else:
+            self._matcher.match_below(self.below)
+            self.below = None

@@ -87,6 +87,7 @@ class TrackerConfig:
         renew: scans of the window matched anew at each frame, besides the newest; the next to leave first.
         renew_most: as many while the estimate moves.
         stale_sigmas: a match is stale where the estimate has moved farther since, in standard deviations.
+        settle_scans: scans matched anew with each frame while a running tracker settles.
         start_scans: scans before the first batch solution is tried, and between attempts.
         restart_scans: the same after an alarm.
         start_attempts: failed attempts near the last estimate after an alarm before the search begins anew.
@@ -106,6 +107,7 @@ class TrackerConfig:
     renew: int = 1
     renew_most: int = 4
     stale_sigmas: float = 0.3
+    settle_scans: int = 8
     start_scans: int = 12
     restart_scans: int = 8
     start_attempts: int = 4
@@ -121,6 +123,7 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "window", "start_scans", "restart_scans", "min_frame_matches", "late_s")
+        _require_positive(self, "settle_scans")
         if self.window < max(self.start_scans, self.restart_scans):
             raise ValueError(f"window {self.window}: expected at least start_scans and restart_scans")
 

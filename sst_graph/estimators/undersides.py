@@ -97,18 +97,53 @@ def agreed_undersides(
     """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
     if config.use == "never":
         return (), {}
-    concentration = underside_concentration(drives, tracks, state, joint, config)
-    least = config.min_concentration if config.use == "auto" else 0.0
-    return tuple(c for c, share in concentration.items() if share >= least), concentration
+    return underside_support(drives, tracks, state, joint).agreed(config)
+
+
+@dataclass(frozen=True)
+class UndersideSupport:
+    """Support of each class's undersides: the matches, each counted by its robust weight.
+
+    Attributes:
+        narrow, wide: under the last kernel and under a wide one.
+    """
+
+    narrow: Mapping[SemanticClass, float] = field(default_factory=dict)
+    wide: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+    def plus(self, other: UndersideSupport) -> UndersideSupport:
+        """That of these scans and others."""
+        return UndersideSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
+
+    def agreed(self, config: UndersideConfig) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
+        """Classes whose labels agree, and the share of the wide support that remains under the last kernel.
+
+        Classes with too little support under the last kernel are left out.
+        """
+        concentration = {
+            c: self.narrow[c] / self.wide[c]
+            for c in sorted(self.narrow)
+            if self.narrow[c] >= config.min_support
+        }
+        least = config.min_concentration if config.use == "auto" else 0.0
+        return tuple(c for c, share in concentration.items() if share >= least), concentration
 
 
 def underside_concentration(
     drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
 ) -> dict[SemanticClass, float]:
-    """Support of each class's undersides under the last kernel as a share of that under a wide one.
+    """Support of each class's undersides under the last kernel as a share of that under a wide one."""
+    return underside_support(drives, tracks, state, joint).agreed(config)[1]
 
-    Classes with too little support under the last kernel are left out.
-    """
+
+def _summed(a: Mapping[SemanticClass, float], b: Mapping[SemanticClass, float]) -> dict[SemanticClass, float]:
+    return {c: a.get(c, 0.0) + b.get(c, 0.0) for c in {*a, *b}}
+
+
+def underside_support(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig
+) -> UndersideSupport:
+    """Support of the undersides of some scans at a state."""
     classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
     graph = replace(joint.graph, undersides=tuple(sorted(classes)))
     narrow, wide = (
@@ -121,4 +156,4 @@ def underside_concentration(
         )
         for scale in CONCENTRATION_SCALES
     )
-    return {c: narrow[c] / wide[c] for c in sorted(narrow) if narrow[c] >= config.min_support}
+    return UndersideSupport(narrow, wide)

@@ -50,6 +50,8 @@ class Window:
     """Bounded buffers of one drive; scans are numbered from 0 and never twice.
 
     Attributes:
+        size: most scans, but while nothing may leave.
+        held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         sightings: the latest ones of each track, in the order of time.
         moving: speed of the objects of a scan that move by themselves, by the scan's number [m/s].
@@ -59,9 +61,10 @@ class Window:
 
     def __init__(self, camera: PinholeCamera, scans: int) -> None:
         self.camera = camera
-        self.scans: deque[tuple[int, ScanFeatures]] = deque(maxlen=scans)
+        self.size, self.held = scans, False
+        self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
-        self.motions: deque[RelativeMotion] = deque(maxlen=scans + 10)
+        self.motions: deque[RelativeMotion] = deque()
         self.tracks: dict[int, dict[tuple[SemanticClass, int], int]] = {}
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.sightings: dict[int, list[Sighting]] = {}
@@ -81,12 +84,21 @@ class Window:
         """Stamp of the newest scan."""
         return self.scans[-1][1].stamp_ns if self.scans else None
 
+    def leaving(self) -> list[int]:
+        """The scans that leave when the next one comes, oldest first."""
+        surplus = 0 if self.held else min(2, len(self.scans) + 1 - self.size)
+        return [self.scans[i][0] for i in range(surplus)]
+
     def add_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
         """Keep a scan and the motion that led to it; its number."""
         number = self.next_scan
         self.next_scan += 1
+        for _ in self.leaving():
+            self.scans.popleft()
         if motion is not None:
             self.motions.append(motion)
+            while len(self.motions) > max(self.size, len(self.scans)) + 10:
+                self.motions.popleft()
             self.wTl = self.wTl.compose(motion.aTb)
         lean = dataclasses.replace(
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
@@ -150,6 +162,11 @@ class Window:
             speeds[sighting.name] = speed
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
             self.judged_anew.add(sighting.scan)
+
+    def left_out(self, number: int, tau_s: float, reach_m: float) -> frozenset[tuple[SemanticClass, int]]:
+        """The objects of a scan that are judged to move farther than ``reach_m`` within an interval."""
+        speeds = self.moving.get(number, {})
+        return frozenset(name for name, speed in speeds.items() if speed * abs(tau_s) > reach_m)
 
     def restless(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings.

@@ -212,12 +212,13 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
 
 
 def test_a_checkpoint_resumes_to_the_same_estimates(
-    street: SimulatedDrive, frames: list[Frame], running: Path
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:
     kept = _tracker(street)
     for frame in frames[:20]:
         kept.add(frame)
-    resumed = load_checkpoint(running)
+    save_checkpoint(kept, tmp_path / "tracker.npz")
+    resumed = load_checkpoint(tmp_path / "tracker.npz")
     assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
     assert resumed.point.offset_s == kept.point.offset_s
     np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)

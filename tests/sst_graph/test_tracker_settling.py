@@ -1,0 +1,101 @@
+"""A running tracker settles with the frames that come, a little with each."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph import Tracker, TrackerConfig
+from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.types import Frame
+
+
+@cache
+def _street() -> SimulatedDrive:
+    return simulate(
+        SimulationConfig(
+            seed=3,
+            frames=34,
+            width=621,
+            height=188,
+            azimuth_limit_deg=50.0,
+            azimuth_step_deg=0.3,
+            vehicle_density=0.3,
+            time_offset_s=0.03,
+            motion="no_stop",
+            speed_mps=6.0,
+            moving_fraction=0.0,
+        )
+    )
+
+
+def _distance(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
+    """Mahalanobis distance of the estimate from a calibration."""
+    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+
+
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
+    """Checkpoint of a tracker that has settled for a frame, begun at the truth, and the frames to come."""
+    street, config = _street(), TrackerConfig(start_scans=8, window=18)
+    start = dataclasses.replace(config.calibration.start, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, start=start))
+    tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+    frames = list(street)
+    for k, frame in enumerate(frames):
+        settled = tracker.settling is not None
+        tracker.add(frame)
+        if settled and tracker.settling is not None:
+            path = tmp_path_factory.mktemp("tracker") / "settling.npz"
+            save_checkpoint(tracker, path)
+            return path, frames[k + 1 :]
+    raise AssertionError("the tracker does not settle")
+
+
+def test_a_checkpoint_keeps_the_settling(begun: tuple[Path, list[Frame]]) -> None:
+    tracker = load_checkpoint(begun[0])
+    assert tracker.settling is not None and tracker.window.held
+    # With one frame, edges towards the ground have been looked at.
+    assert len(tracker.settling.done) == tracker.config.settle_scans // 2
+    assert tracker.settling.below is not None and tracker.settling.below.narrow
+
+
+def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, list[Frame]]) -> None:
+    tracker, coming = load_checkpoint(begun[0]), begun[1]
+    oldest, sizes = tracker.window.first_scan, []
+    for frame in coming:
+        assert tracker.add(frame).accepted
+        # Nothing leaves before it is settled, though the window is full.
+        assert tracker.window.first_scan == oldest
+        sizes.append(len(tracker.window.scans))
+        if tracker.settling is None:
+            break
+    assert tracker.settling is None and sizes[-1] > tracker.config.window
+    assert tracker.smoother is not None
+    assert set(tracker.smoother.entries) == {number for number, _ in tracker.window.scans}
+    # What was held leaves two at a time.
+    assert tracker.window.leaving() == [oldest, oldest + 1]
+    found, covariance = tracker.point, tracker.covariance.copy()
+    assert tracker.settle()
+    assert _distance(tracker, found.cTl, found.offset_s) < 1.0
+    np.testing.assert_allclose(np.diag(tracker.covariance), np.diag(covariance), rtol=0.5)
+
+
+def test_a_settling_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
+    once, again, coming = load_checkpoint(begun[0]), load_checkpoint(begun[0]), begun[1]
+    again.stop_settling()
+    assert not again.window.held and again.add(coming[0]).accepted
+    again.begin_settling()
+    once.add(coming[0])
+    for frame in coming[1:]:
+        once.add(frame)
+        again.add(frame)
+    assert once.settling is None and again.settling is None
+    assert _distance(once, again.point.cTl, again.point.offset_s) < 0.5
