@@ -88,10 +88,11 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     resumed = _lines(capsys.readouterr().out)
     assert resumed[0]["frame"] in (6, 9, 12, 15, 18) and resumed[-1]["frame"] == 19
     a, b = unbroken[-1], resumed[-1]
+    # What is resumed was matched anew as a whole, and neither has settled yet: half a sigma apart at most.
     sigma = a["sigma_time_offset_s"]
-    assert abs(a["time_offset_s"] - b["time_offset_s"]) < 0.3 * sigma
+    assert abs(a["time_offset_s"] - b["time_offset_s"]) < 0.5 * sigma
     off = np.array(a["T_camera_lidar"])[:3, 3] - np.array(b["T_camera_lidar"])[:3, 3]
-    assert np.abs(off).max() < 0.3 * max(a["sigma_translation_m"])
+    assert np.abs(off).max() < 0.5 * max(a["sigma_translation_m"])
 
 
 @pytest.mark.parametrize(
