@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
-from sst_graph.problem.objects import MovingConfig, ObjectId, ObjectTracker, speed_of
+from sst_graph.problem.objects import MovingConfig, ObjectId, ObjectTracker, speed_of, standing_share
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -164,9 +164,9 @@ class Window:
             self.judged_anew.add(sighting.scan)
 
     def left_out(self, number: int, tau_s: float, reach_m: float) -> frozenset[tuple[SemanticClass, int]]:
-        """The objects of a scan that are judged to move farther than ``reach_m`` within an interval."""
-        speeds = self.moving.get(number, {})
-        return frozenset(name for name, speed in speeds.items() if speed * abs(tau_s) > reach_m)
+        """The objects of a scan that move too far within an interval to keep any weight."""
+        speeds = self.moving.get(number, {}).items()
+        return frozenset(name for name, speed in speeds if not standing_share(speed * abs(tau_s), reach_m))
 
     def restless(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -22,7 +23,7 @@ from sst_graph.association.silhouettes import (
 )
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outlines
-from sst_graph.problem.objects import ObjectId, moving_objects
+from sst_graph.problem.objects import ObjectId, moving_objects, standing_share
 from sst_graph.problem.state import (
     EXTRINSIC,
     State,
@@ -36,6 +37,7 @@ from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+_Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -55,8 +57,8 @@ class GraphConfig:
         delay_sigma_s: prior deviation of the time offset from the guess [s].
         rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
         rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
-        mover_reach_m: an object that moves farther than this by itself between its scan and its image is
-            left out [m].
+        mover_reach_m: an object that moves so far by itself between its scan and its image keeps half of its
+            weight, a little farther none [m].
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
     """
 
@@ -126,23 +128,15 @@ class Tracks:
         other._tracks, other.objects, other._moving = self._tracks, [objects], [moving]
         return other
 
-    def standing(
-        self,
-        drive: int,
-        scan: int,
-        boundaries: Mapping[SemanticClass, Boundaries],
-        reach_m: float,
-        tau_s: float,
-    ) -> dict[SemanticClass, Boundaries]:
-        """A scan's boundaries without objects that move by more than ``reach_m`` in an interval."""
+    def shares(
+        self, drive: int, scan: int, c: SemanticClass, numbers: NDArray[np.intp], reach_m: float, tau_s: float
+    ) -> FloatArray:
+        """(n,) share of their weight that objects of a scan keep, for they may move in an interval."""
         if not self._moving:
-            return dict(boundaries)
-        speeds, still = self._moving[drive], {}
-        for c, points in boundaries.items():
-            steps = {n: speeds.get((scan, c, int(n)), 0.0) * abs(tau_s) for n in np.unique(points.objects)}
-            numbers = [n for n, step in steps.items() if step <= reach_m]
-            still[c] = points.take(np.flatnonzero(np.isin(points.objects, numbers)))
-        return {c: points for c, points in still.items() if len(points)}
+            return np.ones(len(numbers))
+        speeds = self._moving[drive]
+        steps_m = [speeds.get((scan, c, int(n)), 0.0) * abs(tau_s) for n in numbers]
+        return np.array([standing_share(step_m, reach_m) for step_m in steps_m])
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -163,14 +157,15 @@ def associate(
             image = drive.images[pair.image]
             l_twist = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
             motion = _camera_motion(l_twist, state.cTl)
+            share = partial(
+                tracks.shares,
+                number,
+                pair.scan,
+                reach_m=config.mover_reach_m,
+                tau_s=offset_s + pair.base_tau_s,
+            )
             matches = match_silhouettes(
-                tracks.standing(
-                    number,
-                    pair.scan,
-                    outlines(drive.scans[pair.scan], config.undersides),
-                    config.mover_reach_m,
-                    offset_s + pair.base_tau_s,
-                ),
+                _standing(outlines(drive.scans[pair.scan], config.undersides), share),
                 image.contours,
                 drive.camera,
                 state.cTl,
@@ -181,12 +176,32 @@ def associate(
                 kernel,
                 config.match,
             )
+            matches = {c: _weighted(m, share(c, m.objects)) for c, m in matches.items()}
             if matches:
                 on = _objects_of(
                     matches, pair.scan, None if tracks.objects is None else tracks.objects[number]
                 )
                 found.append(PairMatches(number, pair, l_twist, motion, matches, on))
     return found
+
+
+def _standing(
+    boundaries: Mapping[SemanticClass, Boundaries], share: _Share
+) -> dict[SemanticClass, Boundaries]:
+    """Boundaries without the objects that would keep nothing of their weight."""
+    still = {}
+    for c, points in boundaries.items():
+        numbers, which = np.unique(points.objects, return_inverse=True)
+        keeps = share(c, numbers)[which.reshape(-1)] > 0.0
+        still[c] = points if keeps.all() else points.take(np.flatnonzero(keeps))
+    return {c: points for c, points in still.items() if len(points)}
+
+
+def _weighted(matches: SilhouetteMatches, shares: FloatArray) -> SilhouetteMatches:
+    if (shares == 1.0).all():
+        return matches
+    alignment = replace(matches.alignment, weights=shares * matches.alignment.weights)
+    return replace(matches, alignment=alignment)
 
 
 def _objects_of(

@@ -124,6 +124,20 @@ def moving_objects(
     return found
 
 
+_LEAST_SHARE = 0.1
+"""An object that would keep less of its weight is left out."""
+
+
+def standing_share(step_m: float, reach_m: float) -> float:
+    """Share of its weight that an object keeps which moves by ``step_m`` within the interval of a pair.
+
+    Half at ``reach_m``; 0 far beyond it. Were it all or nothing, objects would come and go with the time
+    offset's last millisecond, and the estimate with them.
+    """
+    share = 1.0 / (1.0 + (step_m / reach_m) ** 2)
+    return share if share >= _LEAST_SHARE else 0.0
+
+
 def speed_of(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:
     """Speed of centres (n, 2) [m] at times (n,) [s]; 0 where they wander like a parked object's."""
     span = float(np.ptp(times)) if len(times) else 0.0

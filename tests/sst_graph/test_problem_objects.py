@@ -11,7 +11,7 @@ import pytest
 from factors import PinholeCamera
 from sst_graph.association.boundary import Boundaries
 from sst_graph.problem.drive import Drive, ScanFeatures
-from sst_graph.problem.objects import MovingConfig, ObjectTracker, moving_objects, object_tracks
+from sst_graph.problem.objects import MovingConfig, ObjectTracker, moving_objects, object_tracks, standing_share
 from sst_graph.types import RelativeMotion, SemanticClass
 
 VEHICLE, POLE = SemanticClass.VEHICLE, SemanticClass.POLE
@@ -102,3 +102,13 @@ def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
     # One track is not given to two objects of a scan.
     both = tracker.add({VEHICLE: boundaries(here, here + 0.5)}, gtsam.Pose3())
     assert len(set(both.values())) == 2 and 2 in both.values()
+
+
+def test_a_mover_loses_its_weight_bit_by_bit() -> None:
+    """3 mm within the pair's interval halve it; a parked object keeps all of it, a fast one nothing."""
+    steps_m = np.linspace(0.0, 0.02, 201)
+    shares = np.array([standing_share(float(step_m), 0.003) for step_m in steps_m])
+    assert shares[0] == 1.0 and standing_share(0.003, 0.003) == pytest.approx(0.5)
+    assert (np.diff(shares) <= 0.0).all() and shares[-1] == 0.0
+    # The one jump, where an object is left out, is small beside the whole.
+    assert np.abs(np.diff(shares)).max() < 0.11

@@ -13,7 +13,7 @@ from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators.joint import solve_joint
 from sst_graph.estimators.undersides import with_undersides
 from sst_graph.problem.drive import prepare_drive
-from sst_graph.problem.graph import Tracks
+from sst_graph.problem.graph import Tracks, tracked_objects
 from sst_graph.problem.objects import moving_objects, object_tracks
 from sst_graph.problem.state import State, underside_track
 from sst_graph.types import SemanticClass
@@ -75,7 +75,8 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     ours = dict(zip(tracker.point.tracks, tracker.point.object_biases_px, strict=True))
     shared = underside_track(SemanticClass.VEHICLE)
     assert tracker.point.biases_px[1] == pytest.approx(state.object_biases_px[0, shared], abs=0.2)
-    theirs = {track: bias for (_, track), bias in state.object_biases_px.items() if track != shared}
+    matched = {track for _, _, track in tracked_objects(solution.pairs)} - {shared}
+    theirs = {track: state.object_biases_px[0, track] for track in matched}
     assert len(theirs) > 5 and {track: ours[track] for track in theirs} == pytest.approx(theirs, abs=0.2)
     expected, *_ = robust_covariance(solution.graph, solution.values, solution.pairs, state, [tracks])
     ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])

@@ -40,7 +40,7 @@ def test_forward_against_delay() -> None:
 
 
 def test_what_hardly_separates_must_be_known_better() -> None:
-    """4 cm alone are within the limit of 5 cm; tied to the time offset, as at constant speed, they are not."""
+    """4 cm alone are within the limit of 5 cm; tied to the time offset, as at constant speed, not."""
     alone = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0])
     tied = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.005])
     sure = np.diag(np.array([np.radians(0.05)] * 3 + [0.005] * 3 + [0.0003]) ** 2)
