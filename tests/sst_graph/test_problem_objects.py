@@ -11,7 +11,13 @@ import pytest
 from factors import PinholeCamera
 from sst_graph.association.boundary import Boundaries
 from sst_graph.problem.drive import Drive, ScanFeatures
-from sst_graph.problem.objects import MovingConfig, ObjectTracker, moving_objects, object_tracks, standing_share
+from sst_graph.problem.objects import (
+    MovingConfig,
+    ObjectTracker,
+    moving_objects,
+    object_tracks,
+    standing_share,
+)
 from sst_graph.types import RelativeMotion, SemanticClass
 
 VEHICLE, POLE = SemanticClass.VEHICLE, SemanticClass.POLE
