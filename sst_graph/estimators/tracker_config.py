@@ -91,7 +91,6 @@ class TrackerConfig:
         start_scans: scans before the first batch solution is tried, and between attempts.
         restart_scans: the same after an alarm.
         start_attempts: failed attempts near the last estimate after an alarm before the search begins anew.
-        start_candidates: most candidates of a search whose solutions are compared.
         start_share: least share of the pairs that the first solution must still match.
         start_gain: by which fraction of the cost a start whose time offset was searched must be better.
         start_offset_step_s: damping of the time offset in the first solution, a step's prior deviation [s].
@@ -111,7 +110,6 @@ class TrackerConfig:
     start_scans: int = 12
     restart_scans: int = 8
     start_attempts: int = 4
-    start_candidates: int = 3
     start_share: float = 0.7
     start_gain: float = 0.1
     start_offset_step_s: float = 0.005

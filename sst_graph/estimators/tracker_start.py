@@ -10,12 +10,11 @@ import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
-from sst_graph.association.search import Candidate
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
+from sst_graph.estimators.contest import choose_start
 from sst_graph.estimators.gaussian import Gaussian, Point
-from sst_graph.estimators.joint import solve_joint
-from sst_graph.estimators.start import find_start
+from sst_graph.estimators.joint import JointConfig, solve_joint
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
@@ -79,15 +78,10 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    calibration = config.calibration
-    search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
-    enabled = guess.search or guess.cTl is None
-    start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
-    candidates = find_start([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, start)
     solved, reasons = [], []
-    for candidate in candidates[: config.start_candidates]:
+    for start in _starts(drive, guess, config, delay_s):
         try:
-            solved.append(_solution(drive, candidate, config))
+            solved.append(_solution(drive, start, config))
         except EstimationError as error:
             reasons.append(str(error))
     if not solved:
@@ -102,16 +96,38 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
     return best
 
 
-def _solution(drive: Drive, candidate: Candidate, config: TrackerConfig) -> _Solved:
-    """The joint method from a candidate, its offset damped."""
+def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> list[State]:
+    """Where the solutions begin: the winners of the batch's contest, or the guess itself.
+
+    Raises:
+        EstimationError: nothing to search for, or no guess and no search.
+    """
     calibration = config.calibration
-    graph = dataclasses.replace(calibration.joint.graph, delay_sigma_s=config.start_offset_step_s)
-    joint = dataclasses.replace(calibration.joint, graph=graph)
-    solution = solve_joint([drive], State(candidate.cTl, (candidate.offset_s,)), joint)
+    search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
+    enabled = guess.search or guess.cTl is None
+    start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    joint = _damped(config) if delay_s == 0.0 else calibration.joint
+    contest = choose_start(
+        [drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, joint, start
+    )
+    return [State(cTl, (offset_s,)) for cTl, offset_s in contest.finalists]
+
+
+def _damped(config: TrackerConfig) -> JointConfig:
+    """The joint method with small steps of the time offset."""
+    joint = config.calibration.joint
+    graph = dataclasses.replace(joint.graph, delay_sigma_s=config.start_offset_step_s)
+    return dataclasses.replace(joint, graph=graph)
+
+
+def _solution(drive: Drive, start: State, config: TrackerConfig) -> _Solved:
+    """The joint method from a start, its offset damped."""
+    calibration = config.calibration
+    solution = solve_joint([drive], start, _damped(config))
     if not solution.converged:
         raise EstimationError(f"the first solution still moved after {solution.outer_iterations} iterations")
     state = solution.state
-    _check_pairs(drive, candidate.offset_s, len(solution.pairs), state.offset_s(0), config)
+    _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
     return _Solved(_cost(drive, point, config), point)
