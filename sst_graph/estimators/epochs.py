@@ -28,7 +28,7 @@ class Found:
         stamp_ns: of the scan.
         image: number of the image; scans that meet the same one share its twist.
         other: what the scan says with its other image, where the pairing is not certain and the scan leaves.
-        left_out: objects that were judged to move too far.
+        left_out: objects that were judged to move, with the tenths of their weight that they lost.
     """
 
     pair: PairMatches
@@ -36,7 +36,7 @@ class Found:
     stamp_ns: int
     image: int
     other: Other | None = None
-    left_out: frozenset[tuple[SemanticClass, int]] = frozenset()
+    left_out: frozenset[tuple[SemanticClass, int, int]] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Entry:
         epoch: which calibration it sees.
         image: number of its image.
         other: what the scan says with its other image.
-        left_out: objects that were judged to move too far.
+        left_out: objects that were judged to move, with the tenths of their weight that they lost.
     """
 
     pair: PairMatches
@@ -57,7 +57,7 @@ class Entry:
     epoch: int
     image: int
     other: Other | None = None
-    left_out: frozenset[tuple[SemanticClass, int]] = frozenset()
+    left_out: frozenset[tuple[SemanticClass, int, int]] = frozenset()
 
 
 @dataclass(frozen=True)

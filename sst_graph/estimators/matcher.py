@@ -125,8 +125,8 @@ class WindowMatcher:
 
     def left_out(
         self, pair: PairMatches, number: int, offset_s: float
-    ) -> frozenset[tuple[SemanticClass, int]]:
-        """The objects of a scan that are not matched with the image of a pair, for they move."""
+    ) -> frozenset[tuple[SemanticClass, int, int]]:
+        """The objects of a scan that count for less with the image of a pair, or for nothing: they move."""
         return self.window.left_out(number, offset_s + pair.pair.base_tau_s, self.graph.mover_reach_m)
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:

@@ -163,10 +163,15 @@ class Window:
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
             self.judged_anew.add(sighting.scan)
 
-    def left_out(self, number: int, tau_s: float, reach_m: float) -> frozenset[tuple[SemanticClass, int]]:
-        """The objects of a scan that move too far within an interval to keep any weight."""
-        speeds = self.moving.get(number, {}).items()
-        return frozenset(name for name, speed in speeds if not standing_share(speed * abs(tau_s), reach_m))
+    def left_out(
+        self, number: int, tau_s: float, reach_m: float
+    ) -> frozenset[tuple[SemanticClass, int, int]]:
+        """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
+        lost = [
+            (c, name, round(10.0 * (1.0 - standing_share(speed * abs(tau_s), reach_m))))
+            for (c, name), speed in self.moving.get(number, {}).items()
+        ]
+        return frozenset(entry for entry in lost if entry[2] > 0)
 
     def restless(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings.
