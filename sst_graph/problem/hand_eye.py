@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from factors import delay_prior, hand_eye_factor, rotation_hand_eye
 from factors.robust import RobustKernel
 from sst_graph.odometry.relative import DirectionMotion
-from sst_graph.odometry.standing import at_rest
+from sst_graph.odometry.standing import StandingConfig, at_rest
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.path import PathStep, SensorPath
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
@@ -92,9 +92,14 @@ def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list
     ]
 
 
+_EACH_ALONE = StandingConfig(longest_stretch=1)
+"""Only motions that each by itself are surely none are set to rest: the noise's scale is fitted to all pairs,
+and noise that is taken away would make the rest of them too sure."""
+
+
 def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
-    """The LiDAR's path in each drive, exactly at rest where it stands."""
-    return [SensorPath(at_rest(drive.lidar_motions)) for drive in drives]
+    """The LiDAR's path in each drive, exactly at rest where it stands without any doubt."""
+    return [SensorPath(at_rest(drive.lidar_motions, _EACH_ALONE)) for drive in drives]
 
 
 def pair_motions(
