@@ -64,26 +64,26 @@ class MotionSmoother:
         """As :func:`smoothed`; a motion that an earlier call had is known by being the same object."""
         result, runs = list(motions), []
         for start, end in _ranges(motions):
-            run, first = self._going_on(motions[start:end])
+            run = self._going_on(motions[start:end])
             run.smooth(self._reach)
-            result[start:end] = run.smoothed[first:]
+            result[start:end] = run.smoothed
             runs.append(run)
         self._runs = runs
         return result
 
-    def _going_on(self, motions: Sequence[RelativeMotion]) -> tuple[_Run, int]:
-        """A run that ends with these motions, an earlier one if it can be, and where in it they begin."""
+    def _going_on(self, motions: Sequence[RelativeMotion]) -> _Run:
+        """The run of these motions: an earlier one that goes on with them, or a new one."""
         for run in self._runs:
-            places = [i for i, motion in enumerate(run.motions) if motion is motions[0]]
-            if places:
-                pairs = zip(run.motions[places[0] :], motions, strict=False)
-                known = next((i for i, (a, b) in enumerate(pairs) if a is not b), len(motions))
-                run.cut(places[0] + known)
-                run.extend(motions[len(run.motions) - places[0] :])
-                return run, places[0]
+            place = next((i for i, motion in enumerate(run.motions) if motion is motions[0]), None)
+            if place is not None:
+                run.forget(place)
+                pairs = zip(run.motions, motions, strict=False)
+                run.cut(next((i for i, (a, b) in enumerate(pairs) if a is not b), len(motions)))
+                run.extend(motions[len(run.motions) :])
+                return run
         run = _Run(motions[0])
         run.extend(motions)
-        return run, 0
+        return run
 
 
 def _ranges(motions: Sequence[RelativeMotion]) -> Iterator[tuple[int, int]]:
@@ -123,8 +123,14 @@ class _Run:
         self.motions: list[RelativeMotion] = []
         self.smoothed: list[RelativeMotion] = []
         self._steps: list[_Step] = []
+        self._forgotten = 0
         self._seconds = first.seconds
         self._sigmas = np.sqrt(np.diag(first.covariance)) / first.seconds
+
+    def forget(self, count: int) -> None:
+        """Drop the first motions; what they said of the others stays."""
+        del self.motions[:count], self.smoothed[:count], self._steps[:count]
+        self._forgotten += count
 
     def cut(self, length: int) -> None:
         """Forget all motions but the first ones."""
@@ -201,7 +207,7 @@ class _Run:
 
     def _weights(self, last: _Step) -> tuple[FloatArray, FloatArray]:
         """(6, r) posterior of the roughness, and the mean scale of the noise's covariance under each."""
-        freedom = len(self._steps) - 2 + _PRIOR_WEIGHT
+        freedom = self._forgotten + len(self._steps) - 2 + _PRIOR_WEIGHT
         squares = (last.squares + _PRIOR_WEIGHT)[..., None] / _SCALES
         log_posterior = -0.5 * (last.log_sizes[..., None] + freedom * np.log(_SCALES) + squares)
         shares = np.exp(log_posterior - log_posterior.max(axis=(1, 2), keepdims=True))

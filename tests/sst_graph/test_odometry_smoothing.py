@@ -105,6 +105,15 @@ def test_motion_by_motion() -> None:
     np.testing.assert_allclose(of(window)[0][-20:], expected[-20:], atol=1e-9)
 
 
+def test_what_is_no_longer_asked_for_is_forgotten() -> None:
+    motions, _ = drive(60, 3)
+    smoother = MotionSmoother(reach=10)
+    for k in range(5, 61):
+        smoother.smoothed(motions[max(0, k - 15) : k])
+    (run,) = smoother._runs
+    assert len(run.motions) == len(run.smoothed) == len(run._steps) == 15
+
+
 def test_a_motion_that_turns_out_to_be_none() -> None:
     """The latest motions are at rest as soon as the next one is, too."""
     motions, _ = drive(20, 4)
