@@ -129,13 +129,6 @@ class UndersideSupport:
         return tuple(c for c, share in concentration.items() if share >= least), concentration
 
 
-def underside_concentration(
-    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
-) -> dict[SemanticClass, float]:
-    """Support of each class's undersides under the last kernel as a share of that under a wide one."""
-    return underside_support(drives, tracks, state, joint).agreed(config)[1]
-
-
 def _summed(a: Mapping[SemanticClass, float], b: Mapping[SemanticClass, float]) -> dict[SemanticClass, float]:
     return {c: a.get(c, 0.0) + b.get(c, 0.0) for c in {*a, *b}}
 

@@ -12,7 +12,7 @@ from streets import prepared_street, standing_street
 from sst_graph.association.boundary import Edge
 from sst_graph.estimators.contest import narrowed
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
-from sst_graph.estimators.undersides import UndersideConfig, underside_concentration, with_undersides
+from sst_graph.estimators.undersides import UndersideConfig, underside_support, with_undersides
 from sst_graph.problem.drive import Drive, image_features
 from sst_graph.problem.graph import Tracks, associate
 from sst_graph.problem.state import State
@@ -85,7 +85,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
     one, centre = solved(drive)
     config = replace(CONFIG, use=use)
     tracks = Tracks([drive])
-    shares = underside_concentration([drive], tracks, one.state, JOINT, config)
+    shares = underside_support([drive], tracks, one.state, JOINT).agreed(config)[1]
     assert shares[VEHICLE] < CONFIG.min_concentration
     below = with_undersides([drive], tracks, [(one, centre)], JOINT, config)
     if use == "always":
@@ -98,4 +98,4 @@ def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
     config = UndersideConfig(min_support=1e6)
-    assert underside_concentration([drive], Tracks([drive]), one.state, JOINT, config) == {}
+    assert underside_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}
