@@ -8,6 +8,21 @@ from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
 from sst_graph.types import SemanticClass
 
+TRACKED_STREET = SimulationConfig(
+    seed=3,
+    frames=36,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.3,
+    time_offset_s=0.03,
+    motion="no_stop",
+    speed_mps=6.0,
+    moving_fraction=0.0,
+)
+"""A drive for the tracker, at half the usual size."""
+
 
 @cache
 def standing_street(label_noise: float = 1.0) -> SimulatedDrive:

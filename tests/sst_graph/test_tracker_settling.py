@@ -9,30 +9,17 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from streets import TRACKED_STREET
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.data.simulator import SimulatedDrive, simulate
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import Frame
 
 
 @cache
 def _street() -> SimulatedDrive:
-    return simulate(
-        SimulationConfig(
-            seed=3,
-            frames=34,
-            width=621,
-            height=188,
-            azimuth_limit_deg=50.0,
-            azimuth_step_deg=0.3,
-            vehicle_density=0.3,
-            time_offset_s=0.03,
-            motion="no_stop",
-            speed_mps=6.0,
-            moving_fraction=0.0,
-        )
-    )
+    return simulate(dataclasses.replace(TRACKED_STREET, frames=34))
 
 
 def _distance(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:

@@ -10,9 +10,10 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
+from streets import TRACKED_STREET
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.data.simulator import SimulatedDrive, simulate
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.epochs import Found
@@ -28,19 +29,6 @@ from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.gained import gained_of
 
 CONFIG = TrackerConfig(start_scans=8)
-STREET = SimulationConfig(
-    seed=3,
-    frames=36,
-    width=621,
-    height=188,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.3,
-    vehicle_density=0.3,
-    time_offset_s=0.03,
-    motion="no_stop",
-    speed_mps=6.0,
-    moving_fraction=0.0,
-)
 
 STEP = 20
 """Frame from which on the calibration has changed, in the tests of that."""
@@ -48,7 +36,7 @@ STEP = 20
 
 @pytest.fixture(scope="module")
 def street() -> SimulatedDrive:
-    return simulate(STREET)
+    return simulate(TRACKED_STREET)
 
 
 @pytest.fixture(scope="module")
