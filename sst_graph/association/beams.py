@@ -22,8 +22,10 @@ IntArray = NDArray[np.intp]
 _CONE_NOISE_M = 0.02
 _ROUNDS = 6
 _MIN_RING_POINTS = 30
-_CONE_POINTS = 500
-"""Points of a ring that its cone is fitted to, about."""
+_CONE_POINTS = 256
+"""Points of a ring that its cone is fitted to."""
+_STEPS = 8_000
+"""Steps between neighbours of which the median is taken, about."""
 _APART = 10.0
 """Distance of two rings among the keys that points are sorted by; azimuths differ by less [rad]."""
 _MIN_RHO_RATIO = 1.5
@@ -73,12 +75,13 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     ring, median_elevation = _rank_by_elevation(labels, elevation)
     keys = Beams.key(ring, azimuth)
     order = np.argsort(keys, kind="stable")  # points come nearly in order
-    steps = np.diff(keys[order])
+    in_order = keys[order]
+    steps = np.diff(in_order)
     steps = steps[steps < _APART - 2.0 * np.pi]
-    step = float(np.median(steps)) if len(steps) else 0.0
-    some = order[:: max(1, len(order) // max(1, _CONE_POINTS * len(median_elevation)))]
-    height = _cone_heights(points[some, 2], rho[some], ring[some], len(median_elevation))
-    return Beams(order, keys[order], ring, azimuth, rho, height, step, median_elevation)
+    step = float(np.median(steps[:: 1 + len(steps) // _STEPS])) if len(steps) else 0.0
+    some, counts = _evenly_from_each(ring, len(median_elevation), _CONE_POINTS)
+    height = _cone_heights(points[order[some], 2], rho[order[some]], counts)
+    return Beams(order, in_order, ring, azimuth, rho, height, step, median_elevation)
 
 
 def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
@@ -110,50 +113,52 @@ def _rank_by_elevation(labels: NDArray[np.integer], elevation: FloatArray) -> tu
     """Ring numbers that rise with elevation, and each ring's median elevation."""
     lowest = int(labels.min()) if len(labels) else 0
     shifted = labels.astype(np.intp) - lowest
-    used = np.bincount(shifted) > 0
+    counts = np.bincount(shifted)
+    used = counts > 0
     ring = (np.cumsum(used) - 1)[shifted]
-    # A sorted key that holds the ring before the point and the elevation behind it.
-    by_ring = np.sort(ring * _APART + elevation)
-    starts = np.searchsorted(by_ring, np.arange(np.count_nonzero(used) + 1) * _APART - 0.5 * _APART)
-    middle = (starts[:-1] + starts[1:]) // 2
-    medians = by_ring[middle] - np.arange(len(middle)) * _APART
+    # Small integers are sorted by their digits, which costs next to nothing.
+    together = np.argsort(ring.astype(np.uint16) if len(counts) < 2**16 else ring, kind="stable")
+    by_ring = np.split(elevation[together], np.cumsum(counts[used])[:-1])
+    medians = np.array([np.partition(part, len(part) // 2)[len(part) // 2] for part in by_ring if len(part)])
     rank = np.argsort(medians, kind="stable")
     place = np.empty_like(rank)
     place[rank] = np.arange(len(rank))
     return place[ring], medians[rank]
 
 
-def _cone_heights(z: FloatArray, rho: FloatArray, ring: IntArray, rings: int) -> FloatArray:
-    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell.
+def _evenly_from_each(ring: IntArray, rings: int, number: int) -> tuple[IntArray, IntArray]:
+    """(rings, number) places evenly over each ring of points that come ring by ring, and (rings,) counts.
 
-    The points come ring by ring.
+    Places repeat in rings of fewer points.
     """
     counts = np.bincount(ring, minlength=rings)
-    some = np.flatnonzero(counts)
-    lengths = counts[some]
-    starts = np.cumsum(lengths) - lengths
-    terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho])
+    starts = np.cumsum(counts) - counts
+    return starts[:, None] + np.arange(number) * counts[:, None] // number, counts
+
+
+def _cone_heights(z: FloatArray, rho: FloatArray, counts: IntArray) -> FloatArray:
+    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell.
+
+    Args:
+        z, rho: (rings, n) of points of each ring [m].
+        counts: (rings,) how many points each ring has.
+    """
+    terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho], axis=2)
     base = 1.0 / np.maximum(rho, 1.0)
-    weight, weighted = base, np.empty_like(terms)
-    height = np.zeros(rings)
-    for _ in range(_ROUNDS if len(some) else 0):
-        np.multiply(terms, weight**2, out=weighted)
-        s = np.add.reduceat(weighted, starts, axis=1)
+    weight, tip = base, np.zeros(len(rho))
+    for _ in range(_ROUNDS):
+        s = ((weight**2)[:, None, :] @ terms)[:, 0, :].T
         det = s[0] * s[2] - s[1] ** 2
         safe = np.where(det > 1e-9 * np.maximum(s[0] * s[2], 1e-12), det, np.inf)
         slope, tip = (s[0] * s[4] - s[1] * s[3]) / safe, (s[2] * s[3] - s[1] * s[4]) / safe
-        height[some] = tip
-        error = np.repeat(slope, lengths)
-        error *= rho
+        error = slope[:, None] * rho
         np.subtract(z, error, out=error)
-        error -= np.repeat(tip, lengths)
+        error -= tip[:, None]
         error /= _CONE_NOISE_M
         error *= error
         error += 1.0
         weight = base / error
-    nearest, farthest = np.full(rings, np.inf), np.zeros(rings)
-    if len(some):
-        nearest[some] = np.minimum.reduceat(rho, starts)
-        farthest[some] = np.maximum.reduceat(rho, starts)
-    trusted = (counts >= _MIN_RING_POINTS) & (farthest > _MIN_RHO_RATIO * nearest) & (np.abs(height) < 0.6)
-    return np.where(trusted, height, 0.0)
+    trusted = (counts >= _MIN_RING_POINTS) & (np.abs(tip) < 0.6)
+    if rho.size:
+        trusted &= rho.max(axis=1) > _MIN_RHO_RATIO * rho.min(axis=1)
+    return np.where(trusted, tip, 0.0)

@@ -102,9 +102,10 @@ def find_boundaries(
 ) -> dict[SemanticClass, Boundaries]:
     """Boundary points of each class in a scan; a class without any has no entry."""
     config = config or BoundaryConfig()
-    usable = np.linalg.norm(scan.points, axis=1) > 0.5
-    points = scan.points[usable].astype(np.float64)
-    labels = scan.classes[usable]
+    points = scan.points.astype(np.float64)
+    apart = np.einsum("ij,ij->i", points, points) > 0.25
+    usable = slice(None) if apart.all() else apart
+    points, labels = points[usable], scan.classes[usable]
     present = [c for c in classes if np.count_nonzero(labels == c) >= config.min_points]
     if not present:
         return {}
@@ -144,14 +145,16 @@ def _side_edges(
     The half step, not the middle of the two azimuths: a laser mounted off the axis shows a near and a
     far return of neighbouring firings under azimuths that differ by more, or less, than the step.
     """
-    a, b = beams.order[:-1], beams.order[1:]
-    last, following = (a, b) if side > 0 else (b, a)
-    place = np.arange(len(a)) if side > 0 else np.arange(1, len(beams.order))
+    member = mask[beams.order]
+    here, there = (member[:-1], member[1:]) if side > 0 else (member[1:], member[:-1])
+    # Few points are the last of a class: all that follows is asked of these alone.
+    place = np.flatnonzero(here & ~there) + (side < 0)
+    last, following = beams.order[place], beams.order[place + side]
     before = beams.order[np.clip(place - side, 0, len(beams.order) - 1)]
     gap = side * (beams.azimuth[following] - beams.azimuth[last])
     parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
-    ok = (beams.ring[a] == beams.ring[b]) & (gap < config.max_steps * beams.step + parallax)
-    ok &= mask[last] & ~mask[following] & _is_behind(beams.rho, last, following, config)
+    ok = (beams.ring[last] == beams.ring[following]) & (gap < config.max_steps * beams.step + parallax)
+    ok &= _is_behind(beams.rho, last, following, config)
     last, before = last[ok], before[ok]
     steps = side * (beams.azimuth[last] - beams.azimuth[before])
     known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
