@@ -45,7 +45,7 @@ def usable_points(
     if len(kept) > most:
         kept = kept[np.linspace(0, len(kept) - 1, most).astype(np.intp)]
     offsets = None if scan.offsets_s is None else scan.offsets_s[kept].astype(np.float64)
-    return scan.points[kept].astype(np.float64), scan.classes[kept], offsets
+    return scan.points.take(kept, axis=0).astype(np.float64), scan.classes[kept], offsets
 
 
 def registration_cloud(

@@ -97,7 +97,7 @@ class LidarOdometry:
         self._covariance = np.zeros((6, 6))
         self._voxel_m = self.config.voxel_m
         self._lost = True
-        self._cached: tuple[Scan, _Points] | None = None
+        self._parted: tuple[Scan, _Sweep, _Sweep] | None = None
 
     @property
     def pose(self) -> gtsam.Pose3:
@@ -136,13 +136,14 @@ class LidarOdometry:
         config = self.config
         wTl = self._wTl @ _exp(self._twist, seconds)
         if self._lost:
-            wTl = self._searched(self._points(scan, self._twist).still, wTl)
+            wTl = self._searched(self._parts(scan)[0].at_stamp(self._twist), wTl)
         twist: FloatArray | None = self._twist
+        still, movable = self._parts(scan)
         for _ in range(config.compensations):
-            points = self._points(scan, twist)
+            points, others = still.at_stamp(twist), movable.at_stamp(twist)
             # What stands still among the movable objects helps where the rest says little.
-            standing = self._objects.still(_transformed(wTl, points.movable), scan.stamp_ns)
-            found = self._align(np.concatenate([points.still, points.movable[standing]]), wTl, seconds)
+            standing = self._objects.still(_transformed(wTl, others), scan.stamp_ns)
+            found = self._align(np.concatenate([points, others[standing]]), wTl, seconds)
             if found is None or scan.offsets_s is None:
                 return found
             change = np.inf if twist is None else np.abs(found.twist - twist)[3:].max()
@@ -229,7 +230,7 @@ class LidarOdometry:
     def _remember(self, scan: Scan, registered: int) -> None:
         """Keep the movable objects for later comparison, and adapt the voxels to the number registered."""
         config = self.config
-        movable = self._points(scan, self._twist).movable
+        movable = self._parts(scan)[1].at_stamp(self._twist)
         self._objects.remember(_transformed(self._wTl, movable), scan.stamp_ns)
         edge = self._voxel_m * np.sqrt(registered / config.target_points)
         self._voxel_m = float(np.clip(edge, config.min_voxel_m, config.max_voxel_m))
@@ -237,7 +238,7 @@ class LidarOdometry:
     def _restart_map(self, scan: Scan) -> None:
         """Forget the map and begin it anew with a scan at the current pose."""
         config = self.config
-        points = self._points(scan, self._twist).still
+        points = self._parts(scan)[0].at_stamp(self._twist)
         self._map = None
         if len(points) >= config.min_points:
             self._map = small_gicp.GaussianVoxelMap(config.map_voxel_m)
@@ -245,20 +246,18 @@ class LidarOdometry:
             cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
             self._map.insert(cloud, self._wTl)
 
-    def _points(self, scan: Scan, twist: FloatArray | None) -> _Points:
-        """The scan's points at its stamp; what may move counts as still where too little else is left."""
+    def _parts(self, scan: Scan) -> tuple[_Sweep, _Sweep]:
+        """What is still and what may move; the latter counts as still where too little else is left."""
         config = self.config
-        if self._cached is not None and self._cached[0] is scan and scan.offsets_s is None:
-            return self._cached[1]
+        if self._parted is not None and self._parted[0] is scan:
+            return self._parted[1:]
         points, classes, offsets = usable_points(scan, config.near_m, config.far_m, config.max_points)
-        if offsets is not None and twist is not None:
-            points = compensate_sweep(points, offsets, twist)
-        movable = np.isin(classes, MOVABLE_CLASSES)
+        sweep, movable = _Sweep(points, offsets), np.isin(classes, MOVABLE_CLASSES)
         if np.count_nonzero(~movable) < config.min_points:
             movable[:] = False
-        found = _Points(points[~movable], points[movable])
-        self._cached = (scan, found)
-        return found
+        parts = sweep.take(np.flatnonzero(~movable)), sweep.take(np.flatnonzero(movable))
+        self._parted = (scan, *parts)
+        return parts
 
 
 def lidar_odometry(scans: Iterable[Scan], config: LidarOdometryConfig | None = None) -> list[RelativeMotion]:
@@ -272,11 +271,24 @@ def lidar_odometry(scans: Iterable[Scan], config: LidarOdometryConfig | None = N
 
 
 @dataclass(frozen=True)
-class _Points:
-    """Points of a scan in the LiDAR frame [m]: still (n, 3), and of classes that may move (m, 3)."""
+class _Sweep:
+    """Points (n, 3) in the LiDAR frame at their own times [m]: (n,) after the stamp [s], or None, at it."""
 
-    still: FloatArray
-    movable: FloatArray
+    points: FloatArray
+    offsets_s: FloatArray | None
+
+    def take(self, index: NDArray[np.intp]) -> _Sweep:
+        """Some of the points, by position."""
+        # Rows are taken much faster by ``take`` than by an index.
+        return _Sweep(
+            self.points.take(index, axis=0), None if self.offsets_s is None else self.offsets_s[index]
+        )
+
+    def at_stamp(self, twist: FloatArray | None) -> FloatArray:
+        """(n, 3) points in the LiDAR frame at the stamp [m]; as measured where no twist is known."""
+        if twist is None or self.offsets_s is None:
+            return self.points
+        return compensate_sweep(self.points, self.offsets_s, twist)
 
 
 @dataclass(frozen=True)
