@@ -62,20 +62,21 @@ class ContourMap:
     @classmethod
     def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image."""
-        inside = (mask == semantic_class).astype(np.uint8)
-        if not inside.any() or inside.all():
+        inside = (mask == semantic_class).view(np.uint8)
+        if cv2.countNonZero(inside) in (0, inside.size):
             return None
         # Only near the class: elsewhere nothing is matched, and the transform is what an image costs.
         x, y, width, height = cv2.boundingRect(inside)
-        rows = slice(max(0, y - REACH_PX), y + height + REACH_PX)
-        columns = slice(max(0, x - REACH_PX), x + width + REACH_PX)
-        distance = np.full(mask.shape, float(REACH_PX), np.float32)
-        near = signed_distance(np.ascontiguousarray(inside[rows, columns]))
-        distance[rows, columns] = np.minimum(cv2.GaussianBlur(near, (0, 0), _SMOOTHING_PX), REACH_PX)
-        unknown = (mask == SemanticClass.IGNORE).astype(np.uint8)
-        if unknown.any():
+        top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
+        box = inside[top : y + height + REACH_PX, left : x + width + REACH_PX]
+        near = cv2.GaussianBlur(signed_distance(np.ascontiguousarray(box)), (0, 0), _SMOOTHING_PX)
+        np.minimum(near, REACH_PX, out=near)
+        below, right = mask.shape[0] - top - len(near), mask.shape[1] - left - near.shape[1]
+        distance = cv2.copyMakeBorder(near, top, below, left, right, cv2.BORDER_CONSTANT, value=REACH_PX)
+        unknown = (mask == SemanticClass.IGNORE).view(np.uint8)
+        if cv2.countNonZero(unknown):
             unknown = np.asarray(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), np.uint8)
-        return cls(distance, unknown.astype(np.float32))
+        return cls(np.asarray(distance, np.float32), unknown.astype(np.float32))
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
@@ -85,19 +86,17 @@ class ContourMap:
             valid = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
             valid &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
         safe = np.where(valid[:, None], uvs, BORDER_PX + 1.0)
-        distances = sample(self.distance, safe)
-        step_u, step_v = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-        gradient = 0.5 * np.stack(
-            [
-                sample(self.distance, safe + step_u) - sample(self.distance, safe - step_u),
-                sample(self.distance, safe + step_v) - sample(self.distance, safe - step_v),
-            ],
-            axis=1,
-        )
+        steps = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        # All at once: with few points a call costs more than what it does.
+        around = sample(self.distance, (steps[:, None, :] + safe).reshape(-1, 2)).reshape(5, -1)
+        distances = around[0]
+        gradient = 0.5 * np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
         length = np.linalg.norm(gradient, axis=1)
         normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
         feet = safe - distances[:, None] * normals
-        valid &= (length > MIN_GRADIENT) & (sample(self.unknown, feet) < 0.1)
+        valid &= length > MIN_GRADIENT
+        if self.veiled:
+            valid &= sample(self.unknown, feet) < 0.1
         return ContourFeet(distances, normals, feet, valid)
 
 
@@ -116,7 +115,7 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
         box = (slice(max(0, y - 1), y + height + 1), slice(left, end + 1))
         region = np.ascontiguousarray(inside[box])
         inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        np.subtract(0.5, inner, out=distance[box], where=region > 0)
+        np.subtract(0.5, inner, out=distance[box], where=region.view(np.bool_))
     return distance
 
 
@@ -124,8 +123,7 @@ def sample(field: FloatMap, uvs: FloatArray) -> FloatArray:
     """(n,) bilinear values of a field (h, w) at pixels uvs (n, 2); the border is extended."""
     values = np.empty(len(uvs))
     for start in range(0, len(uvs), _REMAP_LIMIT):
-        part = uvs[start : start + _REMAP_LIMIT].astype(np.float32)
-        u, v = np.ascontiguousarray(part[:, :1]), np.ascontiguousarray(part[:, 1:])
+        u, v = uvs[start : start + _REMAP_LIMIT].T.astype(np.float32, order="C")[:, :, None]
         values[start : start + _REMAP_LIMIT] = cv2.remap(
             field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         ).reshape(-1)
