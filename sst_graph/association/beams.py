@@ -21,7 +21,7 @@ IntArray = NDArray[np.intp]
 
 _CONE_NOISE_M = 0.02
 _ROUNDS = 6
-_MIN_RING_POINTS = 30
+_MIN_CONE_POINTS = 30
 _CONE_POINTS = 256
 """Points of a ring that its cone is fitted to."""
 _STEPS = 8_000
@@ -68,19 +68,19 @@ def arrange_beams(points: FloatArray, rings: NDArray[np.integer] | None) -> Beam
     Args:
         rings: (n,) laser of each point, or None: then rings are recovered from the elevations.
     """
-    rho = np.hypot(points[:, 0], points[:, 1])
+    rho = np.sqrt(points[:, 0] ** 2 + points[:, 1] ** 2)
     azimuth = np.arctan2(points[:, 1], points[:, 0])
     elevation = np.arctan2(points[:, 2], np.maximum(rho, 1e-6))
     labels = recover_rings(elevation, rho) if rings is None else rings
-    ring, median_elevation = _rank_by_elevation(labels, elevation)
+    ring, counts, median_elevation = _rank_by_elevation(labels, elevation)
     keys = Beams.key(ring, azimuth)
     order = np.argsort(keys, kind="stable")  # points come nearly in order
     in_order = keys[order]
     steps = np.diff(in_order)
     steps = steps[steps < _APART - 2.0 * np.pi]
     step = float(np.median(steps[:: 1 + len(steps) // _STEPS])) if len(steps) else 0.0
-    some, counts = _evenly_from_each(ring, len(median_elevation), _CONE_POINTS)
-    height = _cone_heights(points[order[some], 2], rho[order[some]], counts)
+    some = order[_evenly_from_each(counts)]
+    height = _cone_heights(points[some, 2], rho[some], counts)
     return Beams(order, in_order, ring, azimuth, rho, height, step, median_elevation)
 
 
@@ -109,31 +109,35 @@ def recover_rings(elevation: FloatArray, rho: FloatArray) -> IntArray:
     return np.asarray(np.searchsorted(borders, elevation).astype(np.intp))
 
 
-def _rank_by_elevation(labels: NDArray[np.integer], elevation: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Ring numbers that rise with elevation, and each ring's median elevation."""
+def _rank_by_elevation(
+    labels: NDArray[np.integer], elevation: FloatArray
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Ring numbers (n,) that rise with elevation; points (rings,) of each ring, and its median elevation."""
     lowest = int(labels.min()) if len(labels) else 0
     shifted = labels.astype(np.intp) - lowest
-    counts = np.bincount(shifted)
-    used = counts > 0
+    used = np.bincount(shifted) > 0
     ring = (np.cumsum(used) - 1)[shifted]
+    counts = np.bincount(ring, minlength=np.count_nonzero(used))
     # Small integers are sorted by their digits, which costs next to nothing.
     together = np.argsort(ring.astype(np.uint16) if len(counts) < 2**16 else ring, kind="stable")
-    by_ring = np.split(elevation[together], np.cumsum(counts[used])[:-1])
-    medians = np.array([np.partition(part, len(part) // 2)[len(part) // 2] for part in by_ring if len(part)])
+    # Of all points: medians of a part of them would swap rings that are close to one another.
+    by_ring, starts = elevation[together], np.cumsum(counts) - counts
+    for start, count in zip(starts.tolist(), counts.tolist(), strict=True):
+        by_ring[start : start + count].partition(count // 2)
+    medians = by_ring[starts + counts // 2]
     rank = np.argsort(medians, kind="stable")
     place = np.empty_like(rank)
     place[rank] = np.arange(len(rank))
-    return place[ring], medians[rank]
+    return place[ring], counts[rank], medians[rank]
 
 
-def _evenly_from_each(ring: IntArray, rings: int, number: int) -> tuple[IntArray, IntArray]:
-    """(rings, number) places evenly over each ring of points that come ring by ring, and (rings,) counts.
+def _evenly_from_each(counts: IntArray) -> IntArray:
+    """(rings, _CONE_POINTS) places evenly over each ring of ``counts`` points that come ring by ring.
 
     Places repeat in rings of fewer points.
     """
-    counts = np.bincount(ring, minlength=rings)
     starts = np.cumsum(counts) - counts
-    return starts[:, None] + np.arange(number) * counts[:, None] // number, counts
+    return np.asarray(starts[:, None] + np.arange(_CONE_POINTS) * counts[:, None] // _CONE_POINTS)
 
 
 def _cone_heights(z: FloatArray, rho: FloatArray, counts: IntArray) -> FloatArray:
@@ -158,7 +162,7 @@ def _cone_heights(z: FloatArray, rho: FloatArray, counts: IntArray) -> FloatArra
         error *= error
         error += 1.0
         weight = base / error
-    trusted = (counts >= _MIN_RING_POINTS) & (np.abs(tip) < 0.6)
+    trusted = (counts >= _MIN_CONE_POINTS) & (np.abs(tip) < 0.6)
     if rho.size:
         trusted &= rho.max(axis=1) > _MIN_RHO_RATIO * rho.min(axis=1)
     return np.where(trusted, tip, 0.0)

@@ -225,7 +225,8 @@ def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:
     order = some[np.lexsort((points[some, 2], objects[some]))]
     if len(order) == 0:
         return heights
-    _, first, counts = np.unique(objects[order], return_index=True, return_counts=True)
+    first = np.flatnonzero(np.diff(objects[order], prepend=-1))
+    counts = np.diff(first, append=len(order))
     lowest = points[order[first + (0.03 * counts).astype(np.intp)], 2]
     heights[order] = np.repeat(lowest, counts)
     return heights
