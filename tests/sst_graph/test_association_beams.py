@@ -83,3 +83,21 @@ def test_nothing() -> None:
     assert len(recover_rings(np.zeros(0), np.zeros(0))) == 0
     beams = arrange_beams(np.zeros((0, 3)), None)
     assert len(beams.order) == 0 and beams.step == 0.0
+
+
+def test_rings_of_few_points_among_rings_of_many() -> None:
+    points, rank = eight_rings(noise_m=0.002)
+    rng = np.random.default_rng(2)
+    kept = (rank % 2 == 0) | (
+        rng.random(len(rank)) < 0.05
+    )  # every other ring has fewer than its cone may use
+    counts = np.bincount(rank[kept])
+    assert counts[1::2].max() < 150 and counts[::2].min() > 1000
+    beams = arrange_beams(points[kept], NAMES[rank[kept]].astype(np.uint16))
+    np.testing.assert_array_equal(beams.ring, rank[kept])
+    np.testing.assert_allclose(beams.height, HEIGHTS, atol=0.005)
+    medians = [
+        np.median(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
+        for p in (points[kept & (rank == r)] for r in range(8))
+    ]
+    np.testing.assert_allclose(beams.elevation, medians, atol=1e-3)
