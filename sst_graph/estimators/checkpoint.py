@@ -6,7 +6,7 @@ import io
 import json
 import zlib
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from sst_graph.errors import DataError
 from sst_graph.estimators.epochs import RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.incremental import Tracker
-from sst_graph.estimators.object_sums import ObjectSums
+from sst_graph.estimators.object_sums import ObjectBelief, ObjectSums
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.settling import Milestones, Settling
 from sst_graph.estimators.smoother import WindowSmoother
@@ -37,7 +37,7 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 6
+VERSION = 7
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -190,6 +190,11 @@ def _put_window(arrays: Arrays, window: Window) -> dict[str, Any]:
             for scan, speeds in window.moving.items()
             for (c, number), speed in speeds.items()
         ],
+        "persistence": [
+            [scan, int(c), number, shares.tolist()]
+            for scan, by_name in window.persistence.shares.items()
+            for (c, number), shares in by_name.items()
+        ],
         "judged_anew": sorted(window.judged_anew),
     }
 
@@ -229,6 +234,22 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
     for scan, c, number, speed in head["moving"]:
         window.moving.setdefault(scan, {})[SemanticClass(c), number] = speed
     window.judged_anew = set(head["judged_anew"])
+    _get_persistence(head["persistence"], window)
+
+
+def _get_persistence(rows: Sequence[Any], window: Window) -> None:
+    """What has been found again, and the latest scans for those to come, from the newest backwards."""
+    persistence, led_by = window.persistence, {motion.to_ns: motion for motion in window.motions}
+    persistence.shares = {number: {} for number, _ in window.scans}
+    for scan, c, number, shares in rows:
+        persistence.shares[scan][SemanticClass(c), number] = np.array(shares)
+    wTl = window.wTl
+    for number, features in reversed(window.scans):
+        persistence.remember(number, features, wTl)
+        motion = led_by.get(features.stamp_ns)
+        if motion is None or window.scans[-1][1].stamp_ns - features.stamp_ns > persistence.memory_ns:
+            break
+        wTl = wTl.compose(motion.aTb.inverse())
 
 
 def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
@@ -244,14 +265,15 @@ def _put_smoother(arrays: Arrays, smoother: WindowSmoother) -> dict[str, Any]:
     arrays["sums/sides"] = np.array([[side, last] for side, (_, last) in sums.live.items()], np.int64)
     arrays["sums/objects/closed"] = sums.objects.closed
     for track, own in sums.objects.live.items():
-        _put_gaussian(arrays, f"sums/objects/{track}", own)
+        _put_gaussian(arrays, f"sums/objects/{track}", own.belief)
     arrays["sums/recent"] = np.concatenate([np.zeros((0, 6)), *sums.recent])
     return {
         "start_ns": smoother.epochs[0].start_ns,
         "entries": sorted(smoother.entries),
         "model": [smoother.model.side, smoother.model.side_frame, smoother.model.match],
         "recent": [len(rows) for rows in sums.recent],
-        "objects": [sums.objects.count, list(sums.objects.live)],
+        "objects": [sums.objects.count, sums.objects.weight, sums.objects.weight2],
+        "live": [[track, own.weight] for track, own in sums.objects.live.items()],
         "weights": [sums.weight, sums.curvature],
     }
 
@@ -261,9 +283,12 @@ def _get_smoother(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> 
     sums = ScoreSums(arrays["sums/JJ"], arrays["sums/frames"], arrays["sums/closed"])
     sums.recent = deque(recent, sums.recent.maxlen)
     sums.weight, sums.curvature = head["weights"]
-    count, objects = head["objects"]
-    live = {track: _gaussian(arrays, f"sums/objects/{track}") for track in objects}
-    sums.objects = ObjectSums(arrays["sums/objects/closed"], count, live)
+    live = {
+        track: ObjectBelief(_gaussian(arrays, f"sums/objects/{track}"), weight)
+        for track, weight in head["live"]
+    }
+    count, weight, weight2 = head["objects"]
+    sums.objects = ObjectSums(arrays["sums/objects/closed"], count, weight, weight2, live)
     for (side, last), row in zip(arrays["sums/sides"].reshape(-1, 2), arrays["sums/live"], strict=True):
         sums.live[int(side)] = (row, int(last))
     smoother = WindowSmoother(

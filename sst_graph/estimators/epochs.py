@@ -13,7 +13,8 @@ from sst_graph.estimators.scores import PairScore
 from sst_graph.estimators.undecided import Other
 from sst_graph.problem.graph import PairMatches
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import ErrorModel, composed
+from sst_graph.uncertainty.covariance import ErrorModel
+from sst_graph.uncertainty.object_spread import composed
 
 FloatArray = NDArray[np.float64]
 

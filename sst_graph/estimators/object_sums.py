@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.estimators.gaussian import Gaussian, Point, core_steps
-from sst_graph.uncertainty.covariance import growth_without
+from sst_graph.uncertainty.object_spread import ObjectSpread, growth_without
 
 FloatArray = NDArray[np.float64]
 
@@ -27,6 +27,7 @@ class ObjectBeliefs:
         tracks: (k) the objects' tracks.
         information, vector: (k, m, m), (k, m) as of :class:`~sst_graph.estimators.gaussian.Gaussian`.
         biases_px: (k,) the objects' own biases at the point; empty where they have none.
+        weights: (k,) sum of the robust weights of the objects' matches.
     """
 
     point: Point
@@ -34,10 +35,13 @@ class ObjectBeliefs:
     information: FloatArray
     vector: FloatArray
     biases_px: FloatArray
+    weights: FloatArray
 
     @classmethod
-    def of(cls, J: FloatArray, r: FloatArray, track: NDArray[np.intp], point: Point) -> ObjectBeliefs:
-        """From weighted rows J (m, n) at a point, residuals and tracks (m,)."""
+    def of(
+        cls, J: FloatArray, r: FloatArray, roots: FloatArray, track: NDArray[np.intp], point: Point
+    ) -> ObjectBeliefs:
+        """From weighted rows J (m, n) at a point, and residuals, roots of the weights, tracks (m,)."""
         order = np.argsort(track, kind="stable")
         bounds = [0, *(np.flatnonzero(np.diff(track[order])) + 1).tolist(), len(track)]
         rows, residuals = J[order, : point.core_size], r[order]
@@ -52,19 +56,37 @@ class ObjectBeliefs:
             informations.append(part.T @ part)
             vectors.append(-part.T @ residuals[start:end])
         biases = np.array([point.object_biases_px[point.tracks.index(name)] for name in names if own])
-        return cls(point, names, np.stack(informations), np.stack(vectors), biases)
+        weights = np.add.reduceat(roots[order] ** 2, bounds[:-1])
+        return cls(point, names, np.stack(informations), np.stack(vectors), biases, weights)
 
-    def gaussians(self) -> dict[int, Gaussian]:
-        """One by one, by track."""
+    def one_by_one(self) -> dict[int, ObjectBelief]:
+        """By track."""
         return {
-            track: Gaussian(_restricted(self.point, track), self.information[k], self.vector[k])
+            track: ObjectBelief(
+                Gaussian(_restricted(self.point, track), self.information[k], self.vector[k]),
+                float(self.weights[k]),
+            )
             for k, track in enumerate(self.tracks)
         }
 
     @classmethod
-    def single(cls, track: int, own: Gaussian) -> ObjectBeliefs:
+    def single(cls, track: int, own: ObjectBelief) -> ObjectBeliefs:
         """One object."""
-        return cls(own.point, (track,), own.information[None], own.vector[None], own.point.object_biases_px)
+        belief, biases = own.belief, own.belief.point.object_biases_px
+        weights = np.array([own.weight])
+        return cls(belief.point, (track,), belief.information[None], belief.vector[None], biases, weights)
+
+
+@dataclass(frozen=True)
+class ObjectBelief:
+    """The matches of one object in many frames, and the sum of their robust weights."""
+
+    belief: Gaussian
+    weight: float
+
+    def plus(self, other: ObjectBelief) -> ObjectBelief:
+        """These matches and others."""
+        return ObjectBelief(self.belief.plus(other.belief), self.weight + other.weight)
 
 
 @dataclass
@@ -74,16 +96,19 @@ class ObjectSums:
     Attributes:
         closed: (n, n) sum of squared scores that stand for the objects gone.
         count: how many they are.
+        weight, weight2: sums of their weights, and of the squares.
         live: the matches of each other object alone, by its track.
     """
 
     closed: FloatArray
     count: int = 0
-    live: dict[int, Gaussian] = field(default_factory=dict)
+    weight: float = 0.0
+    weight2: float = 0.0
+    live: dict[int, ObjectBelief] = field(default_factory=dict)
 
     def add(self, objects: ObjectBeliefs) -> None:
         """Take in the objects of a frame."""
-        for track, own in objects.gaussians().items():
+        for track, own in objects.one_by_one().items():
             self.live[track] = self.live[track].plus(own) if track in self.live else own
 
     def transform(self, T: FloatArray) -> None:
@@ -105,11 +130,11 @@ class ObjectSums:
         scores = steps @ information
         self.closed = self.closed + scores.T @ scores
         self.count += len(gone)
+        self.weight += sum(own.weight for own in gone.values())
+        self.weight2 += sum(own.weight**2 for own in gone.values())
 
-    def jackknife(
-        self, window: Sequence[ObjectBeliefs], naive: FloatArray, point: Point
-    ) -> FloatArray | None:
-        """(n, n) covariance from leaving out one object after the other; None where there is but one.
+    def spread(self, window: Sequence[ObjectBeliefs], naive: FloatArray, point: Point) -> ObjectSpread:
+        """How the estimate varies with the objects.
 
         Args:
             window: objects of the frames beside those taken in.
@@ -117,14 +142,15 @@ class ObjectSums:
             point: the estimate.
         """
         beliefs = [*(ObjectBeliefs.single(track, own) for track, own in self.live.items()), *window]
-        total, count = naive @ self.closed @ naive, self.count
+        squares, count = naive @ self.closed @ naive, self.count
+        weight, weight2 = self.weight, self.weight2
         if beliefs:
             tracks, informations, vectors = _summed(beliefs, point)
             steps = _steps_without(tracks, informations, vectors, naive, point)
-            total, count = total + steps.T @ steps, count + len(tracks)
-        if count < 2:
-            return None
-        return np.asarray((count - 1) / count * total)
+            squares, count = squares + steps.T @ steps, count + len(tracks)
+            weights = _weights_by_track(beliefs)
+            weight, weight2 = weight + float(weights.sum()), weight2 + float(weights @ weights)
+        return ObjectSpread.from_sums(squares, count, weight, weight2)
 
     def copy(self) -> ObjectSums:
         return replace(self, live=dict(self.live))
@@ -133,6 +159,13 @@ class ObjectSums:
 def _restricted(point: Point, track: int) -> Point:
     """A point with one object's bias, or none where it has none of its own."""
     return point.seen({track: 0}) if track in point.tracks else point.core()
+
+
+def _weights_by_track(beliefs: Sequence[ObjectBeliefs]) -> FloatArray:
+    """Weight of each object, summed over its frames."""
+    tracks = np.concatenate([part.tracks for part in beliefs])
+    weights = np.concatenate([part.weights for part in beliefs])
+    return np.asarray(np.bincount(np.unique(tracks, return_inverse=True)[1].reshape(-1), weights))
 
 
 def _summed(beliefs: Sequence[ObjectBeliefs], point: Point) -> tuple[tuple[int, ...], FloatArray, FloatArray]:

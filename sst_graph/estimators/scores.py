@@ -178,7 +178,7 @@ def score_pair(
         sides.scores.T @ sides.scores,
         len(pair),
         places,
-        ObjectBeliefs.of(J, r, track, point) if by_object else None,
+        ObjectBeliefs.of(J, r, roots, track, point) if by_object else None,
         weight,
         bend,
     )

@@ -19,7 +19,8 @@ from sst_graph.estimators.undecided import Undecided
 from sst_graph.problem.graph import GraphConfig
 from sst_graph.problem.state import bias_key, delay_key, object_bias_key, underside_track
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import ErrorModel, composed
+from sst_graph.uncertainty.covariance import ErrorModel
+from sst_graph.uncertainty.object_spread import composed
 
 FloatArray = NDArray[np.float64]
 
@@ -214,12 +215,12 @@ class WindowSmoother:
         point, scores = self.past.point, [entry.score for entry in self.entries.values()]
         columns = [point.columns(score.belief.point.tracks) for score in scores]
         robust = naive + naive @ self.sums.surplus(scores, columns, self.model) @ naive
-        jackknife = None
+        spread = None
         if not self.drift.enabled:
             found = [score.objects for score in scores if score.objects is not None]
             point_now = self.past.at(self._point).point
-            jackknife = self.sums.objects.jackknife(found, naive, point_now)
-        robust = composed(robust, jackknife, self.sums.flatness(scores))
+            spread = self.sums.objects.spread(found, naive, point_now)
+        robust = composed(robust, spread, self.sums.flatness(scores))
         return 0.5 * (robust + robust.T), naive
 
     def live_epochs(self) -> list[RetiredEpoch]:

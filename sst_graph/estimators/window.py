@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
-from sst_graph.problem.objects import MovingConfig, ObjectId, ObjectTracker, speed_of, standing_share
+from sst_graph.problem.objects import (
+    MovingConfig,
+    ObjectId,
+    ObjectTracker,
+    higher_speeds,
+    speed_of,
+    standing_share,
+)
+from sst_graph.problem.persistence import ObjectName, Persistence
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +49,7 @@ class Sighting:
     """
 
     scan: int
-    name: tuple[SemanticClass, int]
+    name: ObjectName
     stamp_ns: int
     centre: FloatArray
 
@@ -54,7 +62,9 @@ class Window:
         held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         sightings: the latest ones of each track, in the order of time.
-        moving: speed of the objects of a scan that move by themselves, by the scan's number [m/s].
+        moving: speed of the objects of a scan whose sightings say that they move by themselves, by the scan's
+            number [m/s].
+        persistence: which objects stay where they are, whatever their sightings say.
         judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
     """
@@ -65,10 +75,11 @@ class Window:
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
-        self.tracks: dict[int, dict[tuple[SemanticClass, int], int]] = {}
+        self.tracks: dict[int, dict[ObjectName, int]] = {}
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.sightings: dict[int, list[Sighting]] = {}
-        self.moving: dict[int, dict[tuple[SemanticClass, int], float]] = {}
+        self.moving: dict[int, dict[ObjectName, float]] = {}
+        self.persistence = Persistence()
         self.judged_anew: set[int] = set()
         self.next_scan = 0
         self.next_image = 0
@@ -106,6 +117,8 @@ class Window:
         self.scans.append((number, lean))
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self._judge(number, features.stamp_ns)
+        self.persistence.forget(self.first_scan)
+        self.judged_anew |= self.persistence.add(number, lean, self.wTl)
         for by_scan in (self.tracks, self.moving):
             for old in [k for k in by_scan if k < self.first_scan]:
                 del by_scan[old]
@@ -168,10 +181,14 @@ class Window:
     ) -> frozenset[tuple[SemanticClass, int, int]]:
         """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
         lost = [
-            (c, name, round(10.0 * (1.0 - standing_share(speed * abs(tau_s), reach_m))))
-            for (c, name), speed in self.moving.get(number, {}).items()
+            (c, name, round(10.0 * (1.0 - standing_share(speed, tau_s, reach_m))))
+            for (c, name), speed in self.speeds(number).items()
         ]
         return frozenset(entry for entry in lost if entry[2] > 0)
+
+    def speeds(self, number: int) -> dict[ObjectName, float]:
+        """Speed of the objects of a scan that move by themselves [m/s]."""
+        return higher_speeds(self.moving.get(number, {}), self.persistence.speeds(number))
 
     def restless(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings.
@@ -187,8 +204,7 @@ class Window:
         speeds: dict[ObjectId, float] = {}
         for position, number in enumerate(numbers):
             tracks.update({(position, c, n): track for (c, n), track in self.tracks[number].items()})
-            moving = self.moving.get(number, {})
-            speeds.update({(position, c, n): speed for (c, n), speed in moving.items()})
+            speeds.update({(position, c, n): speed for (c, n), speed in self.speeds(number).items()})
         return tracks, speeds
 
     def add_image(self, features: ImageFeatures) -> None:

@@ -135,8 +135,8 @@ class Tracks:
         if not self._moving:
             return np.ones(len(numbers))
         speeds = self._moving[drive]
-        steps_m = [speeds.get((scan, c, int(n)), 0.0) * abs(tau_s) for n in numbers]
-        return np.array([standing_share(step_m, reach_m) for step_m in steps_m])
+        own = [speeds.get((scan, c, int(n)), 0.0) for n in numbers]
+        return np.array([standing_share(speed, tau_s, reach_m) for speed in own])
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""

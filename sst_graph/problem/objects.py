@@ -1,9 +1,14 @@
-"""The same object in many scans: tracks through the world, for clusters of matches that err together."""
+"""The same object in many scans: tracks through the world, for clusters of matches that err together.
+
+And which of them move by themselves: by the way of their centres where they are followed long enough, which
+tells slow ones best, else by :mod:`sst_graph.problem.persistence`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -11,11 +16,14 @@ from numpy.typing import NDArray
 
 from sst_graph.association.boundary import Boundaries
 from sst_graph.problem.drive import Drive
+from sst_graph.problem.persistence import Persistence
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 ObjectId = tuple[int, SemanticClass, int]
 """Position of the scan, class, number of the object within the scan."""
+
+_Name = TypeVar("_Name")
 
 _REACH_M = 2.0
 """Farthest an object's centre may seem to jump between scans [m]."""
@@ -103,10 +111,33 @@ def moving_objects(
 
     Around every scan an object's centres within ``window_s`` are fitted by a straight, steady motion. A
     parked object's centre wanders too, as other sides of it come into view, but neither far nor straight.
+    Those that do not stay where they are pass for at least as fast as :class:`Persistence` says.
     """
-    config = config or MovingConfig()
-    places: dict[int, list[tuple[ObjectId, float, FloatArray]]] = {}
     poses = _scan_poses(drive)
+    followed = _speeds_of_tracks(drive, tracks, poses, config or MovingConfig())
+    return higher_speeds(followed, _speeds_without_tracks(drive, poses))
+
+
+def higher_speeds(a: Mapping[_Name, float], b: Mapping[_Name, float]) -> dict[_Name, float]:
+    """The higher of two speeds of each object."""
+    return {name: max(a.get(name, 0.0), b.get(name, 0.0)) for name in {**a, **b}}
+
+
+def _speeds_without_tracks(drive: Drive, poses: Sequence[gtsam.Pose3]) -> dict[ObjectId, float]:
+    persistence = Persistence()
+    for position, wTl in enumerate(poses):
+        persistence.add(position, drive.scans[position], wTl)
+    return {
+        (position, c, n): speed
+        for position in range(len(poses))
+        for (c, n), speed in persistence.speeds(position).items()
+    }
+
+
+def _speeds_of_tracks(
+    drive: Drive, tracks: Mapping[ObjectId, int], poses: Sequence[gtsam.Pose3], config: MovingConfig
+) -> dict[ObjectId, float]:
+    places: dict[int, list[tuple[ObjectId, float, FloatArray]]] = {}
     for (position, c, number), track in tracks.items():
         boundaries = drive.scans[position].boundaries[c]
         centre = poses[position].transformFrom(boundaries.lPs[boundaries.objects == number].mean(axis=0))
@@ -126,16 +157,19 @@ def moving_objects(
 
 _LEAST_SHARE = 0.1
 """An object that would keep less of its weight is left out."""
+_SHORTEST_S = 0.005
+"""Intervals count as no shorter: the offset is not known better while it is sought, and the outline of an
+object that moves by itself does not follow the offset as that of a standing one does."""
 
 
-def standing_share(step_m: float, reach_m: float) -> float:
-    """Share of its weight that an object keeps which moves by ``step_m`` within the interval of a pair.
+def standing_share(speed_mps: float, tau_s: float, reach_m: float) -> float:
+    """Share of its weight that an object keeps which moves by itself within a pair's interval.
 
-    Half at ``reach_m``; 0 far beyond it. Were it all or nothing, objects would come and go with the time
-    offset's last millisecond, and the estimate with them.
+    Half where it comes as far as ``reach_m``; 0 far beyond it. Were it all or nothing, objects would come and
+    go with the time offset's last millisecond, and the estimate with them.
     """
-    share = 1.0 / (1.0 + (step_m / reach_m) ** 2)
-    return share if share >= _LEAST_SHARE else 0.0
+    share = 1.0 / (1.0 + (speed_mps * np.hypot(tau_s, _SHORTEST_S) / reach_m) ** 2)
+    return float(share) if share >= _LEAST_SHARE else 0.0
 
 
 def speed_of(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:

@@ -14,8 +14,8 @@ under heavy tails it is flatter where it counts (Huber, Robust statistics, 1981,
 grows with the square of that ratio.
 
 Some objects err as no model of the others says: two that were merged, one half hidden. Where such an
-object has a direction to itself, the residuals do not show it. So the answer without each object is computed,
-too (a jackknife over objects), and the covariance takes a part of both.
+object has a direction to itself, the residuals do not show it:
+see :mod:`sst_graph.uncertainty.object_spread`.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from sst_graph.problem.graph import PairMatches, bias_groups, state_from, tracke
 from sst_graph.problem.objects import ObjectId
 from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
 from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.object_spread import ObjectSpread, composed, step_without
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -313,33 +314,9 @@ def robust_covariance(
     surplus = score_variance(table, model) - table.J.T @ table.J
     covariance = bread + bread @ surplus @ bread
     steps = steps_without_objects(table, bread)
-    jackknife = (len(steps) - 1) / len(steps) * (steps.T @ steps) if len(steps) > 1 else None
-    covariance = composed(covariance, jackknife, table.flatness)
+    weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
+    covariance = composed(covariance, ObjectSpread.of(steps, weights), table.flatness)
     return 0.5 * (covariance + covariance.T), model, unknowns
-
-
-def composed(covariance: FloatArray, jackknife: FloatArray | None, flatness: float) -> FloatArray:
-    """(n, n) covariance of an answer.
-
-    Args:
-        covariance: under the error model.
-        jackknife: over objects; None where there is but one.
-        flatness: mean robust weight over mean curvature.
-    """
-    if jackknife is not None:
-        covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * jackknife
-    return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
-
-
-_MODEL_SHARE, _OBJECT_SHARE = 0.37, 0.18
-"""Parts of the covariance under the error model, and of the jackknife over objects, in the answer's: set on
-simulated drives so that the normalised error squared is neither too large on drives with few or moving
-vehicles, where the model alone is too sure, nor too small on the others."""
-_LEFT_OUT = 0.98
-"""Largest part of what is known of a direction that is left out. Matches whose twists are given may seem to
-tell a direction better than all matches together do, whose twists are not."""
-_FLATTEST = 3.0
-"""Largest ratio of the mean robust weight to the mean curvature that is believed."""
 
 
 def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
@@ -351,22 +328,6 @@ def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
     return np.stack(
         [step_without(root, J[own].T @ J[own], J[own].T @ r[own]) for own in np.split(order, bounds)]
     )
-
-
-def step_without(root: FloatArray, information: FloatArray, score: FloatArray) -> FloatArray:
-    """(n,) how far an estimate moves without some matches.
-
-    Args:
-        root: (n, n) Cholesky factor of the inverse of all information.
-        information, score: (n, n), (n,) J^T J and J^T r of these matches.
-    """
-    shares, axes = np.linalg.eigh(root.T @ information @ root)
-    return np.asarray(root @ (axes @ (growth_without(shares) * (axes.T @ (root.T @ score)))))
-
-
-def growth_without(shares: FloatArray) -> FloatArray:
-    """How much variances grow along directions of which these shares of the information are left out."""
-    return np.asarray(1.0 / (1.0 - np.minimum(shares, _LEFT_OUT)))
 
 
 def marginal_covariance(

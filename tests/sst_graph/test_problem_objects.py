@@ -37,16 +37,21 @@ def boundaries(*centres: np.ndarray) -> Boundaries:
 
 
 def drive(*paths: Callable[[float], np.ndarray]) -> Drive:
-    """Scans of a LiDAR that drives a curve past vehicles whose world places are given over time [s]."""
+    """Scans of a LiDAR that drives a curve past vehicles whose world places are given over time [s].
+
+    The wandering one has a body around its visible side.
+    """
+    body = np.stack(np.meshgrid(*[np.arange(-1.2, 1.3, 0.1)] * 2, [-0.5, 0.0, 0.5]), -1).reshape(-1, 3)
     scans, wTl = [], gtsam.Pose3()
     nothing, small = np.zeros(0), np.zeros((0, 3), np.float32)
     for k in range(SCANS):
         places = [wTl.transformTo(path(0.1 * k)) for path in paths]
         found = {VEHICLE: boundaries(*places)}
-        labels = np.zeros(0, np.uint8)
-        scans.append(
-            ScanFeatures(k, k * PERIOD_NS, found, np.zeros((0, 3)), labels, nothing, small, small[:, 0])
-        )
+        inside = np.zeros((0, 3))
+        if wandering in paths:
+            inside = (body + np.array([15.0, -6.0, 0.0]) - wTl.translation()) @ wTl.rotation().matrix()
+        labels = np.full(len(inside), VEHICLE, np.uint8)
+        scans.append(ScanFeatures(k, k * PERIOD_NS, found, inside, labels, nothing, small, small[:, 0]))
         wTl = wTl.compose(STEP)
     motions = [
         RelativeMotion(k * PERIOD_NS, (k + 1) * PERIOD_NS, STEP, np.eye(6) * 1e-6) for k in range(SCANS - 1)
@@ -64,8 +69,12 @@ def wandering(seconds: float) -> np.ndarray:
     return np.array([15.0 + 0.5 * np.sin(11.0 * seconds), -6.0 + 0.3 * np.cos(17.0 * seconds), 0.0])
 
 
-def creeping(seconds: float) -> np.ndarray:
-    return np.array([30.0 + 0.4 * seconds, 8.0, 0.0])
+SLOW_MPS = 1.1
+
+
+def slow(seconds: float) -> np.ndarray:
+    """At 60 m, where half a metre still counts as found again."""
+    return np.array([60.0 + SLOW_MPS * seconds, 8.0, 0.0])
 
 
 def mover(seconds: float) -> np.ndarray:
@@ -81,18 +90,27 @@ def test_one_track_for_each_object() -> None:
 
 
 def test_a_mover_is_found_and_parked_vehicles_are_not() -> None:
-    made = drive(parked, wandering, creeping, mover)
+    made = drive(parked, wandering, mover)
     found = moving_objects(made, object_tracks(made))
-    assert set(found) == {(k, VEHICLE, 3) for k in range(SCANS)}
-    assert list(found.values()) == pytest.approx([np.hypot(6.0, 2.0)] * SCANS, rel=1e-6)
+    assert set(found) == {(k, VEHICLE, 2) for k in range(SCANS)}
+    assert min(found.values()) > np.hypot(6.0, 2.0) - 1e-6
 
 
-def test_too_few_sightings_tell_nothing() -> None:
-    made = drive(mover)
+def test_a_mover_is_found_without_a_track() -> None:
+    """Its points are not where they were, nor where they will be."""
+    made = drive(parked, mover)
     tracks = object_tracks(made)
-    assert moving_objects(made, tracks)
+    assert {n for _, _, n in moving_objects(made, {key: tracks[key] for key in list(tracks)[:3]})} == {1}
+    assert {n for _, _, n in moving_objects(made, {})} == {1}
+
+
+def test_a_slow_vehicle_is_found_by_its_track_alone() -> None:
+    """It overlaps with itself 0.3 s later; twelve centres in a line tell."""
+    made = drive(slow)
+    tracks = object_tracks(made)
+    found = moving_objects(made, tracks)
+    assert list(found.values()) == pytest.approx([SLOW_MPS] * SCANS, rel=1e-6)
     assert not moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))
-    assert not moving_objects(made, {key: tracks[key] for key in list(tracks)[:3]})
     assert not moving_objects(made, {})
 
 
@@ -112,9 +130,16 @@ def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
 
 def test_a_mover_loses_its_weight_bit_by_bit() -> None:
     """3 mm within the pair's interval halve it; a parked object keeps all of it, a fast one nothing."""
-    steps_m = np.linspace(0.0, 0.02, 201)
-    shares = np.array([standing_share(float(step_m), 0.003) for step_m in steps_m])
-    assert shares[0] == 1.0 and standing_share(0.003, 0.003) == pytest.approx(0.5)
+    speeds = np.linspace(0.0, 2.0, 201)
+    shares = np.array([standing_share(float(speed), 0.012, 0.003) for speed in speeds])
+    # sqrt(12^2 + 5^2) ms = 13 ms.
+    assert shares[0] == 1.0 and standing_share(0.003 / 0.013, 0.012, 0.003) == pytest.approx(0.5)
     assert (np.diff(shares) <= 0.0).all() and shares[-1] == 0.0
     # The one jump, where an object is left out, is small beside the whole.
     assert np.abs(np.diff(shares)).max() < 0.11
+
+
+def test_a_fast_mover_is_left_out_even_where_scan_and_image_meet() -> None:
+    """How its outline follows the time offset is not known."""
+    assert standing_share(8.0, 0.0, 0.003) == 0.0
+    assert standing_share(0.0, 0.05, 0.003) == 1.0

@@ -9,6 +9,7 @@ import pytest
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
 from sst_graph.estimators.settling import Milestones
+from sst_graph.uncertainty.object_spread import ObjectSpread
 
 TRACKS = (4, 7, 9)
 N = 8 + len(TRACKS)
@@ -30,7 +31,8 @@ def _frame(seed: int, at: Point) -> tuple[ObjectBeliefs, dict[int, tuple[np.ndar
         residuals.append(r)
         track += [name] * 20
     stacked = np.concatenate(rows), np.concatenate(residuals), np.array(track, dtype=np.intp)
-    return ObjectBeliefs.of(*stacked, at), parts
+    J, r, tracks = stacked
+    return ObjectBeliefs.of(J, r, np.ones(len(r)), tracks, at), parts
 
 
 def _whole(*frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -55,19 +57,16 @@ def test_the_jackknife_is_the_batch_s_wherever_the_frames_are() -> None:
     H = _whole(rows_1, rows_2)
     expected = _expected(H, rows_1, rows_2)
     sums = ObjectSums(np.zeros((N, N)))
-    both = sums.jackknife([one, two], np.linalg.inv(H), point)
-    assert both is not None
-    np.testing.assert_allclose(both, expected, rtol=1e-6, atol=1e-12)
+    both = sums.spread([one, two], np.linalg.inv(H), point)
+    np.testing.assert_allclose(both.jackknife, expected, rtol=1e-6, atol=1e-12)
     sums.add(one)
-    left = sums.jackknife([two], np.linalg.inv(H), point)
-    assert left is not None
-    np.testing.assert_allclose(left, expected, rtol=1e-6, atol=1e-12)
+    left = sums.spread([two], np.linalg.inv(H), point)
+    np.testing.assert_allclose(left.jackknife, expected, rtol=1e-6, atol=1e-12)
     sums.add(two)
     sums.close((4,), H, np.linalg.inv(H), point)
     assert set(sums.live) == {4} and sums.count == 2
-    closed = sums.jackknife([], np.linalg.inv(H), point)
-    assert closed is not None
-    np.testing.assert_allclose(closed, expected, rtol=1e-6, atol=1e-12)
+    closed = sums.spread([], np.linalg.inv(H), point)
+    np.testing.assert_allclose(closed.jackknife, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_gone_objects_count_on_when_their_biases_are_marginalized_out() -> None:
@@ -79,9 +78,8 @@ def test_gone_objects_count_on_when_their_biases_are_marginalized_out() -> None:
     sums.close((), H, np.linalg.inv(H), point)
     smaller, T = Gaussian(point, H, np.zeros(N)).without([7, 9])
     sums.transform(T)
-    found = sums.jackknife([], np.linalg.inv(smaller.information), smaller.point)
-    assert found is not None
-    np.testing.assert_allclose(found, _expected(H, rows)[:9, :9], rtol=1e-6, atol=1e-12)
+    found = sums.spread([], np.linalg.inv(smaller.information), smaller.point)
+    np.testing.assert_allclose(found.jackknife, _expected(H, rows)[:9, :9], rtol=1e-6, atol=1e-12)
 
 
 def test_residuals_follow_the_estimate() -> None:
@@ -93,20 +91,39 @@ def test_residuals_follow_the_estimate() -> None:
     H = _whole(rows)
     expected = _expected(H, moved)
     there = point.moved(d)
-    found = ObjectSums(np.zeros((N, N))).jackknife([frame], np.linalg.inv(H), there)
+    found = ObjectSums(np.zeros((N, N))).spread([frame], np.linalg.inv(H), there)
     sums = ObjectSums(np.zeros((N, N)))
     sums.add(frame)
-    after = sums.jackknife([], np.linalg.inv(H), there)
-    assert found is not None and after is not None
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-12)
-    np.testing.assert_allclose(after, expected, rtol=1e-5, atol=1e-12)
+    after = sums.spread([], np.linalg.inv(H), there)
+    np.testing.assert_allclose(found.jackknife, expected, rtol=1e-5, atol=1e-12)
+    np.testing.assert_allclose(after.jackknife, expected, rtol=1e-5, atol=1e-12)
 
 
 def test_one_object_cannot_be_left_out() -> None:
+    """What the others would say without it is not known: the correction is the largest."""
     point = Point(gtsam.Pose3(), 0.0, np.zeros(1))
     J, r = np.eye(8), np.ones(8)
-    frame = ObjectBeliefs.of(J, r, np.zeros(8, dtype=np.intp), point)
-    assert ObjectSums(np.zeros((8, 8))).jackknife([frame], 0.5 * np.eye(8), point) is None
+    frame = ObjectBeliefs.of(J, r, np.ones(8), np.zeros(8, dtype=np.intp), point)
+    spread = ObjectSums(np.zeros((8, 8))).spread([frame], 0.5 * np.eye(8), point)
+    assert not spread.jackknife.any() and spread.number == 1.0
+    several = ObjectSpread(spread.jackknife, 5.0)
+    assert spread.correction > several.correction == pytest.approx(1.25)
+
+
+def test_the_number_of_objects_counts_those_gone() -> None:
+    """Three objects of twenty matches each in two frames, wherever the frames are: three."""
+    point = _point()
+    (one, rows_1), (two, rows_2) = _frame(1, point), _frame(2, point)
+    H = _whole(rows_1, rows_2)
+    sums = ObjectSums(np.zeros((N, N)))
+    sums.add(one)
+    assert sums.spread([two], np.linalg.inv(H), point).number == pytest.approx(3.0)
+    sums.close((4,), H, np.linalg.inv(H), point)
+    assert (sums.count, sums.weight, sums.weight2) == (2, 40.0, 800.0)
+    # Objects seen again after they were closed are others.
+    weights = np.array([20.0, 20.0, 40.0, 20.0, 20.0])
+    again = sums.spread([two], np.linalg.inv(H), point).number
+    assert again == pytest.approx(weights.sum() ** 2 / (weights @ weights))
 
 
 @pytest.mark.parametrize(

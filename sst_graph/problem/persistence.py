@@ -1,0 +1,185 @@
+"""Objects that stay: what a scan shows of them is at the same place a little before or after, too.
+
+An object that moves by itself has left its place by then. That needs no track of the object and no scan in
+which it is alone, so it tells oncoming vehicles, too, whose tracks break and join others'. What has only
+just come into view is at its place a little later, and what is about to leave was there a little before: the
+better of the two counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from sst_graph.odometry.lidar import MOVABLE_CLASSES
+from sst_graph.problem.drive import ScanFeatures
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+ObjectName = tuple[SemanticClass, int]
+"""Class of an object and its number within its scan."""
+
+
+@dataclass(frozen=True)
+class PersistenceConfig:
+    """When an object stays where it is.
+
+    Attributes:
+        horizons_s: how long before and after a scan is looked; the shorter tells fast objects before they
+            overlap with the next, the longer slow ones [s].
+        reach_m: farthest from its place that a point counts as found again [m] ...
+        reach_ratio: ... or this fraction of its range, where that is more.
+        lost, kept: shares of an object's points that are found again, at or below which it moves, and at or
+            above which it stays.
+        most_points: points of an object that are looked for.
+    """
+
+    horizons_s: tuple[float, ...] = (0.1, 0.3)
+    reach_m: float = 0.2
+    reach_ratio: float = 0.008
+    lost: float = 0.35
+    kept: float = 0.55
+    most_points: int = 48
+
+
+_SPEED = 0.6
+"""Speed that an object half way between lost and kept passes for [m/s]."""
+_FASTEST = 30.0
+"""Speed that a lost object passes for [m/s]."""
+
+
+class Persistence:
+    """Which objects of the latest scans stay, scan by scan; scans are told apart by their number.
+
+    Attributes:
+        shares: of each object of each scan, the share of its points found again, for each horizon (nan where
+            no scan is that far away).
+    """
+
+    def __init__(self, config: PersistenceConfig | None = None) -> None:
+        self.config = config or PersistenceConfig()
+        self.shares: dict[int, dict[ObjectName, FloatArray]] = {}
+        self._places: dict[int, _Places] = {}
+
+    def add(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> set[int]:
+        """The next scan, posed at ``wTl``; numbers of the earlier ones that it tells something new about."""
+        here = self.remember(number, scan, wTl)
+        horizons = self.config.horizons_s
+        self.shares[number] = {name: np.full(len(horizons), np.nan) for name in here.names}
+        others = [self._nearest(number, scan.stamp_ns, seconds) for seconds in horizons]
+        before = {other: self.speeds(other) for other in others if other is not None}
+        for horizon, other in enumerate(others):
+            if other is not None:
+                self._note(number, horizon, here.found_in(self._places[other]))
+                self._note(other, horizon, self._places[other].found_in(here))
+        return {other for other, speeds in before.items() if self.speeds(other) != speeds}
+
+    def remember(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
+        """Keep the places of a scan's objects for the scans that follow."""
+        self._places[number] = places = _Places.of(scan, wTl, self.config)
+        since = scan.stamp_ns - self.memory_ns
+        self._places = {k: kept for k, kept in self._places.items() if kept.stamp_ns >= since}
+        return places
+
+    @property
+    def memory_ns(self) -> int:
+        """Age of the oldest scan that one to come is compared with."""
+        return round(1.5e9 * max(self.config.horizons_s))
+
+    def forget(self, before: int) -> None:
+        """Drop all scans before one."""
+        for by_scan in (self.shares, self._places):
+            for number in [k for k in by_scan if k < before]:
+                del by_scan[number]
+
+    def speeds(self, number: int) -> dict[ObjectName, float]:
+        """Speed [m/s] that the objects of a scan pass for, of those that do not stay."""
+        found = {}
+        for name, shares in self.shares.get(number, {}).items():
+            known = shares[~np.isnan(shares)]
+            if len(known) and known.min() < self.config.kept:
+                found[name] = self._speed(float(known.min()))
+        return found
+
+    def _speed(self, share: float) -> float:
+        above = max(share - self.config.lost, 1e-9)
+        return float(min(_SPEED * np.sqrt((self.config.kept - share) / above), _FASTEST))
+
+    def _nearest(self, number: int, stamp_ns: int, seconds: float) -> int | None:
+        """The earlier scan whose age is nearest to some seconds, from 0.7 to 1.5 times as much."""
+        ages = {k: 1e-9 * (stamp_ns - kept.stamp_ns) for k, kept in self._places.items() if k != number}
+        near = {k: abs(age - seconds) for k, age in ages.items() if 0.7 * seconds <= age <= 1.5 * seconds}
+        return min(near, key=near.__getitem__) if near else None
+
+    def _note(self, number: int, horizon: int, found: dict[ObjectName, float]) -> None:
+        for name, share in found.items():
+            shares = self.shares.get(number, {}).get(name)
+            if shares is not None:
+                shares[horizon] = np.fmax(shares[horizon], share)
+
+
+@dataclass(frozen=True)
+class _Places:
+    """The movable objects of a scan.
+
+    Attributes:
+        stamp_ns: of the scan.
+        names: of the objects.
+        wPs, reaches_m, owners: (n, 3), (n,), (n,) some points of the objects' outlines in the world, how far
+            from there they may be found, and whose they are, by class.
+        trees: all points of a class in the world.
+    """
+
+    stamp_ns: int
+    names: tuple[ObjectName, ...]
+    wPs: dict[SemanticClass, FloatArray]
+    reaches_m: dict[SemanticClass, FloatArray]
+    owners: dict[SemanticClass, NDArray[np.intp]]
+    trees: dict[SemanticClass, KDTree]
+
+    @classmethod
+    def of(cls, scan: ScanFeatures, wTl: gtsam.Pose3, config: PersistenceConfig) -> _Places:
+        names: list[ObjectName] = []
+        wPs, reaches, owners, trees = {}, {}, {}, {}
+        for c in [c for c in MOVABLE_CLASSES if c in scan.boundaries]:
+            outline = [scan.boundaries[c], *([scan.undersides[c]] if c in scan.undersides else [])]
+            lPs = np.concatenate([part.lPs for part in outline])
+            objects = np.concatenate([part.objects for part in outline])
+            chosen = _some_of_each(objects, config.most_points)
+            names += [(c, int(n)) for n in np.unique(objects)]
+            wPs[c], owners[c] = _moved(wTl, lPs[chosen]), objects[chosen]
+            ranges = np.linalg.norm(lPs[chosen], axis=1)
+            reaches[c] = np.maximum(config.reach_m, config.reach_ratio * ranges)
+            inside = scan.lPs[scan.classes == c]
+            trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, inside])))
+        return cls(scan.stamp_ns, tuple(names), wPs, reaches, owners, trees)
+
+    def found_in(self, other: _Places) -> dict[ObjectName, float]:
+        """Share of each object's points that have a point of their class near by in another scan."""
+        shares = {}
+        for c, wPs in self.wPs.items():
+            owners, near = self.owners[c], np.zeros(len(wPs), dtype=bool)
+            if c in other.trees:
+                reaches = self.reaches_m[c]
+                distances, _ = other.trees[c].query(wPs, distance_upper_bound=float(reaches.max()))
+                near = distances <= reaches
+            numbers, which = np.unique(owners, return_inverse=True)
+            found = np.bincount(which, near) / np.bincount(which)
+            shares.update({(c, int(n)): float(share) for n, share in zip(numbers, found, strict=True)})
+        return shares
+
+
+def _moved(wTl: gtsam.Pose3, lPs: FloatArray) -> FloatArray:
+    """Points (n, 3) in the world [m]."""
+    return np.asarray(lPs @ wTl.rotation().matrix().T + wTl.translation())
+
+
+def _some_of_each(objects: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Positions of at most ``most`` evenly spread entries of each number."""
+    order = np.argsort(objects, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(objects[order])) + 1)
+    return np.concatenate([part[:: -(-len(part) // most)] for part in parts if len(part)])
