@@ -101,14 +101,17 @@ class _Step:
 
     Attributes:
         mean, covariance: (6, r, 4), (6, r, 4, 4) of [twist, acceleration, pose errors before and after].
-        transition, diffusion: (4, 4), (6, r, 4, 4) that led here from the motion before.
+        transition: (4, 4) that led here from the motion before.
+        ahead: (6, r, 4, 4) covariance that it led to, before this motion was heard.
+        gain: (6, r, 4, 4) of the smoother (Rauch, Tung, Striebel) from here to the motion before.
         squares, log_sizes: (6, r) sums so far of squared, whitened innovations, and of their log variances.
     """
 
     mean: FloatArray
     covariance: FloatArray
     transition: FloatArray
-    diffusion: FloatArray
+    ahead: FloatArray
+    gain: FloatArray
     squares: FloatArray
     log_sizes: FloatArray
 
@@ -155,11 +158,9 @@ class _Run:
                 return
             # Rauch, Tung, Striebel.
             step, before = self._steps[k], self._steps[k - 1]
-            F, P = step.transition, before.covariance
-            ahead = F @ P @ F.T + step.diffusion
-            gain = np.swapaxes(np.linalg.solve(ahead, F @ P), -1, -2)
-            mean = before.mean + (gain @ (mean - before.mean @ F.T)[..., None])[..., 0]
-            covariance = P + gain @ (covariance - ahead) @ np.swapaxes(gain, -1, -2)
+            mean = before.mean + (step.gain @ (mean - before.mean @ step.transition.T)[..., None])[..., 0]
+            closer = step.gain @ (covariance - step.ahead) @ np.swapaxes(step.gain, -1, -2)
+            covariance = before.covariance + closer
 
     def _beginning(self, motion: RelativeMotion) -> _Step:
         """What is known before the first motion."""
@@ -167,8 +168,8 @@ class _Run:
         covariance = np.zeros((*shape, 4, 4))
         covariance[..., 0, 0], covariance[..., 1, 1] = _DIFFUSE
         covariance[..., 2, 2] = covariance[..., 3, 3] = self._pose_variances(motion)[:, None]
-        nothing = np.zeros(shape)
-        return _Step(np.zeros((*shape, 4)), covariance, np.eye(4), np.zeros((*shape, 4, 4)), nothing, nothing)
+        nothing, none = np.zeros(shape), np.zeros((*shape, 4, 4))
+        return _Step(np.zeros((*shape, 4)), covariance, np.eye(4), covariance, none, nothing, nothing)
 
     def _predicted(self, motion: RelativeMotion) -> _Step:
         before, last = self._steps[-1], self.motions[-1]
@@ -180,8 +181,10 @@ class _Run:
         jerk = np.array([[step**3 / 3.0, step**2 / 2.0], [step**2 / 2.0, step]])
         Q[..., :2, :2] = 3.0 * _ROUGHNESS[:, None, None] * jerk
         Q[..., 3, 3] = self._pose_variances(motion)[:, None]
-        covariance = F @ before.covariance @ F.T + Q
-        return _Step(before.mean @ F.T, covariance, F, Q, before.squares, before.log_sizes)
+        moved = F @ before.covariance
+        ahead = moved @ F.T + Q
+        gain = np.swapaxes(np.linalg.solve(ahead, moved), -1, -2)
+        return _Step(before.mean @ F.T, ahead, F, ahead, gain, before.squares, before.log_sizes)
 
     def _updated(self, predicted: _Step, motion: RelativeMotion) -> _Step:
         seconds = motion.seconds / self._seconds

@@ -134,9 +134,9 @@ class Tracks:
         """(n,) share of their weight that objects of a scan keep, for they may move in an interval."""
         if not self._moving:
             return np.ones(len(numbers))
-        speeds = self._moving[drive]
-        own = [speeds.get((scan, c, int(n)), 0.0) for n in numbers]
-        return np.array([standing_share(speed, tau_s, reach_m) for speed in own])
+        speeds, (names, which) = self._moving[drive], np.unique(numbers, return_inverse=True)
+        own = [speeds.get((scan, c, name), 0.0) for name in names.tolist()]
+        return np.array([standing_share(speed, tau_s, reach_m) for speed in own])[which.reshape(-1)]
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
