@@ -37,7 +37,7 @@ from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
-_Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray]
+_Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray | None]
 
 
 @dataclass(frozen=True)
@@ -118,30 +118,39 @@ class Tracks:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track(smoother) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._moving: Sequence[Mapping[ObjectId, float]] = [
-            moving_objects(drive, tracks) for drive, tracks in found
-        ]
+        self._moving = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
 
     def seeing(self, objects: Mapping[ObjectId, int], moving: Mapping[ObjectId, float]) -> Tracks:
         """The same twists of one drive, with other object tracks and speeds of the moving objects."""
         other = Tracks([])
-        other._tracks, other.objects, other._moving = self._tracks, [objects], [moving]
+        other._tracks, other.objects, other._moving = self._tracks, [objects], [_by_scan(moving)]
         return other
 
     def shares(
         self, drive: int, scan: int, c: SemanticClass, numbers: NDArray[np.intp], reach_m: float, tau_s: float
-    ) -> FloatArray:
-        """(n,) share of their weight that objects of a scan keep, for they may move in an interval."""
-        if not self._moving:
-            return np.ones(len(numbers))
-        speeds, (names, which) = self._moving[drive], np.unique(numbers, return_inverse=True)
-        own = [speeds.get((scan, c, name), 0.0) for name in names.tolist()]
-        return np.array([standing_share(speed, tau_s, reach_m) for speed in own])[which.reshape(-1)]
+    ) -> FloatArray | None:
+        """(n,) share of their weight that objects of a scan keep, for they may move in an interval.
+
+        None where all keep all of it.
+        """
+        speeds = self._moving[drive].get(scan, {}) if self._moving else {}
+        if not any(own == c for own, _ in speeds):
+            return None
+        names, which = np.unique(numbers, return_inverse=True)
+        shares = [standing_share(speeds.get((c, n), 0.0), tau_s, reach_m) for n in names.tolist()]
+        return np.array(shares)[which.reshape(-1)]
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
         track = self._tracks[drive]
         return None if track is None else track.at(stamp_ns)
+
+
+def _by_scan(speeds: Mapping[ObjectId, float]) -> dict[int, dict[tuple[SemanticClass, int], float]]:
+    found: dict[int, dict[tuple[SemanticClass, int], float]] = {}
+    for (scan, c, n), speed in speeds.items():
+        found.setdefault(scan, {})[c, n] = speed
+    return found
 
 
 def associate(
@@ -191,14 +200,13 @@ def _standing(
     """Boundaries without the objects that would keep nothing of their weight."""
     still = {}
     for c, points in boundaries.items():
-        numbers, which = np.unique(points.objects, return_inverse=True)
-        keeps = share(c, numbers)[which.reshape(-1)] > 0.0
-        still[c] = points if keeps.all() else points.take(np.flatnonzero(keeps))
+        shares = share(c, points.objects)
+        still[c] = points if shares is None or shares.all() else points.take(np.flatnonzero(shares))
     return {c: points for c, points in still.items() if len(points)}
 
 
-def _weighted(matches: SilhouetteMatches, shares: FloatArray) -> SilhouetteMatches:
-    if (shares == 1.0).all():
+def _weighted(matches: SilhouetteMatches, shares: FloatArray | None) -> SilhouetteMatches:
+    if shares is None or (shares == 1.0).all():
         return matches
     alignment = replace(matches.alignment, weights=shares * matches.alignment.weights)
     return replace(matches, alignment=alignment)

@@ -36,6 +36,7 @@ class PersistenceConfig:
         lost, kept: shares of an object's points that are found again, at or below which it moves, and at or
             above which it stays.
         most_points: points of an object that are looked for.
+        most_inside: points of a class, beside its outlines, among which they are (about).
     """
 
     horizons_s: tuple[float, ...] = (0.1, 0.3)
@@ -44,6 +45,7 @@ class PersistenceConfig:
     lost: float = 0.35
     kept: float = 0.55
     most_points: int = 48
+    most_inside: int = 1000
 
 
 _SPEED = 0.6
@@ -155,7 +157,8 @@ class _Places:
             ranges = np.linalg.norm(lPs[chosen], axis=1)
             reaches[c] = np.maximum(config.reach_m, config.reach_ratio * ranges)
             inside = scan.lPs[scan.classes == c]
-            trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, inside])))
+            thin = inside[:: max(1, len(inside) // config.most_inside)]
+            trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, thin])))
         return cls(scan.stamp_ns, tuple(names), wPs, reaches, owners, trees)
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
