@@ -156,12 +156,14 @@ def answer_joint(
     config, finals = dataclasses.replace(config, joint=below.joint), below.solutions
     solution = finals[0]
     # 4. How sure; where the labels tell everything, the motion is heard too.
-    covariance, model, _ = robust_covariance(*_frozen(solution), objects)
+    robust = robust_covariance(*_frozen(solution), objects)
+    covariance = robust.matrix
     heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
-        covariance, model, _ = robust_covariance(*_frozen(solution), objects)
-        covariance *= heard.inflation
+        robust = robust_covariance(*_frozen(solution), objects)
+        covariance = heard.inflation * robust.matrix
+    model = robust.model
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
@@ -184,7 +186,7 @@ def answer_joint(
             "undersides": [c.name.lower() for c in below.joint.graph.undersides],
             "motion": heard.diagnostics,
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), objects, drives, model)),
+            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
         },
     )
 

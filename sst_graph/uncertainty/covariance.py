@@ -299,14 +299,31 @@ def score_variance(table: MatchTable, model: ErrorModel) -> FloatArray:
     return np.asarray(meat)
 
 
+@dataclass(frozen=True)
+class RobustCovariance:
+    """A cluster-robust covariance and what it was made of.
+
+    Attributes:
+        matrix: (n, n) covariance of [extrinsic 6, offsets, biases].
+        model: the error model behind it.
+        unknowns: its columns.
+        table: the matches.
+    """
+
+    matrix: FloatArray
+    model: ErrorModel
+    unknowns: Unknowns
+    table: MatchTable
+
+
 def robust_covariance(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     pairs: Sequence[PairMatches],
     state: State,
     tracks: Sequence[dict[ObjectId, int]],
-) -> tuple[FloatArray, ErrorModel, Unknowns]:
-    """Covariance (n, n) of [extrinsic 6, offsets, biases], the error model behind it, and the columns."""
+) -> RobustCovariance:
+    """Covariance of the unknowns that are not motion, from a frozen graph and its matches."""
     unknowns = Unknowns.of(state, pairs)
     bread = marginal_covariance(graph, values, unknowns)
     table = match_table(graph, values, pairs, state, tracks, unknowns)
@@ -316,7 +333,7 @@ def robust_covariance(
     steps = steps_without_objects(table, bread)
     weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
     covariance = composed(covariance, ObjectSpread.of(steps, weights), table.flatness)
-    return 0.5 * (covariance + covariance.T), model, unknowns
+    return RobustCovariance(0.5 * (covariance + covariance.T), model, unknowns, table)
 
 
 def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:

@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import PairMatches
-from sst_graph.problem.objects import ObjectId
 from sst_graph.problem.state import State, delay_key, twist_key
 from sst_graph.result import FrameId
-from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, Unknowns, match_table
+from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, RobustCovariance, Unknowns
 from sst_graph.uncertainty.frame_information import FrameInformation, positive_part
 
 FloatArray = NDArray[np.float64]
@@ -86,13 +85,11 @@ def frame_gains(
     values: gtsam.Values,
     pairs: Sequence[PairMatches],
     state: State,
-    tracks: Sequence[dict[ObjectId, int]],
     drives: Sequence[Drive],
-    model: ErrorModel,
+    robust: RobustCovariance,
 ) -> tuple[FrameInformation, ...]:
     """What each pair brought, in the order of the pairs; pairs that share an image count as one."""
-    unknowns = Unknowns.of(state, pairs)
-    table = match_table(graph, values, pairs, state, tracks, unknowns)
+    unknowns, table, model = robust.unknowns, robust.table, robust.model
     prior, twisted = _frame_information(graph, values, unknowns)
     groups = _groups(pairs)
     parts = [_part(table, rows, *twisted[key], model) for key, (_, rows) in groups.items()]

@@ -47,8 +47,8 @@ def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[Obj
 def gains(motion: str) -> tuple[ErrorModel, tuple[FrameInformation, ...]]:
     drive, state, pairs, objects = matched(motion)
     graph, values = joint_graph(pairs, state, CONFIG)
-    _, model, _ = robust_covariance(graph, values, pairs, state, objects)
-    return model, frame_gains(graph, values, pairs, state, objects, [drive], model)
+    robust = robust_covariance(graph, values, pairs, state, objects)
+    return robust.model, frame_gains(graph, values, pairs, state, [drive], robust)
 
 
 def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
