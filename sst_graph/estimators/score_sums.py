@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import scattered
 from sst_graph.estimators.object_sums import ObjectSums
 from sst_graph.estimators.scores import PairScore, summed_rows
@@ -21,6 +22,7 @@ from sst_graph.uncertainty.covariance import (
     ErrorModel,
     effective_views,
     flatness_of,
+    freedom_of_sides,
     spread_beyond,
     with_floors,
 )
@@ -131,7 +133,8 @@ class ScoreSums:
 
 def fit_sides(rows: FloatArray) -> ErrorModel:
     """The batch's error model from the rows of sides, (k, 6) as in :class:`ScoreSums`."""
-    sides = np.unique(rows[:, 0], return_inverse=True)[1].reshape(-1)
+    names, sides = np.unique(rows[:, 0], return_inverse=True)
+    sides = sides.reshape(-1)
     means, weights, weights2, within, moved = rows[:, 1:].T
     freedom = float((weights - weights2 / np.maximum(weights, 1e-12)).sum())
     match = max(0.05, float(within.sum()) / max(freedom, 1e-9))
@@ -141,4 +144,5 @@ def fit_sides(rows: FloatArray) -> ErrorModel:
     total = np.bincount(sides, v)
     side_means = np.bincount(sides, v * means) / np.maximum(total, 1e-12)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(total), dtype=np.intp), centre=0.0)
+    side /= freedom_of_sides(len(names), len(np.unique(names // SIDES)))
     return with_floors(side, side_frame, match, effective_views(sides, weights, moved > 0.5))

@@ -3,12 +3,14 @@
 An object that moves by itself has left its place by then. That needs no track of the object and no scan in
 which it is alone, so it tells oncoming vehicles, too, whose tracks break and join others'. What has only
 just come into view is at its place a little later, and what is about to leave was there a little before: the
-better of the two counts.
+better of the two counts. Labels come and go, too: where a place is taken by anything but ground, it has not
+been left.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -52,6 +54,7 @@ _SPEED = 0.6
 """Speed that an object half way between lost and kept passes for [m/s]."""
 _FASTEST = 30.0
 """Speed that a lost object passes for [m/s]."""
+_GROUND = (SemanticClass.GROUND, SemanticClass.TERRAIN)
 
 
 class Persistence:
@@ -99,13 +102,14 @@ class Persistence:
                 del by_scan[number]
 
     def speeds(self, number: int) -> dict[ObjectName, float]:
-        """Speed [m/s] that the objects of a scan pass for, of those that do not stay."""
-        found = {}
-        for name, shares in self.shares.get(number, {}).items():
-            known = shares[~np.isnan(shares)]
-            if len(known) and known.min() < self.config.kept:
-                found[name] = self._speed(float(known.min()))
-        return found
+        """Speed [m/s] that the objects of a scan pass for, of those that do not stay.
+
+        Nothing is said before the longest horizon is known: a short burst of scans has little else to go by,
+        and in it what moves is still near its place.
+        """
+        known = {name: s for name, s in self.shares.get(number, {}).items() if not np.isnan(s[-1])}
+        least = {name: float(np.nanmin(shares)) for name, shares in known.items()}
+        return {name: self._speed(share) for name, share in least.items() if share < self.config.kept}
 
     def _speed(self, share: float) -> float:
         above = max(share - self.config.lost, 1e-9)
@@ -131,49 +135,72 @@ class _Places:
     Attributes:
         stamp_ns: of the scan.
         names: of the objects.
-        wPs, reaches_m, owners: (n, 3), (n,), (n,) some points of the objects' outlines in the world, how far
-            from there they may be found, and whose they are, by class.
+        outlines: by class.
         trees: all points of a class in the world.
+        other_wPs: (n, 3) points of all classes but the ground, in the world [m].
+        kept: share of an object's points from which on it stays.
     """
 
     stamp_ns: int
     names: tuple[ObjectName, ...]
-    wPs: dict[SemanticClass, FloatArray]
-    reaches_m: dict[SemanticClass, FloatArray]
-    owners: dict[SemanticClass, NDArray[np.intp]]
+    outlines: dict[SemanticClass, _Outlines]
     trees: dict[SemanticClass, KDTree]
+    other_wPs: FloatArray
+    kept: float
 
     @classmethod
     def of(cls, scan: ScanFeatures, wTl: gtsam.Pose3, config: PersistenceConfig) -> _Places:
         names: list[ObjectName] = []
-        wPs, reaches, owners, trees = {}, {}, {}, {}
+        outlines, trees = {}, {}
         for c in [c for c in MOVABLE_CLASSES if c in scan.boundaries]:
-            outline = [scan.boundaries[c], *([scan.undersides[c]] if c in scan.undersides else [])]
-            lPs = np.concatenate([part.lPs for part in outline])
-            objects = np.concatenate([part.objects for part in outline])
-            chosen = _some_of_each(objects, config.most_points)
+            edges = [scan.boundaries[c], *([scan.undersides[c]] if c in scan.undersides else [])]
+            lPs = np.concatenate([part.lPs for part in edges])
+            objects = np.concatenate([part.objects for part in edges])
             names += [(c, int(n)) for n in np.unique(objects)]
-            wPs[c], owners[c] = _moved(wTl, lPs[chosen]), objects[chosen]
-            ranges = np.linalg.norm(lPs[chosen], axis=1)
-            reaches[c] = np.maximum(config.reach_m, config.reach_ratio * ranges)
+            chosen = _some_of_each(objects, config.most_points)
+            reaches = np.maximum(config.reach_m, config.reach_ratio * np.linalg.norm(lPs[chosen], axis=1))
+            outlines[c] = _Outlines(_moved(wTl, lPs[chosen]), reaches, objects[chosen])
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // config.most_inside)]
             trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, thin])))
-        return cls(scan.stamp_ns, tuple(names), wPs, reaches, owners, trees)
+        raised = _moved(wTl, scan.lPs[~np.isin(scan.classes, _GROUND)])
+        return cls(scan.stamp_ns, tuple(names), outlines, trees, raised, config.kept)
+
+    @cached_property
+    def _anything(self) -> KDTree:
+        return KDTree(self.other_wPs)
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
-        """Share of each object's points that have a point of their class near by in another scan."""
+        """Share of each object's points whose place is taken in another scan, by its class or anything."""
         shares = {}
-        for c, wPs in self.wPs.items():
-            owners, near = self.owners[c], np.zeros(len(wPs), dtype=bool)
-            if c in other.trees:
-                reaches = self.reaches_m[c]
-                distances, _ = other.trees[c].query(wPs, distance_upper_bound=float(reaches.max()))
-                near = distances <= reaches
-            numbers, which = np.unique(owners, return_inverse=True)
-            found = np.bincount(which, near) / np.bincount(which)
+        for c, outlines in self.outlines.items():
+            near = outlines.near(other.trees[c]) if c in other.trees else np.zeros(len(outlines.wPs), bool)
+            numbers, which = np.unique(outlines.owners, return_inverse=True)
+            count = np.bincount(which)
+            lost = (np.bincount(which, near) < self.kept * count)[which]
+            if lost.any() and len(other.other_wPs):
+                near[lost] |= outlines.take(lost).near(other._anything)
+            found = np.bincount(which, near) / count
             shares.update({(c, int(n)): float(share) for n, share in zip(numbers, found, strict=True)})
         return shares
+
+
+@dataclass(frozen=True)
+class _Outlines:
+    """Some points (n, 3) of objects' outlines in the world [m], how far from there they may be found (n,)
+    [m], and whose they are (n,)."""
+
+    wPs: FloatArray
+    reaches_m: FloatArray
+    owners: NDArray[np.intp]
+
+    def take(self, chosen: NDArray[np.bool_]) -> _Outlines:
+        return _Outlines(self.wPs[chosen], self.reaches_m[chosen], self.owners[chosen])
+
+    def near(self, tree: KDTree) -> NDArray[np.bool_]:
+        """(n,) whether a point of a tree lies within reach."""
+        distances, _ = tree.query(self.wPs, distance_upper_bound=float(self.reaches_m.max()))
+        return np.asarray(distances <= self.reaches_m)
 
 
 def _moved(wTl: gtsam.Pose3, lPs: FloatArray) -> FloatArray:

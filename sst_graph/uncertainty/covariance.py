@@ -265,7 +265,20 @@ def fit_error_model(table: MatchTable) -> ErrorModel:
     v = 1.0 / (match / count + side_frame)
     side_mean, side_w, _ = _means(frame_mean, v, side_of_frame)
     side = spread_beyond(side_mean, 1.0 / side_w, np.zeros(len(side_mean), dtype=np.intp), centre=0.0)
+    side /= freedom_of_sides(len(side_mean), len(np.unique(table.objects)))
     return with_floors(side, side_frame, match, table.views)
+
+
+_LEAST_FREEDOM = 0.25
+"""Least share of the sides' spread that is taken to be left."""
+
+
+def freedom_of_sides(sides: int, objects: int) -> float:
+    """Share of the variance of sides that is left in their residuals.
+
+    The pose and a mask bias of each object are fitted to the same sides and swallow the rest.
+    """
+    return max((sides - objects - 6) / max(sides, 1), _LEAST_FREEDOM)
 
 
 def _means(values: FloatArray, w: FloatArray, groups: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
