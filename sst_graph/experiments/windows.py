@@ -74,17 +74,24 @@ def _row(path: str, count: int, config: WindowsConfig) -> str:
     for first, last in itertools.pairwise(edges):
         window = open_source(path, image_shift=config.shift, frames=f"{first}:{last}")
         results.append(calibrate(window, window.nominal, config.calibration))
-    deviations, covariances = deviations_of(results)
-    units = (np.degrees(1.0), 100.0, 1e3)
-    cells = [whole.name, str(count)]
-    for part, unit in zip(PARTS, units, strict=True):
-        width = part.stop - part.start
-        spread = np.sqrt((deviations[:, part] ** 2).sum() / (width * (count - 1)))
-        claimed = np.sqrt(np.mean([np.trace(C[part, part]) / width for C in covariances]))
-        cells.append(f"{unit * spread:.2f} / {unit * claimed:.2f}")
-    cells.append(", ".join(f"{ratio:.2f}" for ratio in spread_in_sigmas(deviations, covariances)))
-    cells.append(", ".join(result.status for result in results))
+    cells = [whole.name, str(count), *spread_cells(results), ", ".join(result.status for result in results)]
     return "| " + " | ".join(cells) + " |"
+
+
+def spread_cells(results: Sequence[CalibrationResult]) -> list[str]:
+    """Spread over claim of rotation, translation and offset, and the three in sigmas; doubted answers, which
+    claim nothing, are left out."""
+    claimed = [result for result in results if result.status != "not_converged"]
+    if len(claimed) < 2:
+        return ["–"] * (len(PARTS) + 1)
+    deviations, covariances = deviations_of(claimed)
+    cells = []
+    for part, unit in zip(PARTS, (np.degrees(1.0), 100.0, 1e3), strict=True):
+        width = part.stop - part.start
+        spread = np.sqrt((deviations[:, part] ** 2).sum() / (width * (len(claimed) - 1)))
+        sigma = np.sqrt(np.mean([np.trace(C[part, part]) / width for C in covariances]))
+        cells.append(f"{unit * spread:.2f} / {unit * sigma:.2f}")
+    return [*cells, ", ".join(f"{ratio:.2f}" for ratio in spread_in_sigmas(deviations, covariances))]
 
 
 def deviations_of(results: Sequence[CalibrationResult]) -> tuple[FloatArray, list[FloatArray]]:

@@ -14,7 +14,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig
 from sst_graph.estimators.start import StartConfig
 from sst_graph.experiments import windows
-from sst_graph.experiments.windows import WindowsConfig, deviations_of, spread_in_sigmas
+from sst_graph.experiments.windows import WindowsConfig, deviations_of, spread_cells, spread_in_sigmas
 from sst_graph.result import CalibrationResult
 from tests.sst_graph.streets import standing_street
 
@@ -42,6 +42,14 @@ def test_the_spread_of_drawn_answers_is_what_was_drawn(claimed: float) -> None:
     template = CalibrationResult(gtsam.Pose3(), 0.0, np.eye(7), "ok", standing_street().camera)
     deviations, covariances = deviations_of(drawn_results(template, 200, claimed))
     assert spread_in_sigmas(deviations, covariances) == pytest.approx([1.0 / claimed] * 3, rel=0.08)
+
+
+def test_doubted_answers_are_left_out() -> None:
+    template = CalibrationResult(gtsam.Pose3(), 0.0, np.eye(7), "ok", standing_street().camera)
+    results = drawn_results(template, 4, 1.0)
+    far = replace(results[0], time_offset_s=5.0, status="not_converged")
+    assert spread_cells([*results, far]) == spread_cells(results)
+    assert set(spread_cells([results[0], far])) == {"–"}
 
 
 def test_no_data_and_one_window_are_refused() -> None:
