@@ -30,6 +30,9 @@ FloatArray = NDArray[np.float64]
 _SPEED_CHANGE = 0.2
 """Speeds of an object that differ by more than this fraction are a new judgement."""
 
+_RESTLESS_MPS = 0.6
+"""Objects that pass for slower than this have not moved: half of their points are where they were."""
+
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
 MOVING = MovingConfig()
@@ -195,8 +198,13 @@ class Window:
 
         While an object starts or stops, no line fits its places, and it may pass for one that stands.
         """
-        sightings = self.sightings.items()
-        return {track for track, seen in sightings if any(self._speed(sighting) > 0.0 for sighting in seen)}
+        numbers = {sighting.scan for seen in self.sightings.values() for sighting in seen}
+        speeds = {number: self.speeds(number) for number in numbers}
+        return {
+            track
+            for track, seen in self.sightings.items()
+            if any(speeds[sighting.scan].get(sighting.name, 0.0) > _RESTLESS_MPS for sighting in seen)
+        }
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, float]]:
         """Tracks of the objects of some scans, and speeds of the moving ones, by the scan's position."""
