@@ -237,6 +237,7 @@ class Window:
         """Forget all scans but the last few."""
         while len(self.scans) > last:
             self.scans.popleft()
+        self.persistence.forget(self.first_scan)
 
     def stamps_ns(self) -> dict[int, int]:
         """Stamp of each scan by its number."""

@@ -137,7 +137,7 @@ class _Places:
         names: of the objects.
         outlines: by class.
         trees: all points of a class in the world.
-        other_wPs: (n, 3) points of all classes but the ground, in the world [m].
+        scan, wTl: itself, and its pose.
         kept: share of an object's points from which on it stays.
     """
 
@@ -145,7 +145,8 @@ class _Places:
     names: tuple[ObjectName, ...]
     outlines: dict[SemanticClass, _Outlines]
     trees: dict[SemanticClass, KDTree]
-    other_wPs: FloatArray
+    scan: ScanFeatures
+    wTl: gtsam.Pose3
     kept: float
 
     @classmethod
@@ -163,12 +164,13 @@ class _Places:
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // config.most_inside)]
             trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, thin])))
-        raised = _moved(wTl, scan.lPs[~np.isin(scan.classes, _GROUND)])
-        return cls(scan.stamp_ns, tuple(names), outlines, trees, raised, config.kept)
+        return cls(scan.stamp_ns, tuple(names), outlines, trees, scan, wTl, config.kept)
 
     @cached_property
-    def _anything(self) -> KDTree:
-        return KDTree(self.other_wPs)
+    def _anything(self) -> KDTree | None:
+        """All points but the ground's in the world; made where it is asked for."""
+        raised = self.scan.lPs[~np.isin(self.scan.classes, _GROUND)]
+        return KDTree(_moved(self.wTl, raised)) if len(raised) else None
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
         """Share of each object's points whose place is taken in another scan, by its class or anything."""
@@ -178,7 +180,7 @@ class _Places:
             numbers, which = np.unique(outlines.owners, return_inverse=True)
             count = np.bincount(which)
             lost = (np.bincount(which, near) < self.kept * count)[which]
-            if lost.any() and len(other.other_wPs):
+            if lost.any() and other._anything is not None:
                 near[lost] |= outlines.take(lost).near(other._anything)
             found = np.bincount(which, near) / count
             shares.update({(c, int(n)): float(share) for n, share in zip(numbers, found, strict=True)})

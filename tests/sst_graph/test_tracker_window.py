@@ -121,3 +121,10 @@ def test_nothing_grows_with_the_drive() -> None:
         assert min(s.stamp_ns for s in kept) >= window.last_stamp_ns - 1_600_000_000
     assert len(long.objects.live) == len(short.objects.live) == 4
     assert max(long.objects.last_seen.values()) - min(long.objects.last_seen.values()) <= OBJECT_MEMORY
+
+
+def test_scans_that_are_cut_off_leave_nothing_behind() -> None:
+    """A checkpoint made right after an alarm holds the scans that are left, and what is known of these."""
+    window = _window(_drive(12), 40)
+    window.keep_scans(4)
+    assert [number for number, _ in window.scans] == sorted(window.persistence.shares) == [8, 9, 10, 11]
