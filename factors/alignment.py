@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .condensed import condense, cost_rows
+from .condensed import condense, condense_root, cost_rows
 from .custom import custom_factor
 from .errors import FactorError, checked_array
 from .matches import Alignment
@@ -119,13 +120,14 @@ def frame_factor(
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
     frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
+    bounds = list(pairwise(accumulate(frame.dims, initial=0)))
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
     def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
         if not jacobians:
             return cost_rows(frame.cost(values), rows) if condensed else frame.stacked_error(values), None
         error, J = frame.condensed(values) if condensed else frame.stacked(values)
-        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
+        return error, [J[:, start:end] for start, end in bounds]
 
     return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
 
@@ -203,16 +205,23 @@ class FrameResidual:
 
     def gram(self, values: Sequence[Any]) -> tuple[FloatArray, float]:
         """Gram matrix (cols + 1, cols + 1) of the weighted [J r] of all matches, and their constant."""
+        return self._gram([self._weighted(part, values) for part in self.parts])
+
+    def _gram(self, weighted: Sequence[tuple[Evaluated, float]]) -> tuple[FloatArray, float]:
         G = np.zeros((self.cols + 1, self.cols + 1))
-        constant = 0.0
-        for part in self.parts:
-            evaluated, part_constant = self._weighted(part, values)
+        for part, (evaluated, _) in zip(self.parts, weighted, strict=True):
             G[np.ix_(part.targets, part.targets)] += evaluated.gram()[np.ix_(part.columns, part.columns)]
-            constant += part_constant
-        return G, constant
+        return G, sum(constant for _, constant in weighted)
 
     def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
-        return condense(*self.gram(values))
+        weighted = [self._weighted(part, values) for part in self.parts]
+        evaluated, constant = weighted[0]
+        if len(weighted) > 1 or len(evaluated.rows) > self.cols + 1:
+            return condense(*self._gram(weighted))
+        # Of a single alignment there is a root at once: that of its rows' short form.
+        R = np.zeros((len(evaluated.rows), self.cols + 1))
+        R[:, self.parts[0].targets] = evaluated.root()[:, self.parts[0].columns]
+        return condense_root(R, constant)
 
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         blocks, constant = [], 0.0

@@ -48,11 +48,15 @@ def condense(G: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArr
         r (cols + 2,) and J (cols + 2, cols) with ``|r|^2 = G[-1, -1] + constant``,
         ``J^T r = G[:-1, -1]`` and ``J^T J = G[:-1, :-1]``; the last row has a zero Jacobian.
     """
-    R = square_root(G)
-    m = len(G)
-    J = np.zeros((m + 1, m - 1))
-    J[:m] = R[:, :-1]
-    return np.append(R[:, -1], np.sqrt(max(constant, 0.0))), J
+    return condense_root(square_root(G), constant)
+
+
+def condense_root(R: FloatArray, constant: float = 0.0) -> tuple[FloatArray, FloatArray]:
+    """As :func:`condense`, from a root R (k, cols + 1), R^T R = G, of no more than cols + 1 rows."""
+    k, m = R.shape
+    J, error = np.zeros((m + 1, m - 1)), np.zeros(m + 1)
+    J[:k], error[:k], error[m] = R[:, :-1], R[:, -1], np.sqrt(max(constant, 0.0))
+    return error, J
 
 
 def cost_rows(cost: float, rows: int) -> FloatArray:

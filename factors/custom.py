@@ -62,28 +62,29 @@ def custom_factor(
     if noise.dim() != rows:
         raise FactorError("noise of a factor", f"dimension {noise.dim()}", f"dimension {rows} (rows)")
 
-    names = _names(keys)
-
     def callback(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
         arguments = [_read(values, key, dim) for key, dim in zip(keys, dims, strict=True)]
         error, jacobians = function(*arguments, jacobians=H is not None)
-        error = _checked(f"error of the factor on {names}", error, (rows,))
+        error = _checked("error of the factor on", keys, error, (rows,))
         if H is not None:
             if jacobians is None or len(jacobians) != len(keys):
                 found = "None" if jacobians is None else f"{len(jacobians)}"
                 raise FactorError("Jacobians of a factor", found, f"{len(keys)}, one for each key")
             for i, (key, dim) in enumerate(zip(keys, dims, strict=True)):
-                H[i] = _checked(f"Jacobian by {_names([key])}", jacobians[i], (rows, dim), fortran=True)
+                H[i] = _checked("Jacobian by", [key], jacobians[i], (rows, dim), fortran=True)
         return error
 
     return gtsam.CustomFactor(noise, keys, callback)
 
 
-def _checked(what: str, value: Any, shape: tuple[int, ...], fortran: bool = False) -> FloatArray:
+def _checked(
+    what: str, keys: Sequence[int], value: Any, shape: tuple[int, ...], fortran: bool = False
+) -> FloatArray:
     array = np.asarray(value, dtype=np.float64, order="F" if fortran else None)
     if array.shape != shape:
-        raise FactorError(what, f"shape {array.shape}", f"shape {shape}")
+        raise FactorError(f"{what} {_names(keys)}", f"shape {array.shape}", f"shape {shape}")
     if not np.isfinite(array).all():
+        what = f"{what} {_names(keys)}"
         raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
     return array
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import gtsam
@@ -60,6 +61,7 @@ def _series_table() -> FloatArray:
 
 
 _SERIES = _series_table()
+_POWERS = np.arange(_TERMS)
 
 
 def exponential_coefficients(x: FloatArray) -> FloatArray:
@@ -103,8 +105,10 @@ def se3_left_jacobian(xi: FloatArray) -> FloatArray:
     J_l = sum ad^k / (k+1)! = I + (b - x b') ad + (c - x c') ad^2 - b' ad^3 - c' ad^4, the powers above 4
     reduced by ad^5 = -2 x ad^3 - x^2 ad (Barfoot, State Estimation for Robotics, 7.95).
     """
-    x = xi[:3] @ xi[:3]
-    b, c, b_x, c_x = exponential_coefficients(np.asarray(x))
+    x = float(xi[:3] @ xi[:3])
+    # Of one number a sum of powers is made much faster than by Horner's rule.
+    small = x < _SERIES_LIMIT
+    b, c, b_x, c_x = x**_POWERS @ _SERIES if small else exponential_coefficients(np.asarray(x))
     ad = twist_ad(xi)
     ad2 = ad @ ad
     return np.asarray(np.eye(6) + (b - x * b_x) * ad + (c - x * c_x) * ad2 - (b_x * ad + c_x * ad2) @ ad2)
@@ -120,12 +124,32 @@ class RigidlyMoved:
 
     Attributes:
         cPs: (3, n) points in the camera at the image's instant [m].
-        lift: (13, 6), from a wrench to the derivatives by cTl (right perturbation, [rot, trans]), offset
-            and c_twist.
+        cTl: pose of the LiDAR in the camera with the motion.
+        tau_s: interval of all points [s].
+        xi, rate: (6,) twist of the displacement, -tau w, and -d xi / d tau.
+        model: see :data:`MotionModel`.
     """
 
     cPs: FloatArray
-    lift: FloatArray
+    cTl: gtsam.Pose3
+    tau_s: float
+    xi: FloatArray
+    rate: FloatArray
+    model: MotionModel
+
+    @cached_property
+    def lift(self) -> FloatArray:
+        """(13, 6) from a wrench to the derivatives by cTl (right perturbation, [rot, trans]), offset and
+        c_twist; made where it is asked for."""
+        if self.model == "translation":
+            left = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+        else:
+            left = se3_left_jacobian(self.xi)
+        lift = np.empty((13, 6))
+        lift[0:6] = self.cTl.AdjointMap().T
+        lift[6] = -left @ self.rate
+        lift[7:13] = -self.tau_s * left.T
+        return lift
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
         """Wrenches [cP x g; g] into out (6, k, n), from the gradients g (3, k, n) by cP."""
@@ -232,16 +256,10 @@ def _move_rigidly(
     rate = c_twist - tau_s * c_acceleration
     if model == "translation":
         moved = gtsam.Pose3(cTl.rotation(), cTl.translation() + xi[3:])
-        left = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
     else:
         moved = gtsam.Pose3.Expmap(xi) * cTl
-        left = se3_left_jacobian(xi)
-    lift = np.empty((13, 6))
-    lift[0:6] = moved.AdjointMap().T
-    lift[6] = -left @ rate
-    lift[7:13] = -tau_s * left.T
     R, t = np.asarray(moved.rotation().matrix()), np.asarray(moved.translation())
-    return RigidlyMoved(R @ lPs + t.reshape(3, 1), lift)
+    return RigidlyMoved(R @ lPs + t.reshape(3, 1), moved, tau_s, xi, rate, model)
 
 
 def _move(xis: FloatArray, points: FloatArray) -> FloatArray:

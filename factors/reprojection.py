@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .camera import MIN_DEPTH_M, PinholeCamera
-from .condensed import gram
+from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
 from .motion import move_points
@@ -139,14 +139,23 @@ class Evaluated:
 
     def gram(self) -> FloatArray:
         """(cols + 1, cols + 1) Gram matrix of [J r]."""
-        rows = self.rows.reshape(len(self.rows), -1)
-        short = gram(rows)
+        short = gram(self.rows.reshape(len(self.rows), -1))
         if self.lift is None:
             return short
-        lift = np.zeros((len(rows) + 7, len(rows)))
-        lift[:13, :6] = self.lift
-        lift[13:, 6:] = np.eye(len(rows) - 6)
+        lift = self._whole_lift()
         return np.asarray(lift @ short @ lift.T)
+
+    def root(self) -> FloatArray:
+        """R (m, cols + 1) with R^T R the Gram matrix of [J r], with as many rows as the short form has."""
+        R = square_root(gram(self.rows.reshape(len(self.rows), -1)))
+        return R if self.lift is None else np.asarray(R @ self._whole_lift().T)
+
+    def _whole_lift(self) -> FloatArray:
+        """(cols + 1, m) from all rows of the short form."""
+        assert self.lift is not None
+        lift = np.eye(len(self.rows) + 7, len(self.rows), -7)
+        lift[:13, :6] = self.lift
+        return lift
 
 
 def evaluate(
@@ -177,7 +186,8 @@ def evaluate(
     error = np.empty((2, n))
     error[0] = camera.fx * x + (camera.cx - pixels[0])
     error[1] = camera.fy * y + (camera.cy - pixels[1])
-    motion_rows = (13 if moved.lift is None else 6) if jacobians else 0
+    lift = moved.lift if jacobians else None
+    motion_rows = (13 if lift is None else 6) if jacobians else 0
     rows = np.empty((motion_rows + (jacobians and bias_px is not None) + 1, k, n))
     if normals is None:
         rows[-1] = error
@@ -190,7 +200,7 @@ def evaluate(
         rows[motion_rows:-1] = 1.0  # by the bias
     if any_behind:
         rows[:, :, behind] = 0.0
-    return Evaluated(rows, moved.lift, behind if any_behind else None)
+    return Evaluated(rows, lift, behind if any_behind else None)
 
 
 def _gradients(

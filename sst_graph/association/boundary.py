@@ -106,7 +106,9 @@ def find_boundaries(
     apart = np.einsum("ij,ij->i", points, points) > 0.25
     usable = slice(None) if apart.all() else apart
     points, labels = points[usable], scan.classes[usable]
-    present = [c for c in classes if np.count_nonzero(labels == c) >= config.min_points]
+    # Compared with plain ints, for an enum makes all labels int64.
+    members = {c: labels == int(c) for c in classes}
+    present = [c for c in classes if np.count_nonzero(members[c]) >= config.min_points]
     if not present:
         return {}
     beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
@@ -114,7 +116,7 @@ def find_boundaries(
     instances = None if scan.instances is None else scan.instances[usable]
     found = {}
     for c in present:
-        mask = labels == c
+        mask = members[c]
         objects = split_objects(points, mask, instances, config)
         parts = [
             _side_edges(points, mask, beams, config, +1),

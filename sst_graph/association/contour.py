@@ -62,7 +62,8 @@ class ContourMap:
     @classmethod
     def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image."""
-        inside = (mask == semantic_class).view(np.uint8)
+        # Compared with a plain int, for an enum makes all pixels int64.
+        inside = (mask == int(semantic_class)).view(np.uint8)
         if cv2.countNonZero(inside) in (0, inside.size):
             return None
         # Only near the class: elsewhere nothing is matched, and the transform is what an image costs.
@@ -73,7 +74,7 @@ class ContourMap:
         np.minimum(near, REACH_PX, out=near)
         below, right = mask.shape[0] - top - len(near), mask.shape[1] - left - near.shape[1]
         distance = cv2.copyMakeBorder(near, top, below, left, right, cv2.BORDER_CONSTANT, value=REACH_PX)
-        unknown = (mask == SemanticClass.IGNORE).view(np.uint8)
+        unknown = (mask == int(SemanticClass.IGNORE)).view(np.uint8)
         if cv2.countNonZero(unknown):
             unknown = np.asarray(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), np.uint8)
         return cls(np.asarray(distance, np.float32), unknown.astype(np.float32))

@@ -102,8 +102,7 @@ def match_silhouettes(
         if c not in contours:
             continue
         base_taus = base_tau_s - points.offsets_s
-        uvs = _project(points.lPs, camera, cTl, offset_s + base_taus, motion)
-        outs = _project(points.outward, camera, cTl, offset_s + base_taus, motion)
+        uvs, outs = _project(points, camera, cTl, offset_s + base_taus, motion)
         feet = contours[c].look_up(uvs)
         way = outs - uvs
         length = np.linalg.norm(way, axis=1)
@@ -161,10 +160,14 @@ def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: 
 
 
 def _project(
-    lPs: FloatArray, camera: PinholeCamera, cTl: gtsam.Pose3, taus_s: FloatArray, motion: Motion
-) -> FloatArray:
-    """(n, 2) pixels of points moved to their image's instant; NaN behind the camera."""
+    points: Boundaries, camera: PinholeCamera, cTl: gtsam.Pose3, taus_s: FloatArray, motion: Motion
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) pixels of boundary points, and of those across the boundary, moved to their image's instant; NaN
+    behind the camera."""
+    # Both at once: with few points a call costs more than what it does.
+    lPs = np.concatenate([points.lPs, points.outward]).T
     common = bool((taus_s == taus_s[0]).all()) if len(taus_s) else True
-    taus = float(taus_s[0]) if common and len(taus_s) else taus_s
-    moved = move_points(cTl, np.ascontiguousarray(lPs.T), taus, motion.c_twist, motion.c_acceleration)
-    return camera.project(moved.cPs.T)
+    taus = float(taus_s[0]) if common and len(taus_s) else np.tile(taus_s, 2)
+    moved = move_points(cTl, np.ascontiguousarray(lPs), taus, motion.c_twist, motion.c_acceleration)
+    uvs = camera.project(moved.cPs.T)
+    return uvs[: len(taus_s)], uvs[len(taus_s) :]

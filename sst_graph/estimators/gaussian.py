@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from functools import lru_cache
+from itertools import groupby, pairwise
 
 import gtsam
 import numpy as np
@@ -51,9 +52,8 @@ class Point:
         return 7 + len(self.biases_px)
 
     def columns(self, tracks: Sequence[int]) -> IntArray:
-        """Columns of [extrinsic, offset, biases, and these objects' biases]."""
-        places = [self.core_size + self.tracks.index(track) for track in tracks]
-        return np.array([*range(self.core_size), *places], dtype=np.intp)
+        """Columns of [extrinsic, offset, biases, and these objects' biases]; not to be written to."""
+        return _columns(self.core_size, self.tracks, tuple(tracks))
 
     def seen(self, places: Mapping[int, int]) -> Point:
         """The point with just these objects; one that has no bias yet takes its class's.
@@ -223,24 +223,38 @@ class Gaussian:
         return gtsam.LinearContainerFactor(factor.linearize(values), values)
 
 
+@lru_cache(maxsize=4096)
+def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...]) -> IntArray:
+    """Kept, for each frame asks for those of the whole window, and few of them are new."""
+    return np.array([*range(core), *(core + known.index(track) for track in chosen)], dtype=np.intp)
+
+
 def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     """(k, m) steps from each point to another, over [extrinsic, offset, biases]."""
     turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)
-    rest = np.array([[point.offset_s, *point.biases_px] for point in points]).reshape(len(turns), -1)
-    return np.column_stack([turns, np.array([to.offset_s, *to.biases_px]) - rest])
+    offsets = np.array([to.offset_s - point.offset_s for point in points])
+    biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
+    return np.column_stack([turns, offsets, to.biases_px - biases])
 
 
 def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
     """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
     if not places:
         return [np.zeros((n, n)) for _ in blocks]
-    where = np.concatenate([(own[:, None] * n + own).reshape(-1) for own in places])
+    # Blocks of one size together: a call for each of them would cost more than what it does.
+    order: list[int] = sorted(range(len(places)), key=lambda i: len(places[i]))
+    groups = [list(group) for _, group in groupby(order, key=lambda i: len(places[i]))]
+    columns = [np.array([places[i] for i in group]) for group in groups]
+    where = np.concatenate([(own[:, :, None] * n + own[:, None, :]).reshape(-1) for own in columns])
     return [
-        np.asarray(
-            np.bincount(where, np.concatenate([b.reshape(-1) for b in some]), n * n).reshape(n, n), np.float64
-        )
+        np.asarray(np.bincount(where, _in_a_row(some, groups), n * n).reshape(n, n), np.float64)
         for some in blocks
     ]
+
+
+def _in_a_row(blocks: Sequence[FloatArray], groups: Sequence[Sequence[int]]) -> FloatArray:
+    """(k,) all entries of blocks, those of each group have one shape."""
+    return np.concatenate([np.array([blocks[i] for i in group]).reshape(-1) for group in groups])
 
 
 def _like(target: Point, source: Point) -> Point:

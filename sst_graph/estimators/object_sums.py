@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,19 +46,17 @@ class ObjectBeliefs:
         order = np.argsort(track, kind="stable")
         bounds = [0, *(np.flatnonzero(np.diff(track[order])) + 1).tolist(), len(track)]
         rows, residuals = J[order, : point.core_size], r[order]
-        names = tuple(int(track[order[start]]) for start in bounds[:-1])
-        own = bool(point.tracks)
-        informations, vectors = [], []
-        for name, start, end in zip(names, bounds, bounds[1:], strict=False):
-            part = rows[start:end]
-            if own:
-                column = J[order[start:end], point.core_size + point.tracks.index(name)]
-                part = np.column_stack([part, column])
-            informations.append(part.T @ part)
-            vectors.append(-part.T @ residuals[start:end])
-        biases = np.array([point.object_biases_px[point.tracks.index(name)] for name in names if own])
+        names = tuple(track[order[bounds[:-1]]].tolist())
+        biases = np.zeros(0)
+        if point.tracks:
+            places = np.array([point.tracks.index(name) for name in names])
+            own = J[order, np.repeat(point.core_size + places, np.diff(bounds))]
+            rows, biases = np.column_stack([rows, own]), point.object_biases_px[places]
+        parts = [slice(start, end) for start, end in pairwise(bounds)]
+        information = np.array([rows[part].T @ rows[part] for part in parts])
+        vector = np.array([-rows[part].T @ residuals[part] for part in parts])
         weights = np.add.reduceat(roots[order] ** 2, bounds[:-1])
-        return cls(point, names, np.stack(informations), np.stack(vectors), biases, weights)
+        return cls(point, names, information, vector, biases, weights)
 
     def one_by_one(self) -> dict[int, ObjectBelief]:
         """By track."""

@@ -17,6 +17,7 @@ from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.problem.graph import GraphConfig, PairMatches
+from sst_graph.problem.objects import numbers_in, of_each
 from sst_graph.problem.state import object_bias_key, underside_track
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
@@ -91,9 +92,9 @@ def object_places(
 ) -> dict[int, int]:
     """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
     return {
-        tracks[c, int(number)]: classes.index(c)
+        tracks[c, number]: classes.index(c)
         for c in pair.tracks
-        for number in np.unique(pair.matches[c].objects)
+        for number in numbers_in(pair.matches[c].objects)
     }
 
 
@@ -198,7 +199,8 @@ def _tracks_of(
     pair: PairMatches, c: SemanticClass, tracks: Mapping[tuple[SemanticClass, int], int]
 ) -> IntArray:
     """(m,) track of the object of each match of a class."""
-    return np.array([tracks[c, int(number)] for number in pair.matches[c].objects], dtype=np.intp)
+    objects = pair.matches[c].objects
+    return of_each(objects, {number: tracks[c, number] for number in numbers_in(objects)})
 
 
 def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> FloatArray:
@@ -223,7 +225,8 @@ def _rows(
         if objects is not None:
             names, groups = np.unique(objects, return_inverse=True)
             below = 7 + len(classes) + place
-            own = [below if t == underside_track(c) else point.columns([int(t)])[-1] for t in names]
+            known = {track: point.core_size + k for k, track in enumerate(point.tracks)}
+            own = [below if t == underside_track(c) else known[t] for t in names.tolist()]
             columns = np.array(own)[groups.reshape(-1)]
             biases = np.concatenate([point.biases_px, point.object_biases_px])[columns - 7]
         r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, biases)

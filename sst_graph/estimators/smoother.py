@@ -143,7 +143,14 @@ class WindowSmoother:
             self.model = self.sums.error_model([entry.score for entry in self.entries.values()])
 
     def rest_at(self, point: Point) -> None:
-        """Answer this estimate until the next update (that of a checkpoint)."""
+        """Answer this estimate until the next update (that of a checkpoint).
+
+        Matches made anew may see objects that it does not know: their biases stay.
+        """
+        own = zip(self._point.tracks, self._point.object_biases_px.tolist(), strict=True)
+        for track, bias in own:
+            if track not in point.tracks:
+                point = point.with_object(track, bias)
         self._point = point
 
     def polish(self, iterations: int = 10) -> None:

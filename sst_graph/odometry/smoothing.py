@@ -151,16 +151,18 @@ class _Run:
         """Smooth the latest motions, all where ``reach`` is None."""
         last = self._steps[-1]
         mean, covariance = last.mean, last.covariance
-        weights = self._weights(last)
-        for k in range(len(self._steps) - 1, -1, -1):
-            self.smoothed[k] = self._answer(k, mean[..., 0], covariance[..., 0, 0], *weights)
-            if k == 0 or (reach is not None and k <= len(self._steps) - reach):
-                return
+        oldest = 0 if reach is None else max(0, len(self._steps) - reach)
+        twists, variances = [mean[..., 0]], [covariance[..., 0, 0]]
+        for k in range(len(self._steps) - 1, oldest, -1):
             # Rauch, Tung, Striebel.
             step, before = self._steps[k], self._steps[k - 1]
             mean = before.mean + (step.gain @ (mean - before.mean @ step.transition.T)[..., None])[..., 0]
             closer = step.gain @ (covariance - step.ahead) @ np.swapaxes(step.gain, -1, -2)
             covariance = before.covariance + closer
+            twists.append(mean[..., 0])
+            variances.append(covariance[..., 0, 0])
+        answers = self._answers(oldest, np.stack(twists[::-1]), np.stack(variances[::-1]))
+        self.smoothed[oldest:] = answers
 
     def _beginning(self, motion: RelativeMotion) -> _Step:
         """What is known before the first motion."""
@@ -218,15 +220,15 @@ class _Run:
         scale = (shares * _SCALES).sum(axis=2) / np.maximum(by_roughness, 1e-300)
         return by_roughness / by_roughness.sum(axis=1, keepdims=True), scale
 
-    def _answer(
-        self, k: int, twists: FloatArray, variances: FloatArray, shares: FloatArray, scale: FloatArray
-    ) -> RelativeMotion:
-        """Motion k from its twists and their variances (6, r) under each roughness."""
-        motion, mean = self.motions[k], (shares * twists).sum(axis=1)
-        spread = scale * np.maximum(variances, 0.0) + (twists - mean[:, None]) ** 2
-        unit = self._sigmas * motion.seconds
-        return replace(
-            motion,
-            aTb=gtsam.Pose3.Expmap(unit * mean),
-            covariance=np.diag(unit**2 * (shares * spread).sum(axis=1)),
-        )
+    def _answers(self, first: int, twists: FloatArray, variances: FloatArray) -> list[RelativeMotion]:
+        """Motions from the first one on, from their twists and variances (k, 6, r) under each roughness."""
+        shares, scale = self._weights(self._steps[-1])
+        mean = (shares * twists).sum(axis=2)
+        spread = scale * np.maximum(variances, 0.0) + (twists - mean[..., None]) ** 2
+        squares = (shares * spread).sum(axis=2)
+        answers = []
+        for motion, m, square in zip(self.motions[first:], mean, squares, strict=True):
+            unit = self._sigmas * motion.seconds
+            covariance = np.diag(unit**2 * square)
+            answers.append(replace(motion, aTb=gtsam.Pose3.Expmap(unit * m), covariance=covariance))
+        return answers

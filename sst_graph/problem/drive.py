@@ -218,7 +218,8 @@ def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
     square = np.einsum("ij,ij->i", scan.points, scan.points)
     usable = (square > 2.0**2) & (square < 60.0**2) & (scan.classes != SemanticClass.IGNORE)
     parts = [np.zeros(0, dtype=np.intp)]
-    for c in np.flatnonzero(np.bincount(scan.classes[usable])):
+    # Compared with plain ints, for those of NumPy make all classes int64.
+    for c in np.flatnonzero(np.bincount(scan.classes[usable])).tolist():
         members = np.flatnonzero(usable & (scan.classes == c))
         parts.append(members[:: max(1, -(-len(members) // most))])
     return np.concatenate(parts)

@@ -23,7 +23,7 @@ from sst_graph.association.silhouettes import (
 )
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outlines
-from sst_graph.problem.objects import ObjectId, moving_objects, standing_share
+from sst_graph.problem.objects import ObjectId, moving_objects, numbers_in, of_each, standing_share
 from sst_graph.problem.state import (
     EXTRINSIC,
     State,
@@ -136,9 +136,8 @@ class Tracks:
         speeds = self._moving[drive].get(scan, {}) if self._moving else {}
         if not any(own == c for own, _ in speeds):
             return None
-        names, which = np.unique(numbers, return_inverse=True)
-        shares = [standing_share(speeds.get((c, n), 0.0), tau_s, reach_m) for n in names.tolist()]
-        return np.array(shares)[which.reshape(-1)]
+        shares = {n: standing_share(speeds.get((c, n), 0.0), tau_s, reach_m) for n in numbers_in(numbers)}
+        return of_each(numbers, shares)
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -220,7 +219,7 @@ def _objects_of(
         return {}
     found = {}
     for c, m in matches.items():
-        own = np.array([tracks[scan, c, int(number)] for number in m.objects], dtype=np.intp)
+        own = of_each(m.objects, {name: tracks[scan, c, name] for name in numbers_in(m.objects)})
         found[c] = np.where(m.sides == BOTTOM, underside_track(c), own)
     return found
 

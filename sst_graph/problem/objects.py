@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -20,10 +20,12 @@ from sst_graph.problem.persistence import Persistence
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 ObjectId = tuple[int, SemanticClass, int]
 """Position of the scan, class, number of the object within the scan."""
 
 _Name = TypeVar("_Name")
+_Scalar = TypeVar("_Scalar", int, float)
 
 _REACH_M = 2.0
 """Farthest an object's centre may seem to jump between scans [m]."""
@@ -88,6 +90,18 @@ class ObjectTracker:
             for track in [t for t, last in self.last_seen.items() if last < self.scans - self.memory]:
                 del self.live[track], self.last_seen[track]
         return tracks
+
+
+def numbers_in(objects: IntArray) -> list[int]:
+    """Numbers (>= 0) of the objects that occur, rising."""
+    return list(np.flatnonzero(np.bincount(objects)).tolist())
+
+
+def of_each(objects: IntArray, values: Mapping[int, _Scalar]) -> NDArray[Any]:
+    """(n,) value of the object of each entry (n,), given by the object's number (>= 0)."""
+    table = np.zeros(max(values, default=0) + 1, np.array([*values.values()]).dtype)
+    table[[*values]] = [*values.values()]
+    return table[objects]
 
 
 def object_tracks(drive: Drive) -> dict[ObjectId, int]:
@@ -177,10 +191,11 @@ def speed_of(times: FloatArray, centres: FloatArray, config: MovingConfig) -> fl
     span = float(np.ptp(times)) if len(times) else 0.0
     if len(times) < config.min_sightings or span <= 0.0:
         return 0.0
-    design = np.stack([np.ones_like(times), times - times.mean()], axis=1)
-    line = np.linalg.lstsq(design, centres, rcond=None)[0]
-    scatter = float(np.sqrt(np.mean((centres - design @ line) ** 2)))
-    travelled = float(np.linalg.norm(line[1])) * span
+    # The line through the mean that fits best.
+    t, places = times - times.mean(), centres - centres.mean(axis=0)
+    velocity = (t @ places) / (t @ t)
+    scatter = float(np.sqrt(np.mean((places - t[:, None] * velocity) ** 2)))
+    travelled = float(np.linalg.norm(velocity)) * span
     moves = travelled > config.min_travel_m and scatter < config.max_scatter * travelled
     speed = travelled / span
     return speed if moves and speed > config.min_speed_mps else 0.0
@@ -203,7 +218,8 @@ def _nearest(
     """The live track of a class nearest to a place, if within reach and not taken in this scan."""
     best, reach = None, _REACH_M
     for track, (track_class, place) in live.items():
-        distance = float(np.linalg.norm(place - centre))
-        if track_class == c and track not in taken and distance < reach:
-            best, reach = track, distance
+        if track_class == c and track not in taken:
+            distance = float(np.linalg.norm(place - centre))
+            if distance < reach:
+                best, reach = track, distance
     return best

@@ -15,7 +15,7 @@ from functools import cached_property
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
+from scipy.spatial import cKDTree
 
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.problem.drive import ScanFeatures
@@ -107,8 +107,11 @@ class Persistence:
         Nothing is said before the longest horizon is known: a short burst of scans has little else to go by,
         and in it what moves is still near its place.
         """
-        known = {name: s for name, s in self.shares.get(number, {}).items() if not np.isnan(s[-1])}
-        least = {name: float(np.nanmin(shares)) for name, shares in known.items()}
+        least = {}
+        for name, shares in self.shares.get(number, {}).items():
+            known = [share for share in shares.tolist() if share == share]
+            if known and shares[-1] == shares[-1]:  # not nan
+                least[name] = min(known)
         return {name: self._speed(share) for name, share in least.items() if share < self.config.kept}
 
     def _speed(self, share: float) -> float:
@@ -144,7 +147,7 @@ class _Places:
     stamp_ns: int
     names: tuple[ObjectName, ...]
     outlines: dict[SemanticClass, _Outlines]
-    trees: dict[SemanticClass, KDTree]
+    trees: dict[SemanticClass, cKDTree]
     scan: ScanFeatures
     wTl: gtsam.Pose3
     kept: float
@@ -163,14 +166,14 @@ class _Places:
             outlines[c] = _Outlines(_moved(wTl, lPs[chosen]), reaches, objects[chosen])
             inside = scan.lPs[scan.classes == c]
             thin = inside[:: max(1, len(inside) // config.most_inside)]
-            trees[c] = KDTree(_moved(wTl, np.concatenate([lPs, thin])))
+            trees[c] = _tree(_moved(wTl, np.concatenate([lPs, thin])))
         return cls(scan.stamp_ns, tuple(names), outlines, trees, scan, wTl, config.kept)
 
     @cached_property
-    def _anything(self) -> KDTree | None:
+    def _anything(self) -> cKDTree | None:
         """All points but the ground's in the world; made where it is asked for."""
         raised = self.scan.lPs[~np.isin(self.scan.classes, _GROUND)]
-        return KDTree(_moved(self.wTl, raised)) if len(raised) else None
+        return _tree(_moved(self.wTl, raised)) if len(raised) else None
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
         """Share of each object's points whose place is taken in another scan, by its class or anything."""
@@ -199,10 +202,15 @@ class _Outlines:
     def take(self, chosen: NDArray[np.bool_]) -> _Outlines:
         return _Outlines(self.wPs[chosen], self.reaches_m[chosen], self.owners[chosen])
 
-    def near(self, tree: KDTree) -> NDArray[np.bool_]:
+    def near(self, tree: cKDTree) -> NDArray[np.bool_]:
         """(n,) whether a point of a tree lies within reach."""
         distances, _ = tree.query(self.wPs, distance_upper_bound=float(self.reaches_m.max()))
         return np.asarray(distances <= self.reaches_m)
+
+
+def _tree(wPs: FloatArray) -> cKDTree:
+    """Points (n, 3) to look among: for few queries, so it is built without care for its shape."""
+    return cKDTree(wPs, balanced_tree=False, compact_nodes=False)
 
 
 def _moved(wTl: gtsam.Pose3, lPs: FloatArray) -> FloatArray:

@@ -42,26 +42,31 @@ class TwistTrack:
         self._epoch = motions[0].from_ns
         middles = [0.5 * (m.from_ns - self._epoch + m.to_ns - self._epoch) * 1e-9 for m in motions]
         self._middles = np.array(middles)
-        self._twists = np.stack([m.mean_twist for m in motions])
-        self._covariances = np.stack([m.covariance / m.seconds**2 for m in motions])
+        self._motions = motions
 
     def at(self, stamp_ns: int) -> TwistSample:
         """Twist and acceleration at a stamp of the sensor's clock."""
         t = (stamp_ns - self._epoch) * 1e-9
         n = len(self._middles)
         if n == 1:
-            return TwistSample(self._twists[0], np.zeros(6), self._covariances[0])
+            return TwistSample(self._motions[0].mean_twist, np.zeros(6), _covariance(self._motions[0]))
         i = int(np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2))
         span = self._middles[i + 1] - self._middles[i]
-        slope = (self._twists[i + 1] - self._twists[i]) / span
+        before, after = self._motions[i : i + 2]
+        slope = (after.mean_twist - before.mean_twist) / span
         fraction = float(np.clip((t - self._middles[i]) / span, -0.5, 1.5))
         a, b = 1.0 - fraction, fraction
         # As if both erred together, which smoothed motions nearly do.
-        covariance = abs(a) * self._covariances[i] + abs(b) * self._covariances[i + 1]
+        covariance = abs(a) * _covariance(before) + abs(b) * _covariance(after)
         if not 0.0 <= fraction <= 1.0:
             overshoot = span * (max(-fraction, fraction - 1.0))
             covariance = covariance + np.diag((slope * overshoot) ** 2)
-        return TwistSample(self._twists[i] + fraction * span * slope, slope, covariance)
+        return TwistSample(before.mean_twist + fraction * span * slope, slope, covariance)
+
+
+def _covariance(motion: RelativeMotion) -> FloatArray:
+    """(6, 6) of the mean twist of a motion."""
+    return motion.covariance / motion.seconds**2
 
 
 def camera_twist(sample: TwistSample, cTl: gtsam.Pose3) -> TwistSample:
