@@ -42,8 +42,9 @@ def scans_to_match(
     staleness = _staleness(smoother, covariance)
     leaving = [n for n in window.leaving() if staleness.get(n, 1.0) > _FRESH_SIGMAS]
     turn = None if settling is None else settling.advance(smoother.point)
-    if turn is not None:
-        return chosen | set(leaving) | (set(turn) & set(staleness))
+    if settling is not None:
+        # No others: all of the window come in their turn, and to look below them costs as much.
+        return chosen | set(leaving) | (set(turn or ()) & set(staleness))
     known = sorted(staleness, key=staleness.__getitem__, reverse=True)
     stale = sum([value > config.stale_sigmas for value in staleness.values()])
     some = known[: max(config.renew - len(leaving), stale)]

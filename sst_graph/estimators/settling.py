@@ -124,10 +124,12 @@ class Settling:
     def advance(self, point: Point) -> list[int] | None:
         """The scans to match with this frame; None while the edges towards the ground are looked at."""
         numbers = [number for number, _ in self._matcher.window.scans]
+        # The newest is matched as it comes.
+        self.done.update(numbers[-1:])
         waiting = [number for number in numbers if number not in self.done]
         looking, below = self.below is not None, self.below
         # To look below is to match twice.
-        some = waiting[: max(1, self._scans // 2) if looking else self._scans]
+        some = waiting[: (self._scans + 1) // 2 if looking else self._scans]
         if below is not None:
             self.below = below.plus(self._matcher.support_below(point, some))
         self.done.update(some)

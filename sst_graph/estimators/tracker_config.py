@@ -106,7 +106,7 @@ class TrackerConfig:
     renew: int = 1
     renew_most: int = 4
     stale_sigmas: float = 0.3
-    settle_scans: int = 8
+    settle_scans: int = 5
     start_scans: int = 12
     restart_scans: int = 8
     start_attempts: int = 4

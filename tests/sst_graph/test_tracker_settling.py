@@ -31,7 +31,7 @@ def _distance(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     """Checkpoint of a tracker that has settled for a frame, begun at the truth, and the frames to come."""
-    street, config = _street(), TrackerConfig(start_scans=8, window=18)
+    street, config = _street(), TrackerConfig(start_scans=8, window=18, settle_scans=8)
     start = dataclasses.replace(config.calibration.start, enabled=False)
     config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, start=start))
     tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
@@ -49,8 +49,8 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
 def test_a_checkpoint_keeps_the_settling(begun: tuple[Path, list[Frame]]) -> None:
     tracker = load_checkpoint(begun[0])
     assert tracker.settling is not None and tracker.window.held
-    # With one frame, edges towards the ground have been looked at.
-    assert len(tracker.settling.done) == tracker.config.settle_scans // 2
+    # With one frame, edges towards the ground have been looked at; the newest scan is matched as it comes.
+    assert len(tracker.settling.done) == (tracker.config.settle_scans + 1) // 2 + 1
     assert tracker.settling.below is not None and tracker.settling.below.narrow
 
 
