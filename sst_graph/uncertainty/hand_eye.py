@@ -1,8 +1,10 @@
 """The covariance of a hand-eye estimate: neighbouring pairs err together, and all pairs share some error.
 
 A scan and an image end one pair and begin the next, so scores of neighbours are correlated: they are
-summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987). What all pairs share,
-such as a principal point that is off, no residual shows: it stands in :class:`HandEyeErrors`.
+summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
+for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
+What all pairs share, such as a principal point that is off, no residual shows: it stands in
+:class:`HandEyeErrors`.
 """
 
 from __future__ import annotations
@@ -72,7 +74,8 @@ def hand_eye_covariance(
         shared[:, :3] += rotation * J.T @ root[:, :3]
         if term.has_direction:
             shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
-    surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags)
+    residuals = sum(5 if term.has_direction else 3 for term in terms)
+    surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags, residuals)
     covariance = bread + bread @ (surplus + shared @ shared.T) @ bread
     return _capped(covariance, priors)
 
@@ -121,15 +124,26 @@ def _breaks(terms: Sequence[HandEyeTerm]) -> NDArray[np.bool_]:
     return np.array([True] + [a.drive != b.drive or a.to_ns != b.from_ns for a, b in pairwise(cameras)])
 
 
-def _surplus(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], lags: int) -> FloatArray:
-    """(7, 7) by which the scores' own long-run variance exceeds the model's, where it does."""
+def _surplus(
+    scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], lags: int, residuals: int
+) -> FloatArray:
+    """(7, 7) by which the scores' own long-run variance exceeds the model's, where it does.
+
+    Args:
+        scores: (n, 7) of the pairs.
+        model: (7, 7) their variance if the model holds.
+        breaks: (n,) where a pair does not go on where the one before ended.
+        lags: neighbours up to this far apart go together.
+        residuals: number of independent residuals behind the scores.
+    """
     run = np.cumsum(breaks)
     total = scores.T @ scores
     for lag in range(1, lags + 1):
         same = run[lag:] == run[:-lag]
         product = (scores[lag:][same]).T @ scores[:-lag][same]
         total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
-    total *= len(scores) / max(len(scores) - 7.0, 1.0)
+    pairs, unknowns = len(scores), len(model)
+    total *= pairs / max(pairs - 1, 1) * (residuals - 1) / max(residuals - unknowns, 1)
     # Along the directions in which the model is the surer of the two.
     root = np.linalg.cholesky(model + 1e-12 * np.trace(model) * np.eye(len(model)))
     whitener = np.linalg.inv(root)

@@ -116,6 +116,16 @@ def test_covariance_fits_the_errors() -> None:
     assert max(nees) < 20.0
 
 
+def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
+    """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
+    nees, some = [], [0, 1, 2, 6]
+    for seed in range(10):
+        solution = solve_motion([made_drive(weaving, 12, seed)], TRUE, OFFSET_S, MotionConfig())[0]
+        error = error_of(solution)
+        nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
+    assert 0.45 < np.mean(nees) / len(some) < 1.6
+
+
 def test_a_straight_road_leaves_the_roll_and_the_offset_open() -> None:
     drive = made_drive(straight)
     result = calibrate_prepared([drive], off(3.0), _config())

@@ -221,6 +221,19 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     assert _distance(kept, resumed.point.cTl, resumed.point.offset_s) < 0.2
 
 
+def test_an_object_matched_only_on_resuming_is_welcome(running: Path, frames: list[Frame]) -> None:
+    """Matches are made anew at the saved estimate, where a doubtful object may gain one that it had not."""
+    tracker = load_checkpoint(running)
+    smoother = tracker.smoother
+    assert smoother is not None
+    point = smoother.point
+    known = dataclasses.replace(point, tracks=point.tracks[:-1], object_biases_px=point.object_biases_px[:-1])
+    tracker.resume(smoother, set(smoother.entries), known)
+    assert set(smoother.point.tracks) == set(point.tracks)
+    assert np.isfinite(tracker.covariance).all() and tracker.point.offset_s == point.offset_s
+    assert tracker.add(frames[20]).accepted
+
+
 def test_a_broken_checkpoint_is_named(tmp_path: Path, running: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         load_checkpoint(tmp_path / "none.npz")
