@@ -19,6 +19,8 @@ FloatArray = NDArray[np.float64]
 
 MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""
+_MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
+"""Whether a label is one of them."""
 SETTLED_M = 5e-3
 """Sweep compensation has settled where another pass would move no point farther than this [m]."""
 
@@ -252,7 +254,7 @@ class LidarOdometry:
         if self._parted is not None and self._parted[0] is scan:
             return self._parted[1:]
         points, classes, offsets = usable_points(scan, config.near_m, config.far_m, config.max_points)
-        sweep, movable = _Sweep(points, offsets), np.isin(classes, MOVABLE_CLASSES)
+        sweep, movable = _Sweep(points, offsets), _MOVABLE[classes]
         if np.count_nonzero(~movable) < config.min_points:
             movable[:] = False
         parts = sweep.take(np.flatnonzero(~movable)), sweep.take(np.flatnonzero(movable))

@@ -69,15 +69,19 @@ def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.int
     """Index of one point of each occupied voxel."""
     if len(points) == 0:
         return np.zeros(0, np.intp)
-    cell = np.floor((points - points.min(axis=0)) / voxel_m).astype(np.int64)
-    size = cell.max(axis=0) + 1
-    return np.unique((cell[:, 0] * size[1] + cell[:, 1]) * size[2] + cell[:, 2], return_index=True)[1]
+    x, y, z = _cells(points, voxel_m)
+    return np.unique((x * (y.max() + 1) + y) * (z.max() + 1) + z, return_index=True)[1]
 
 
 def _objects(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     """(n,) number of the connected patch of ground plan that each point stands on."""
-    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / cell_m).astype(np.intp)
-    plan = np.zeros(cell.max(axis=0) + 1, np.bool_)
-    plan[cell[:, 0], cell[:, 1]] = True
+    x, y = _cells(points[:, :2], cell_m)
+    plan = np.zeros((x.max() + 1, y.max() + 1), np.bool_)
+    plan[x, y] = True
     numbers, _ = ndimage.label(plan, structure=np.ones((3, 3)))
-    return np.asarray(numbers[cell[:, 0], cell[:, 1]], np.intp)
+    return np.asarray(numbers[x, y], np.intp)
+
+
+def _cells(points: FloatArray, edge_m: float) -> list[NDArray[np.intp]]:
+    """(n,) numbers of the cells of a grid that points (n, d) lie in, axis by axis, which is faster."""
+    return [np.floor((column - column.min()) / edge_m).astype(np.intp) for column in points.T]

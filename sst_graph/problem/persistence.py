@@ -54,7 +54,8 @@ _SPEED = 0.6
 """Speed that an object half way between lost and kept passes for [m/s]."""
 _FASTEST = 30.0
 """Speed that a lost object passes for [m/s]."""
-_GROUND = (SemanticClass.GROUND, SemanticClass.TERRAIN)
+_RAISED = ~np.isin(np.arange(256), (SemanticClass.GROUND, SemanticClass.TERRAIN))
+"""Whether a label is anything but ground."""
 
 
 class Persistence:
@@ -172,7 +173,7 @@ class _Places:
     @cached_property
     def _anything(self) -> cKDTree | None:
         """All points but the ground's in the world; made where it is asked for."""
-        raised = self.scan.lPs[~np.isin(self.scan.classes, _GROUND)]
+        raised = self.scan.lPs[_RAISED[self.scan.classes]]
         return _tree(_moved(self.wTl, raised)) if len(raised) else None
 
     def found_in(self, other: _Places) -> dict[ObjectName, float]:
