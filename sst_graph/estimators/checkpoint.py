@@ -60,12 +60,12 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "alarmed": tracker.alarmed,
         "attempts": tracker.attempts,
         "waited": tracker.waited,
-        "watched": list(tracker.watched),
+        "watched": list(tracker.watch.scans),
         "milestones": [tracker.milestones.first, tracker.milestones.next],
         "settling": None if tracker.settling is None else _settling_document(tracker.settling),
         "inflation": tracker.inflation,
         "undersides": [int(c) for c in tracker.matcher.graph.undersides],
-        "alarm": [tracker.alarm.raised, tracker.alarm.quiet],
+        "alarm": [tracker.watch.alarm.raised, tracker.watch.alarm.quiet],
         "window": _put_window(arrays, tracker.window),
         "smoother": None if tracker.smoother is None else _put_smoother(arrays, tracker.smoother),
         "adopted": tracker.adopted is not None,
@@ -75,7 +75,7 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
     arrays["covariance"] = tracker.covariance
     arrays["arrivals"] = np.array(tracker.arrivals.rows).reshape(-1, 9)
     arrays["entered"] = np.array(tracker.entered, np.int64)
-    arrays["usual"] = np.array(tracker.alarm.usual)
+    arrays["usual"] = np.array(tracker.watch.alarm.usual)
     arrays["costs"] = np.array(tracker.adoption.costs).reshape(-1, 2)
     if tracker.adopted is not None:
         _put_point(arrays, "adopted", tracker.adopted)
@@ -126,9 +126,9 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     tracker.matcher.graph = replace(tracker.matcher.graph, undersides=undersides)
     first, following = head["milestones"]
     tracker.milestones = Milestones(first, following, tracker.config.window)
-    tracker.watched.extend(head["watched"])
-    tracker.alarm.raised, tracker.alarm.quiet = head["alarm"]
-    tracker.alarm.usual.extend(arrays["usual"].tolist())
+    tracker.watch.scans.extend(head["watched"])
+    tracker.watch.alarm.raised, tracker.watch.alarm.quiet = head["alarm"]
+    tracker.watch.alarm.usual.extend(arrays["usual"].tolist())
     tracker.adoption.costs.extend((float(a), float(b)) for a, b in arrays["costs"])
     tracker.adoption.adopted = _point(arrays, "adopted") if head["adopted"] else None
     tracker.entered.extend(arrays["entered"].tolist())

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from factors.errors import FactorError
-from factors.robust import RobustKernel
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
-from sst_graph.estimators.alarm import Joint, StepAlarm
+from sst_graph.estimators.alarm import Joint
 from sst_graph.estimators.arrivals import Arrivals
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
@@ -72,11 +71,11 @@ class Tracker:
         self.smoother: WindowSmoother | None = None
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
         self.joint = Joint(self.covariance, (), len(self.covariance))
-        self.alarm = StepAlarm(self.config.alarm, calibration.joint.graph.object_bias_sigma_px)
+        sigma_px = calibration.joint.graph.object_bias_sigma_px
+        self.watch = Watch(self.matcher, self.config.alarm, sigma_px)
         self.adoption = Adoption(self.config.adoption)
         self.history_store = History(self.config.drift.history)
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
-        self.watched: deque[int] = deque(maxlen=self.config.alarm.frames)
         self.milestones = Milestones(0, self.config.window, self.config.window)
         self.settling: Settling | None = None
         self.arrivals = Arrivals()
@@ -203,9 +202,8 @@ class Tracker:
         smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
         self._take_covariance(smoother)
         self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
-        self.alarm.restart()
+        self.watch.restart()
         self.adoption.restart()
-        self.watched.clear()
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
         self.arrivals.restart()
@@ -232,11 +230,11 @@ class Tracker:
         found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
         new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        chi2, doubt = self._watch(new, before), ""
-        if self.alarm.alarm:
-            watch = Watch(self.matcher, self.alarm, self.watched, self.window.restless())
-            if watch.is_change(before, self.joint, smoother.model):
-                return self._change(before, stamp_ns, chi2)
+        restless, doubt = self.window.restless(), ""
+        chi2 = self.watch.take(new, before, self.joint, smoother.model, restless)
+        if self.watch.alarm.alarm:
+            if self.watch.is_change(smoother.model, restless):
+                return self._change(stamp_ns, chi2)
             doubt = "a single object says that the calibration has changed: a step, or its labels"
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.
@@ -316,15 +314,6 @@ class Tracker:
         """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
         return 1.0 / self.inflation if self.config.drift.enabled else 1.0
 
-    def _watch(self, new: list[int], before: Point) -> float | None:
-        """The change test on new frames, under its wide kernel."""
-        if not new or not self.config.alarm.enabled or self.smoother is None:
-            return None
-        kernel = RobustKernel("geman_mcclure", self.config.alarm.kernel_px)
-        scores = self.matcher.scores(before, new, kernel, self.window.restless())
-        self.watched.extend(new)
-        return self.alarm.check(scores, self.joint, self.smoother.model)
-
     def _compare(self, new: list[int], before: Point) -> None:
         """Held-out costs of the new frames."""
         if not new:
@@ -340,19 +329,21 @@ class Tracker:
             return None
         return Point.unbiased(self.guess.cTl, self.guess.offset_s, self.classes)
 
-    def _change(self, point: Point, stamp_ns: int, chi2: float | None) -> TrackUpdate:
-        """The calibration has changed: begin again from the frames since, near the last estimate."""
+    def _change(self, stamp_ns: int, chi2: float | None) -> TrackUpdate:
+        """The calibration has changed: begin again from the frames since, near the estimate before them."""
+        assert self.watch.kept is not None
+        point = self.watch.kept.point
         _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
         self.guess = Guess(point.cTl, point.offset_s, search=False)
         self.stop_settling()
         self.smoother, self.alarmed = None, True
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
         # Frames before the first that was past the threshold may be from before the change.
-        self.window.keep_scans(self.config.alarm.confirmations)
+        self.window.keep_scans(self.watch.alarm.raised)
         self.waited = len(self.window.scans)
         self.entered.clear()
         self.history_store.cut()
-        self.alarm.restart()
+        self.watch.restart()
         self.adoption.restart()
         return dataclasses.replace(
             self._answer(stamp_ns, "the calibration has changed", chi2=chi2), alarm=True

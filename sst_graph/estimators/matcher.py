@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -114,7 +114,16 @@ class WindowMatcher:
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
     ) -> list[PairScore]:
         """What some scans say at a point, all their objects but those of the tracks ``without``."""
-        pairs, _ = self._pairs(point, chosen, kernel)
+        return self.scores_of(self.pairs_at(point, chosen, kernel), point, without)
+
+    def pairs_at(self, point: Point, chosen: Collection[int], kernel: RobustKernel) -> dict[int, PairMatches]:
+        """Matches of some scans at a point."""
+        return self._pairs(point, chosen, kernel)[0]
+
+    def scores_of(
+        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
+    ) -> list[PairScore]:
+        """What matches of scans, made at a point, say there without the objects of some tracks."""
         if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
         return [

@@ -43,6 +43,7 @@ class AlarmConfig:
         chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
         confirmations: frames in a row past the threshold; then it must hold without any one object, too ...
         others: ... and this share of the statistic must remain.
+        patience: frames in a row past the threshold after which it is given up: they are learnt from by then.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -53,12 +54,15 @@ class AlarmConfig:
     frames: int = 4
     chi2: float = 25.0
     confirmations: int = 3
-    others: float = 0.45
+    others: float = 0.3
+    patience: int = 20
     baseline: int = 300
     warm_up: int = 15
 
     def __post_init__(self) -> None:
         _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "baseline")
+        if self.patience < max(self.frames, self.confirmations):
+            raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")
 
 
 @dataclass(frozen=True)

@@ -1,44 +1,104 @@
-"""Whether frames past the alarm's threshold mean that the calibration has changed."""
+"""New frames against the estimate before them: whether the calibration has changed."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections import deque
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 from factors.robust import RobustKernel
 from sst_graph.estimators.alarm import Joint, StepAlarm
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.matcher import WindowMatcher
+from sst_graph.estimators.tracker_config import AlarmConfig
 from sst_graph.uncertainty.covariance import ErrorModel
 
 
 @dataclass(frozen=True)
-class Watch:
-    """The latest frames under the alarm's wide kernel.
+class Before:
+    """An estimate, as it was before some frames were used.
 
     Attributes:
-        scans: the frames that are compared together.
-        restless: tracks of objects that moved lately; they are not asked.
+        point, joint: the estimate and its covariance.
+        scan: number of the first scan that it does not know.
     """
 
-    matcher: WindowMatcher
-    alarm: StepAlarm
-    scans: Collection[int]
-    restless: Collection[int]
+    point: Point
+    joint: Joint
+    scan: int
 
-    def is_change(self, before: Point, joint: Joint, model: ErrorModel) -> bool:
-        """Whether they speak against the estimate before them, with any one object left out, too.
 
-        Where a single object says so, its labels may err for a while. With one object in view, or one that
-        tells far more than the others, that is not decidable.
+class Watch:
+    """Compares new frames with the estimate before them, under the alarm's wide kernel.
+
+    From the first frame past the threshold on, the estimate from before the frames compared is kept, and all
+    frames since are compared with it: the one that goes on hears them, and would follow a step before enough
+    is seen of it.
+
+    Attributes:
+        alarm: the statistic of the latest frames.
+        scans: the latest frames that were compared.
+        kept: the estimate from before a doubt, while there is one.
+    """
+
+    def __init__(self, matcher: WindowMatcher, config: AlarmConfig, object_sigma_px: float) -> None:
+        """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
+        self.matcher, self.config = matcher, config
+        self.alarm = StepAlarm(config, object_sigma_px)
+        self.scans: deque[int] = deque(maxlen=config.patience)
+        self.kept: Before | None = None
+        self._latest: deque[Before] = deque(maxlen=config.frames)
+        self._kernel = RobustKernel("geman_mcclure", config.kernel_px)
+
+    def restart(self) -> None:
+        """Forget the frames: a new calibration begins."""
+        self.alarm.restart()
+        self.scans.clear()
+        self._latest.clear()
+        self.kept = None
+
+    def take(
+        self, new: Sequence[int], point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]
+    ) -> float | None:
+        """The statistic of the latest frames with some new ones; None while it can't be told.
+
+        Args:
+            new: numbers of the scans.
+            point, joint: the estimate, which has not heard them, and its covariance.
+            restless: tracks of objects that moved lately; they are not asked.
         """
-        config = self.alarm.config
-        kernel = RobustKernel("geman_mcclure", config.kernel_px)
+        if not new or not self.config.enabled:
+            return None
+        self._latest.append(Before(point, joint, min(new)))
+        against = self.kept or self._latest[-1]
+        self.scans.extend(new)
+        scores = self.matcher.scores(against.point, new, self._kernel, restless)
+        value = self.alarm.check(scores, against.joint, model)
+        if self.alarm.raised > self.config.patience:
+            self.restart()
+        elif not self.alarm.raised:
+            self.kept = None
+        elif self.kept is None:
+            self.kept = self._latest[0]
+        return value
+
+    def is_change(self, model: ErrorModel, restless: Collection[int]) -> bool:
+        """Whether all frames since a doubt began speak against the estimate from before it.
+
+        They must do so with any one object left out, too. Where a single object says so, its labels may err
+        for a while: with one object in view, or one that tells far more than the others, that is not decidable.
+        """
+        if self.kept is None:
+            return False
+        kept, config = self.kept, self.config
+        scans = [scan for scan in self.scans if scan >= kept.scan]
+        pairs = self.matcher.pairs_at(kept.point, scans, self._kernel)
 
         def value(*without: int) -> float:
-            scores = self.matcher.scores(before, self.scans, kernel, {*without, *self.restless})
-            return self.alarm.value(scores, joint, model)
+            scores = self.matcher.scores_of(pairs, kept.point, {*without, *restless})
+            return self.alarm.value(scores, kept.joint, model)
 
-        whole, asked = value(), self.matcher.objects_of(self.scans) - set(self.restless)
+        whole = value()
         least = max(config.chi2, config.others * whole)
+        asked = self.matcher.objects_of(scans) - set(restless)
         return whole > least and all(value(track) > least for track in asked)

@@ -131,6 +131,8 @@ def test_settings_out_of_range() -> None:
         TrackerConfig(window=5)
     with pytest.raises(ValueError, match="chi2"):
         AlarmConfig(chi2=0.0)
+    with pytest.raises(ValueError, match="patience"):
+        AlarmConfig(frames=4, patience=3)
 
 
 def test_a_direction_without_information_raises_nothing() -> None:
