@@ -228,13 +228,17 @@ class Tracker:
         )
         sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
         found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
-        new = [scan for scan in found if scan not in smoother.entries and scan not in self.entered]
+        waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
+        new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, doubt = self.window.restless(), ""
-        chi2 = self.watch.take(new, before, self.joint, smoother.model, restless)
-        if self.watch.alarm.alarm:
-            if self.watch.is_change(smoother.model, restless):
-                return self._change(stamp_ns, chi2)
+        restless, doubt, watch = self.window.restless(), "", self.watch
+        matches = {scan: len(found[scan].pair) for scan in new}
+        chi2 = watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
+        if watch.lost:
+            return self._change(before, stamp_ns, chi2)
+        if watch.alarm.alarm:
+            if watch.kept is not None and watch.is_change(smoother.model, restless):
+                return self._change(watch.kept.point, stamp_ns, chi2)
             doubt = "a single object says that the calibration has changed: a step, or its labels"
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.
@@ -329,17 +333,18 @@ class Tracker:
             return None
         return Point.unbiased(self.guess.cTl, self.guess.offset_s, self.classes)
 
-    def _change(self, stamp_ns: int, chi2: float | None) -> TrackUpdate:
-        """The calibration has changed: begin again from the frames since, near the estimate before them."""
-        assert self.watch.kept is not None
-        point = self.watch.kept.point
+    def _change(self, point: Point, stamp_ns: int, chi2: float | None) -> TrackUpdate:
+        """The calibration has changed: begin again from the frames since, near the estimate before them.
+
+        Where the labels have left what ought to be in view, it is looked for all around.
+        """
         _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
-        self.guess = Guess(point.cTl, point.offset_s, search=False)
+        self.guess = Guess(point.cTl, point.offset_s, search=self.watch.far)
         self.stop_settling()
         self.smoother, self.alarmed = None, True
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
         # Frames before the first that was past the threshold may be from before the change.
-        self.window.keep_scans(self.watch.alarm.raised)
+        self.window.keep_scans(self.watch.since)
         self.waited = len(self.window.scans)
         self.entered.clear()
         self.history_store.cut()

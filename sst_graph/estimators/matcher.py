@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from factors.robust import RobustKernel
+from sst_graph.association.pairing import pair_by_time
 from sst_graph.estimators.adoption import mean_cost
 from sst_graph.estimators.epochs import Found
 from sst_graph.estimators.gaussian import Point
@@ -17,7 +18,7 @@ from sst_graph.estimators.undecided import REACH_SIGMAS, Other
 from sst_graph.estimators.undersides import UndersideSupport, underside_support
 from sst_graph.estimators.window import Window
 from sst_graph.odometry.smoothing import MotionSmoother
-from sst_graph.problem.drive import Drive, outline_size
+from sst_graph.problem.drive import Drive, outline_size, outlines
 from sst_graph.problem.graph import PairMatches, Tracks, associate
 from sst_graph.types import SemanticClass
 
@@ -131,6 +132,31 @@ class WindowMatcher:
             for number, pair in pairs.items()
             if len(pair)
         ]
+
+    def in_view(self, point: Point, chosen: Collection[int], without: Collection[int]) -> dict[int, int]:
+        """How many boundary points of scans that have an image ought to be seen in it at a point.
+
+        Args:
+            without: tracks of objects that do not count. Where fewer than two objects are in view it is 0.
+        """
+        part, numbers = self.window.drive(chosen.__contains__)
+        limit = self.graph.max_interval_periods * part.image_period_s
+        found = {}
+        for pair in pair_by_time(part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, limit):
+            number, contours = numbers[pair.scan], part.images[pair.image].contours
+            counts: list[int] = []
+            for c, points in outlines(part.scans[pair.scan], self.graph.undersides).items():
+                if c in contours:
+                    cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
+                    inside = np.bincount(
+                        points.objects, part.camera.in_image(part.camera.project(cPs)).astype(np.float64)
+                    )
+                    tracks = self.window.tracks[number]
+                    counts += [
+                        int(inside[o]) for o in np.flatnonzero(inside) if tracks[c, int(o)] not in without
+                    ]
+            found[number] = sum(counts) if len(counts) > 1 else 0
+        return found
 
     def left_out(
         self, pair: PairMatches, number: int, offset_s: float

@@ -44,6 +44,9 @@ class AlarmConfig:
         confirmations: frames in a row past the threshold; then it must hold without any one object, too ...
         others: ... and this share of the statistic must remain.
         patience: frames in a row past the threshold after which it is given up: they are learnt from by then.
+        lost: frames in a row, but for one of them, in which next to nothing of what ought to be in view meets
+            the image's labels: the step is larger than matches reach.
+        lost_share: share of the boundary points in view that is next to nothing.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -55,12 +58,14 @@ class AlarmConfig:
     chi2: float = 25.0
     confirmations: int = 3
     others: float = 0.3
-    patience: int = 20
+    patience: int = 12
+    lost: int = 8
+    lost_share: float = 0.12
     baseline: int = 300
     warm_up: int = 15
 
     def __post_init__(self) -> None:
-        _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "baseline")
+        _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "lost", "baseline")
         if self.patience < max(self.frames, self.confirmations):
             raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")
 
@@ -113,7 +118,7 @@ class TrackerConfig:
     settle_scans: int = 5
     start_scans: int = 12
     restart_scans: int = 8
-    start_attempts: int = 4
+    start_attempts: int = 2
     start_share: float = 0.7
     start_gain: float = 0.1
     start_offset_step_s: float = 0.005

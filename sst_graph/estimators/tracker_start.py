@@ -14,7 +14,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
 from sst_graph.estimators.contest import choose_start
 from sst_graph.estimators.gaussian import Gaussian, Point
-from sst_graph.estimators.joint import JointConfig, solve_joint
+from sst_graph.estimators.joint import JointConfig, explained, solve_joint
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
@@ -126,6 +126,9 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> _Solved:
     solution = solve_joint([drive], start, _damped(config))
     if not solution.converged:
         raise EstimationError(f"the first solution still moved after {solution.outer_iterations} iterations")
+    if explained(solution) < calibration.start.min_explained:
+        share = f"{100.0 * explained(solution):.0f} %"
+        raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
     state = solution.state
     _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from factors.robust import RobustKernel
@@ -12,6 +12,9 @@ from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.tracker_config import AlarmConfig
 from sst_graph.uncertainty.covariance import ErrorModel
+
+_LEAST_IN_VIEW = 32
+"""Boundary points of which it can be said that next to none of them meets a contour."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,7 @@ class Watch:
         self.scans: deque[int] = deque(maxlen=config.patience)
         self.kept: Before | None = None
         self._latest: deque[Before] = deque(maxlen=config.frames)
+        self._unmet: deque[bool] = deque(maxlen=config.lost)
         self._kernel = RobustKernel("geman_mcclure", config.kernel_px)
 
     def restart(self) -> None:
@@ -55,25 +59,44 @@ class Watch:
         self.alarm.restart()
         self.scans.clear()
         self._latest.clear()
+        self._unmet.clear()
         self.kept = None
 
     def take(
-        self, new: Sequence[int], point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]
+        self,
+        waiting: Sequence[int],
+        matches: Mapping[int, int],
+        point: Point,
+        joint: Joint,
+        model: ErrorModel,
+        restless: Collection[int],
     ) -> float | None:
         """The statistic of the latest frames with some new ones; None while it can't be told.
 
         Args:
-            new: numbers of the scans.
+            waiting: numbers of scans that have had no match yet; those that have an image and were not
+                compared before are compared.
+            matches: how many matches scans have under the narrow kernel.
             point, joint: the estimate, which has not heard them, and its covariance.
             restless: tracks of objects that moved lately; they are not asked.
         """
+        new = [scan for scan in waiting if scan not in self.scans]
         if not new or not self.config.enabled:
             return None
-        self._latest.append(Before(point, joint, min(new)))
+        # 1. Scans that have an image: does what ought to be in view meet its labels?
+        views = self.matcher.in_view(point, new, restless)
+        for scan, seen in views.items():
+            if seen >= _LEAST_IN_VIEW:
+                self._unmet.append(matches.get(scan, 0) < self.config.lost_share * seen)
+        if not views:
+            return None
+        # 2. What they say.
+        self.scans.extend(views)
+        self._latest.append(Before(point, joint, min(views)))
         against = self.kept or self._latest[-1]
-        self.scans.extend(new)
-        scores = self.matcher.scores(against.point, new, self._kernel, restless)
+        scores = self.matcher.scores(against.point, list(views), self._kernel, restless)
         value = self.alarm.check(scores, against.joint, model)
+        # 3. Keep an estimate, or let it go.
         if self.alarm.raised > self.config.patience:
             self.restart()
         elif not self.alarm.raised:
@@ -82,14 +105,31 @@ class Watch:
             self.kept = self._latest[0]
         return value
 
+    @property
+    def lost(self) -> bool:
+        """Whether the image's labels have left what ought to be in view."""
+        return len(self._unmet) == self.config.lost and sum(self._unmet) >= self.config.lost - 1
+
+    @property
+    def far(self) -> bool:
+        """Whether most of the latest frames do not meet the image's labels: a change is a large one."""
+        latest = list(self._unmet)[-self.config.confirmations :]
+        return 2 * sum(latest) > self.config.confirmations
+
+    @property
+    def since(self) -> int:
+        """How many of the latest frames are surely from after a change."""
+        return self.config.lost if self.lost else self.alarm.raised
+
     def is_change(self, model: ErrorModel, restless: Collection[int]) -> bool:
         """Whether all frames since a doubt began speak against the estimate from before it.
 
-        They must do so with any one object left out, too. Where a single object says so, its labels may err
-        for a while: with one object in view, or one that tells far more than the others, that is not decidable.
+        They must do so with any one object left out, too. Where a single object says so, its labels may
+        err for a while: with one in view, or one that tells far more than the others, none can decide that.
         """
         if self.kept is None:
             return False
+        assert self.kept is not None
         kept, config = self.kept, self.config
         scans = [scan for scan in self.scans if scan >= kept.scan]
         pairs = self.matcher.pairs_at(kept.point, scans, self._kernel)

@@ -298,8 +298,31 @@ def test_a_jump_in_the_first_seconds_raises_the_alarm(
     assert _distance(tracker, street.truth.cTl, 0.03 - 1e-3 * jump_ms) < 3.0
 
 
-def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> CameraImage:
-    """The image with the labels around one vehicle moved to the side, all others unknown."""
+def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The camera nods by 10 degrees: next to nothing meets the labels; it is looked for all around."""
+    tracker = _tracker(street)
+    K, R = street.camera.matrix, gtsam.Rot3.Rx(np.radians(10.0))
+    size = (street.camera.width, street.camera.height)
+    alarms = []
+    for frame in frames:
+        assert frame.image is not None
+        mask = cv2.warpPerspective(
+            frame.image.mask,
+            K @ R.matrix() @ np.linalg.inv(K),
+            size,
+            flags=cv2.INTER_NEAREST,
+            borderValue=255,
+        )
+        image = dataclasses.replace(frame.image, mask=mask) if frame.index >= STEP else frame.image
+        alarms += [frame.index] if tracker.add(dataclasses.replace(frame, image=image)).alarm else []
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
+    assert tracker.guess.search and tracker.started
+    error = (gtsam.Pose3(R, np.zeros(3)) * street.truth.cTl).between(tracker.point.cTl)
+    assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation()))) < 0.5
+
+
+def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> Frame:
+    """One vehicle is all that is known, and the image's labels around it are moved to the side."""
     assert frame.image is not None and frame.scan is not None and frame.scan.instances is not None
     lPs = frame.scan.points[
         (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances == instance)
@@ -309,22 +332,34 @@ def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> CameraImage:
     mask = np.full_like(frame.image.mask, SemanticClass.IGNORE)
     box = (slice(max(0, int(top)), int(bottom)), slice(max(0, int(left)), int(right)))
     mask[box] = np.roll(frame.image.mask, 9, axis=1)[box]
-    return dataclasses.replace(frame.image, mask=mask)
+    other = (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances != instance)
+    return dataclasses.replace(
+        frame,
+        image=dataclasses.replace(frame.image, mask=mask),
+        scan=dataclasses.replace(
+            frame.scan, classes=np.where(other, SemanticClass.IGNORE, frame.scan.classes)
+        ),
+    )
 
 
 def test_what_one_object_alone_tells_is_a_doubt(street: SimulatedDrive, frames: list[Frame]) -> None:
-    """One car is in view, and its labels are off: no alarm, but it does not go unsaid."""
+    """One car is in view, and its labels are off: no alarm, but it does not go unsaid, and what was believed
+    before is kept beside what the frames make of it."""
     tracker = _tracker(street, dataclasses.replace(CONFIG, alarm=AlarmConfig(warm_up=4)))
-    scan = frames[STEP + 3].scan
+    scan, T = frames[STEP + 7].scan, street.truth.cTl
     assert scan is not None and scan.instances is not None
-    instance = int(np.bincount(scan.instances[scan.classes == SemanticClass.VEHICLE]).argmax())
-    doubts = []
+    uvs = street.camera.project(scan.points @ T.rotation().matrix().T + T.translation())
+    in_view = (scan.classes == SemanticClass.VEHICLE) & street.camera.in_image(uvs)
+    instance = int(np.bincount(scan.instances[in_view]).argmax())
+    doubts, kept = [], []
     for frame in frames[: STEP + 6]:
-        image = _alone(frame, street, instance) if frame.index >= STEP else frame.image
-        update = tracker.add(dataclasses.replace(frame, image=image))
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
         assert not update.alarm and not (update.doubt and update.adopted)
         doubts += [frame.index] if update.doubt else []
+        kept += [tracker.watch.kept] if update.doubt else []
     assert doubts and min(doubts) >= STEP
+    assert all(before is kept[0] for before in kept)
+    assert kept[0] is not None and kept[0].scan <= doubts[0] and kept[0].point is not tracker.point
 
 
 def test_drift_mode_tells_the_history(street: SimulatedDrive, frames: list[Frame]) -> None:
