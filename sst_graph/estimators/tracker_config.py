@@ -41,7 +41,8 @@ class AlarmConfig:
             for a step to stay in sight [px].
         frames: new frames that are compared together.
         chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
-        confirmations: frames in a row past the threshold; then it must hold without any one object, too ...
+        confirmations: frames in a row past the threshold; then it must hold without any one object, too
+            (the threshold grows with the frames, from twice ``frames`` on) ...
         others: ... and this share of the statistic must remain.
         patience: frames in a row past the threshold after which it is given up: they are learnt from by then.
         lost: frames in a row, but for one of them, in which next to nothing of what ought to be in view meets
@@ -57,8 +58,8 @@ class AlarmConfig:
     frames: int = 4
     chi2: float = 25.0
     confirmations: int = 3
-    others: float = 0.3
-    patience: int = 12
+    others: float = 0.2
+    patience: int = 20
     lost: int = 8
     lost_share: float = 0.12
     baseline: int = 300

@@ -138,7 +138,8 @@ class Watch:
             scores = self.matcher.scores_of(pairs, kept.point, {*without, *restless})
             return self.alarm.value(scores, kept.joint, model)
 
-        whole = value()
-        least = max(config.chi2, config.others * whole)
+        # A step shows more clearly with every frame; labels whose errors last do not.
+        whole, many = value(), len(scans) / (2.0 * config.frames)
+        least = max(config.chi2 * max(1.0, many), config.others * whole)
         asked = self.matcher.objects_of(scans) - set(restless)
         return whole > least and all(value(track) > least for track in asked)

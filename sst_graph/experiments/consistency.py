@@ -57,15 +57,29 @@ class ConsistencyConfig:
 
 @dataclass(frozen=True)
 class Run:
-    """Error (7,) in the covariance's own coordinates, covariance (7, 7), whether the status is a doubt."""
+    """Error and claim of one run.
+
+    Attributes:
+        error: (7,) in the covariance's own coordinates.
+        covariance: (7, 7).
+        doubted: whether the status is a doubt.
+        tells_delay: whether the drive can tell the time offset: if not, it is the prior's and not judged.
+    """
 
     error: FloatArray
     covariance: FloatArray
     doubted: bool
+    tells_delay: bool = True
+
+    def judged(self, part: slice) -> slice:
+        """Those of some of the seven that the drive can tell."""
+        return slice(part.start, part.stop if self.tells_delay else min(part.stop, 6))
 
     def nees(self, part: slice) -> float:
-        """Normalised estimation error squared of some of the seven."""
-        return float(self.error[part] @ np.linalg.solve(self.covariance[part, part], self.error[part]))
+        """Normalised estimation error squared of some of the seven, over their number."""
+        some = self.judged(part)
+        square = float(self.error[some] @ np.linalg.solve(self.covariance[some, some], self.error[some]))
+        return float(square / (some.stop - some.start))
 
 
 def run(config: ConsistencyConfig, progress: Progress | None = None) -> str:
@@ -79,10 +93,10 @@ def run(config: ConsistencyConfig, progress: Progress | None = None) -> str:
             runs.append(_run(drive, config.seed + number, config))
             if progress is not None:
                 progress(name, number + 1, config.runs)
-        rows.append(row(title, runs, config.lost_deg, tells_delay=name != "standing"))
+        rows.append(row(title, runs, config.lost_deg))
         everything += runs
     if len(config.drives) > 1:
-        rows.append(row("all", everything, config.lost_deg, tells_delay=False))
+        rows.append(row("all", everything, config.lost_deg))
     return "\n".join(rows) + "\n"
 
 
@@ -93,7 +107,8 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
     result = calibrate_prepared(prepared, start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
-    return Run(error, result.covariance, result.status == "not_converged" or not result.frames_used)
+    doubted = result.status == "not_converged" or not result.frames_used
+    return Run(error, result.covariance, doubted, tells_delay=drive["motion"] != "standing")
 
 
 def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:
@@ -107,23 +122,19 @@ _HEADER = (
 )
 
 
-def row(title: str, runs: Sequence[Run], lost_deg: float, tells_delay: bool) -> str:
+_PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "delay": slice(6, 7), "all": slice(0, 7)}
+
+
+def row(title: str, runs: Sequence[Run], lost_deg: float) -> str:
     """A row of the table. Doubted runs (no claim is made) and lost ones are counted, the rest judged."""
     claimed = [r for r in runs if not r.doubted]
     kept = [r for r in claimed if np.degrees(np.linalg.norm(r.error[:3])) < lost_deg]
-    parts = {"rotation": slice(0, 3), "translation": slice(3, 6), "delay": slice(6, 7), "all": slice(0, 7)}
-    nees = {
-        name: np.mean([r.nees(part) for r in kept]) / (part.stop - part.start) for name, part in parts.items()
-    }
-    inside = np.array([np.abs(r.error) < 1.96 * np.sqrt(np.diag(r.covariance)) for r in kept])
-    cover = [100.0 * inside[:, part].mean() for part in list(parts.values())[: 3 if tells_delay else 2]]
-    cells = [
-        title,
-        f"{len(runs)} ({len(runs) - len(claimed)}, {len(claimed) - len(kept)})",
-        f"{nees['rotation']:.2f}",
-        f"{nees['translation']:.2f}",
-        f"{nees['delay']:.2f}" if tells_delay else "–",
-        f"{nees['all']:.2f}",
-        ", ".join(f"{share:.0f} %" for share in cover),
-    ]
-    return "| " + " | ".join(cells) + " |"
+    cells, cover = [], []
+    for name, part in _PARTS.items():
+        judged = [r for r in kept if r.judged(part).stop > part.start]
+        cells.append(f"{np.mean([r.nees(part) for r in judged]):.2f}" if judged else "–")
+        if judged and name != "all":
+            inside = [np.abs(r.error[part]) < 1.96 * np.sqrt(np.diag(r.covariance)[part]) for r in judged]
+            cover.append(f"{100.0 * np.mean(inside):.0f} %")
+    counts = f"{len(runs)} ({len(runs) - len(claimed)}, {len(claimed) - len(kept)})"
+    return "| " + " | ".join([title, counts, *cells, ", ".join(cover)]) + " |"
