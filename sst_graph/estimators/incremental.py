@@ -237,8 +237,9 @@ class Tracker:
         if watch.lost:
             return self._change(before, stamp_ns, chi2)
         if watch.alarm.alarm:
-            if watch.kept is not None and watch.is_change(smoother.model, restless):
-                return self._change(watch.kept.point, stamp_ns, chi2)
+            kept = watch.contradicted(smoother.model, restless)
+            if kept is not None:
+                return self._change(kept.point, stamp_ns, chi2)
             doubt = "a single object says that the calibration has changed: a step, or its labels"
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.

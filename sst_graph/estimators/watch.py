@@ -121,15 +121,14 @@ class Watch:
         """How many of the latest frames are surely from after a change."""
         return self.config.lost if self.lost else self.alarm.raised
 
-    def is_change(self, model: ErrorModel, restless: Collection[int]) -> bool:
-        """Whether all frames since a doubt began speak against the estimate from before it.
+    def contradicted(self, model: ErrorModel, restless: Collection[int]) -> Before | None:
+        """The estimate from before a doubt, if all frames since say that the calibration has changed.
 
         They must do so with any one object left out, too. Where a single object says so, its labels may
         err for a while: with one in view, or one that tells far more than the others, none can decide that.
         """
         if self.kept is None:
-            return False
-        assert self.kept is not None
+            return None
         kept, config = self.kept, self.config
         scans = [scan for scan in self.scans if scan >= kept.scan]
         pairs = self.matcher.pairs_at(kept.point, scans, self._kernel)
@@ -142,4 +141,4 @@ class Watch:
         whole, many = value(), len(scans) / (2.0 * config.frames)
         least = max(config.chi2 * max(1.0, many), config.others * whole)
         asked = self.matcher.objects_of(scans) - set(restless)
-        return whole > least and all(value(track) > least for track in asked)
+        return kept if whole > least and all(value(track) > least for track in asked) else None
