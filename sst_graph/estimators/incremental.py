@@ -231,16 +231,11 @@ class Tracker:
         waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
         new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, doubt, watch = self.window.restless(), "", self.watch
-        matches = {scan: len(found[scan].pair) for scan in new}
-        chi2 = watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
-        if watch.lost:
-            return self._change(before, stamp_ns, chi2)
-        if watch.alarm.alarm:
-            kept = watch.contradicted(smoother.model, restless)
-            if kept is not None:
-                return self._change(kept.point, stamp_ns, chi2)
-            doubt = "a single object says that the calibration has changed: a step, or its labels"
+        restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
+        chi2 = self.watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
+        changed, doubt = self.watch.verdict(before, smoother.model, restless)
+        if changed is not None:
+            return self._change(changed, stamp_ns, chi2)
         self._compare(new, before)
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan

@@ -133,29 +133,31 @@ class WindowMatcher:
             if len(pair)
         ]
 
-    def in_view(self, point: Point, chosen: Collection[int], without: Collection[int]) -> dict[int, int]:
-        """How many boundary points of scans that have an image ought to be seen in it at a point.
+    def in_view(
+        self, point: Point, chosen: Collection[int], without: Collection[int]
+    ) -> dict[int, dict[int, int]]:
+        """How many boundary points of each object of scans that have an image ought to be seen in it.
 
         Args:
-            without: tracks of objects that do not count. Where fewer than two objects are in view it is 0.
+            without: tracks of objects that do not count.
+
+        Returns:
+            By the scan's number and the object's track.
         """
         part, numbers = self.window.drive(chosen.__contains__)
         limit = self.graph.max_interval_periods * part.image_period_s
         found = {}
         for pair in pair_by_time(part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, limit):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
-            counts: list[int] = []
+            counts: dict[int, int] = {}
             for c, points in outlines(part.scans[pair.scan], self.graph.undersides).items():
                 if c in contours:
                     cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
-                    inside = np.bincount(
-                        points.objects, part.camera.in_image(part.camera.project(cPs)).astype(np.float64)
-                    )
+                    inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
+                    seen = np.bincount(inside) if len(inside) else np.zeros(0, np.intp)
                     tracks = self.window.tracks[number]
-                    counts += [
-                        int(inside[o]) for o in np.flatnonzero(inside) if tracks[c, int(o)] not in without
-                    ]
-            found[number] = sum(counts) if len(counts) > 1 else 0
+                    counts.update({tracks[c, o]: int(seen[o]) for o in np.flatnonzero(seen).tolist()})
+            found[number] = {track: count for track, count in counts.items() if track not in without}
         return found
 
     def left_out(

@@ -13,8 +13,8 @@ from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.tracker_config import AlarmConfig
 from sst_graph.uncertainty.covariance import ErrorModel
 
-_LEAST_IN_VIEW = 32
-"""Boundary points of which it can be said that next to none of them meets a contour."""
+_LEAST_IN_VIEW = 16
+"""Boundary points of an object of which it can be said that next to none of them meets a contour."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Watch:
         self.scans: deque[int] = deque(maxlen=config.patience)
         self.kept: Before | None = None
         self._latest: deque[Before] = deque(maxlen=config.frames)
-        self._unmet: deque[bool] = deque(maxlen=config.lost)
+        self._unmet: deque[tuple[bool, frozenset[int]]] = deque(maxlen=config.lost)
         self._kernel = RobustKernel("geman_mcclure", config.kernel_px)
 
     def restart(self) -> None:
@@ -85,9 +85,11 @@ class Watch:
             return None
         # 1. Scans that have an image: does what ought to be in view meet its labels?
         views = self.matcher.in_view(point, new, restless)
-        for scan, seen in views.items():
-            if seen >= _LEAST_IN_VIEW:
-                self._unmet.append(matches.get(scan, 0) < self.config.lost_share * seen)
+        for scan, counts in views.items():
+            large = frozenset(track for track, count in counts.items() if count >= _LEAST_IN_VIEW)
+            if large:
+                least = self.config.lost_share * sum(counts.values())
+                self._unmet.append((matches.get(scan, 0) < least, large))
         if not views:
             return None
         # 2. What they say.
@@ -107,21 +109,40 @@ class Watch:
 
     @property
     def lost(self) -> bool:
-        """Whether the image's labels have left what ought to be in view."""
-        return len(self._unmet) == self.config.lost and sum(self._unmet) >= self.config.lost - 1
+        """Whether the image's labels have left what ought to be in view, of two objects or more."""
+        objects = frozenset[int]().union(*(tracks for unmet, tracks in self._unmet if unmet))
+        return self._gone(self.config.lost, 1) and len(objects) > 1
 
     @property
     def far(self) -> bool:
-        """Whether most of the latest frames do not meet the image's labels: a change is a large one."""
-        latest = list(self._unmet)[-self.config.confirmations :]
-        return 2 * sum(latest) > self.config.confirmations
+        """Whether the latest frames do not meet the image's labels: a change is a large one then."""
+        return self._gone(self.config.confirmations, 1)
+
+    def _gone(self, frames: int, but: int) -> bool:
+        latest = [unmet for unmet, _ in self._unmet][-frames:]
+        return len(latest) == frames and sum(latest) >= frames - but
 
     @property
     def since(self) -> int:
         """How many of the latest frames are surely from after a change."""
         return self.config.lost if self.lost else self.alarm.raised
 
-    def contradicted(self, model: ErrorModel, restless: Collection[int]) -> Before | None:
+    def verdict(self, point: Point, model: ErrorModel, restless: Collection[int]) -> tuple[Point | None, str]:
+        """Near which estimate to begin again, where the calibration has changed; else what is doubtful.
+
+        Args:
+            point: the present estimate.
+        """
+        if self.lost:
+            return point, ""
+        if self.alarm.alarm:
+            before = self._contradicted(model, restless)
+            if before is not None:
+                return before.point, ""
+            return None, "a single object says that the calibration has changed: a step, or its labels"
+        return None, "what ought to be in view does not meet the image's labels" if self.far else ""
+
+    def _contradicted(self, model: ErrorModel, restless: Collection[int]) -> Before | None:
         """The estimate from before a doubt, if all frames since say that the calibration has changed.
 
         They must do so with any one object left out, too. Where a single object says so, its labels may
