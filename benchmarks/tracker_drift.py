@@ -13,11 +13,11 @@ import dataclasses
 import json
 from dataclasses import dataclass
 
-import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from tracker_run import PERIOD_NS, endless
+from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
@@ -45,14 +45,9 @@ class Walk:
 def drifted(frame: Frame, walk: Walk, drive: SimulatedDrive) -> Frame:
     """The frame as the drifting camera would have it."""
     assert frame.image is not None
-    K = drive.camera.matrix
-    H = K @ gtsam.Rot3.Ry(walk.yaw_rad[frame.index]).matrix() @ np.linalg.inv(K)
-    size = (drive.camera.width, drive.camera.height)
-    mask = cv2.warpPerspective(
-        frame.image.mask, H, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE
-    )
-    stamp_ns = frame.image.stamp_ns - round(walk.shift_s[frame.index] * 1e9)
-    return dataclasses.replace(frame, image=dataclasses.replace(frame.image, mask=mask, stamp_ns=stamp_ns))
+    yaw_deg = float(np.degrees(walk.yaw_rad[frame.index]))
+    step = Step("drift", (0.0, yaw_deg, 0.0), -1e3 * float(walk.shift_s[frame.index]))
+    return dataclasses.replace(frame, image=step.applied(frame.image, drive))
 
 
 def run(seed: int, frames: int) -> dict[str, float]:

@@ -23,11 +23,12 @@ import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators.tracker_config import DriftConfig
-from sst_graph.types import CameraImage, Frame
+from sst_graph.types import Frame
 
 PERIOD_NS = 100_000_000
 WARM_UP = 100
@@ -35,7 +36,7 @@ STREETS = {
     "plain": SimulationConfig(seed=3, vehicle_density=0.06),
     "heavy": SimulationConfig(seed=1),
 }
-KNOCK = gtsam.Rot3.Ry(np.radians(1.0))
+STEPS = {step.name: step for step in (Step("knock", (0.0, 1.0, 0.0)), Step("clock", late_ms=30.0))}
 
 
 def endless(frames: list[Frame], total: int) -> Iterator[Frame]:
@@ -49,17 +50,6 @@ def endless(frames: list[Frame], total: int) -> Iterator[Frame]:
             dataclasses.replace(frame.scan, stamp_ns=stamp),
             dataclasses.replace(frame.image, stamp_ns=stamp),
         )
-
-
-def changed(image: CameraImage, drive: SimulatedDrive, step: str) -> CameraImage:
-    """The image after a camera knock of 1 deg, or a clock jump of 30 ms."""
-    if step == "clock":
-        return dataclasses.replace(image, stamp_ns=image.stamp_ns + 30_000_000)
-    K = drive.camera.matrix
-    H = K @ KNOCK.matrix() @ np.linalg.inv(K)
-    size = (drive.camera.width, drive.camera.height)
-    mask = cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return dataclasses.replace(image, mask=mask)
 
 
 def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
@@ -79,7 +69,7 @@ def main() -> None:
     parser.add_argument("--drive-frames", type=int, default=40)
     parser.add_argument("--street", choices=tuple(STREETS), default="plain")
     parser.add_argument("--drift", action="store_true")
-    parser.add_argument("--step", choices=("none", "knock", "clock"), default="none")
+    parser.add_argument("--step", choices=("none", *STEPS), default="none")
     parser.add_argument("--step-at", type=int, default=0)
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -92,13 +82,13 @@ def main() -> None:
             azimuth_limit_deg=60.0,
         )
     )
-    frames = list(drive)
+    frames, step = list(drive), STEPS.get(args.step)
     tracker = Tracker(drive.camera, TrackerConfig(drift=DriftConfig(enabled=args.drift)), drive.nominal)
     costs, memory, alarms, chi2, settling = [], [], [], [], []
     for frame in endless(frames, args.frames):
-        if args.step != "none" and frame.index >= args.step_at:
+        if step is not None and frame.index >= args.step_at:
             assert frame.image is not None
-            frame = dataclasses.replace(frame, image=changed(frame.image, drive, args.step))
+            frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
         at_work = tracker.settling is not None
         began = time.process_time()
         update = tracker.add(frame)
@@ -112,8 +102,8 @@ def main() -> None:
     steady, settles = np.array(costs[WARM_UP:]), np.array(settling[WARM_UP:])
     block = min(500, len(steady) // 2)
     truth = drive.truth.cTl
-    if args.step == "knock":
-        truth = gtsam.Pose3(KNOCK, np.zeros(3)) * truth
+    if step is not None:
+        truth = gtsam.Pose3(step.rotation, np.zeros(3)) * truth
     error = truth.between(tracker.point.cTl)
     report = {
         "frames": args.frames,

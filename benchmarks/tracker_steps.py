@@ -40,7 +40,7 @@ class Step:
 
     name: str
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    late_ms: int = 0
+    late_ms: float = 0.0
 
     @property
     def rotation(self) -> gtsam.Rot3:
@@ -56,15 +56,15 @@ class Step:
             mask = cv2.warpPerspective(mask, H, size, flags=cv2.INTER_NEAREST, borderValue=255).astype(
                 np.uint8
             )
-        return dataclasses.replace(image, mask=mask, stamp_ns=image.stamp_ns + self.late_ms * 1_000_000)
+        return dataclasses.replace(image, mask=mask, stamp_ns=image.stamp_ns + round(1e6 * self.late_ms))
 
 
 STEPS = (
     Step("none"),
     Step("yaw 1 deg", (0.0, 1.0, 0.0)),
     Step("pitch 8 deg", (8.0, 0.0, 0.0)),
-    Step("clock 30 ms", late_ms=30),
-    Step("clock -200 ms", late_ms=-200),
+    Step("clock 30 ms", late_ms=30.0),
+    Step("clock -200 ms", late_ms=-200.0),
 )
 
 
