@@ -72,6 +72,8 @@ def main() -> None:
     parser.add_argument("--step", choices=("none", *STEPS), default="none")
     parser.add_argument("--step-at", type=int, default=0)
     args = parser.parse_args()
+    if args.frames < WARM_UP + 20:
+        parser.error(f"--frames {args.frames}: expected {WARM_UP + 20} or more, for {WARM_UP} warm up")
     cv2.setNumThreads(1)
     drive = simulate(
         dataclasses.replace(
