@@ -42,7 +42,7 @@ class AlarmConfig:
         frames: new frames that are compared together.
         chi2: threshold of the statistic, which follows chi-square over the unknowns where all is quiet.
         confirmations: frames in a row past the threshold; then it must hold without any one object, too
-            (the threshold grows with the frames, from twice ``frames`` on) ...
+            (the threshold grows with the frames since) ...
         others: ... and this share of the statistic must remain.
         patience: frames in a row past the threshold after which it is given up: they are learnt from by then.
         lost: frames in a row, but for one of them, in which next to nothing of what ought to be in view meets

@@ -159,7 +159,8 @@ class Watch:
             return self.alarm.value(scores, kept.joint, model)
 
         # A step shows more clearly with every frame; labels whose errors last do not.
-        whole, many = value(), len(scans) / (2.0 * config.frames)
-        least = max(config.chi2 * max(1.0, many), config.others * whole)
+        more = len(scans) / (config.frames + config.confirmations - 1)
+        whole = value()
+        least = max(config.chi2 * max(1.0, more), config.others * whole)
         asked = self.matcher.objects_of(scans) - set(restless)
         return kept if whole > least and all(value(track) > least for track in asked) else None
