@@ -159,7 +159,7 @@ class Watch:
             return self.alarm.value(scores, kept.joint, model)
 
         # A step shows more clearly with every frame; labels whose errors last do not.
-        more = len(scans) / (config.frames + config.confirmations - 1)
+        more = len(scans) / (config.frames + config.confirmations)
         whole = value()
         least = max(config.chi2 * max(1.0, more), config.others * whole)
         asked = self.matcher.objects_of(scans) - set(restless)

@@ -281,7 +281,7 @@ def test_a_step_raises_the_alarm_and_is_learnt(
         assert np.degrees(np.linalg.norm(off)) < 0.6
 
 
-@pytest.mark.parametrize("jump_ms", [30, -40])
+@pytest.mark.parametrize("jump_ms", [-30, 40])
 def test_a_jump_in_the_first_seconds_raises_the_alarm(
     street: SimulatedDrive, frames: list[Frame], jump_ms: int
 ) -> None:
