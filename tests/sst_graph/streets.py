@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cache
 
+import gtsam
+import numpy as np
+
+from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
 from sst_graph.types import SemanticClass
@@ -46,3 +51,20 @@ def prepared_street(label_noise: float = 1.0) -> Drive:
     """:func:`standing_street`, reduced to what calibration needs of its vehicles."""
     config = PrepareConfig(use_visual_odometry=False)
     return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
+
+
+EARLY_START = TrackerConfig(start_scans=8)
+
+
+def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
+    """A tracker that starts from the truth, so that no search is needed."""
+    calibration = config.calibration
+    start = dataclasses.replace(calibration.start, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    return Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+
+
+def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
+    """Mahalanobis distance of a tracker's estimate from a calibration."""
+    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))

@@ -6,12 +6,11 @@ import dataclasses
 from functools import cache
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
-from streets import TRACKED_STREET
+from streets import TRACKED_STREET, sigmas_apart, tracker_from_truth
 
-from sst_graph import Tracker, TrackerConfig
+from sst_graph import TrackerConfig
 from sst_graph.data.simulator import SimulatedDrive, simulate
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import Frame
@@ -22,19 +21,11 @@ def _street() -> SimulatedDrive:
     return simulate(dataclasses.replace(TRACKED_STREET, frames=34))
 
 
-def _distance(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
-    """Mahalanobis distance of the estimate from a calibration."""
-    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
-    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
-
-
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     """Checkpoint of a tracker that has settled for a frame, begun at the truth, and the frames to come."""
     street, config = _street(), TrackerConfig(start_scans=8, window=18, settle_scans=8)
-    start = dataclasses.replace(config.calibration.start, enabled=False)
-    config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, start=start))
-    tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+    tracker = tracker_from_truth(street, config)
     frames = list(street)
     for k, frame in enumerate(frames):
         settled = tracker.settling is not None
@@ -71,7 +62,7 @@ def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, 
     assert tracker.window.leaving() == [oldest, oldest + 1]
     found, covariance = tracker.point, tracker.covariance.copy()
     assert tracker.settle()
-    assert _distance(tracker, found.cTl, found.offset_s) < 1.0
+    assert sigmas_apart(tracker, found.cTl, found.offset_s) < 1.0
     np.testing.assert_allclose(np.diag(tracker.covariance), np.diag(covariance), rtol=0.5)
 
 
@@ -85,4 +76,4 @@ def test_a_settling_that_was_begun_again_ends_alike(begun: tuple[Path, list[Fram
         once.add(frame)
         again.add(frame)
     assert once.settling is None and again.settling is None
-    assert _distance(once, again.point.cTl, again.point.offset_s) < 0.5
+    assert sigmas_apart(once, again.point.cTl, again.point.offset_s) < 0.5
