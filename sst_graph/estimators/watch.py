@@ -111,16 +111,17 @@ class Watch:
     def lost(self) -> bool:
         """Whether the image's labels have left what ought to be in view, of two objects or more."""
         objects = frozenset[int]().union(*(tracks for unmet, tracks in self._unmet if unmet))
-        return self._gone(self.config.lost, 1) and len(objects) > 1
+        return self._gone(self.config.lost) and len(objects) > 1
 
     @property
     def far(self) -> bool:
         """Whether the latest frames do not meet the image's labels: a change is a large one then."""
-        return self._gone(self.config.confirmations, 1)
+        return self._gone(self.config.confirmations)
 
-    def _gone(self, frames: int, but: int) -> bool:
+    def _gone(self, frames: int) -> bool:
+        """Whether so many of the latest frames, but for one of them, do not meet the labels."""
         latest = [unmet for unmet, _ in self._unmet][-frames:]
-        return len(latest) == frames and sum(latest) >= frames - but
+        return len(latest) == frames and sum(latest) >= frames - 1
 
     @property
     def since(self) -> int:

@@ -78,7 +78,7 @@ class Run:
     def nees(self, part: slice) -> float:
         """Normalised estimation error squared of some of the seven, over their number."""
         some = self.judged(part)
-        square = float(self.error[some] @ np.linalg.solve(self.covariance[some, some], self.error[some]))
+        square = self.error[some] @ np.linalg.solve(self.covariance[some, some], self.error[some])
         return float(square / (some.stop - some.start))
 
 

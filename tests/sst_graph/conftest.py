@@ -1,4 +1,4 @@
-"""A tiny KITTI drive on disk."""
+"""A tiny KITTI drive on disk, and the simulated drive that the tracker is tried on."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from streets import TRACKED_STREET
+
+from sst_graph.data.simulator import SimulatedDrive, simulate
+from sst_graph.types import Frame
 
 CALIB = """P0: 700 0 4 0 0 700 3 0 0 0 1 0
 P2: 700 0 4 35 0 700 3 0 0 0 1 0
@@ -40,3 +44,15 @@ def kitti_drive(tmp_path: Path) -> Path:
         mask[-1, -1] = 255
         cv2.imwrite(str(folder / f"semantic_2/{k:06d}.png"), mask)
     return folder
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedDrive:
+    """Of :data:`streets.TRACKED_STREET`; modules with a street of their own hide it."""
+    return simulate(TRACKED_STREET)
+
+
+@pytest.fixture(scope="module")
+def frames(street: SimulatedDrive) -> list[Frame]:
+    """All frames of the street, made once."""
+    return [street[i] for i in range(len(street))]

@@ -9,9 +9,9 @@ import cv2
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, TRACKED_STREET, sigmas_apart, tracker_from_truth
+from streets import EARLY_START, sigmas_apart, tracker_from_truth
 
-from sst_graph.data.simulator import SimulatedDrive, simulate
+from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
@@ -21,24 +21,18 @@ STEP = 20
 """Frame from which on the calibration has changed."""
 
 
-@pytest.fixture(scope="module")
-def street() -> SimulatedDrive:
-    return simulate(TRACKED_STREET)
-
-
-@pytest.fixture(scope="module")
-def frames(street: SimulatedDrive) -> list[Frame]:
-    return [street[i] for i in range(len(street))]
+def _turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
+    """The image of a turned camera; ``border`` says what it shows where it did not look before."""
+    K = street.camera.matrix
+    H = K @ R.matrix() @ np.linalg.inv(K)
+    size = (street.camera.width, street.camera.height)
+    mask = np.asarray(cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, **border), np.uint8)
+    return dataclasses.replace(image, mask=mask)
 
 
 def _knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
     """The image of a camera turned about its vertical axis."""
-    K = street.camera.matrix
-    R = gtsam.Rot3.Ry(np.radians(degrees)).matrix()
-    H = K @ R @ np.linalg.inv(K)
-    size = (street.camera.width, street.camera.height)
-    mask = cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-    return dataclasses.replace(image, mask=mask)
+    return _turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)
 
 
 @pytest.mark.parametrize("kind", ["knock", "clock"])
@@ -89,19 +83,11 @@ def test_a_jump_in_the_first_seconds_raises_the_alarm(
 def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames: list[Frame]) -> None:
     """The camera nods by 10 degrees: next to nothing meets the labels; it is looked for all around."""
     tracker = tracker_from_truth(street)
-    K, R = street.camera.matrix, gtsam.Rot3.Rx(np.radians(10.0))
-    size = (street.camera.width, street.camera.height)
-    alarms = []
+    R, alarms = gtsam.Rot3.Rx(np.radians(10.0)), []
     for frame in frames:
         assert frame.image is not None
-        mask = cv2.warpPerspective(
-            frame.image.mask,
-            K @ R.matrix() @ np.linalg.inv(K),
-            size,
-            flags=cv2.INTER_NEAREST,
-            borderValue=255,
-        )
-        image = dataclasses.replace(frame.image, mask=mask) if frame.index >= STEP else frame.image
+        later = frame.index >= STEP
+        image = _turned(frame.image, street, R, borderValue=255) if later else frame.image
         alarms += [frame.index] if tracker.add(dataclasses.replace(frame, image=image)).alarm else []
     assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
     assert tracker.guess.search and tracker.started

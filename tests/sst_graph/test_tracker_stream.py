@@ -8,10 +8,10 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, TRACKED_STREET, sigmas_apart, tracker_from_truth
+from streets import EARLY_START, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker
-from sst_graph.data.simulator import SimulatedDrive, simulate
+from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.epochs import Found
@@ -22,16 +22,6 @@ from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame
 from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.gained import gained_of
-
-
-@pytest.fixture(scope="module")
-def street() -> SimulatedDrive:
-    return simulate(TRACKED_STREET)
-
-
-@pytest.fixture(scope="module")
-def frames(street: SimulatedDrive) -> list[Frame]:
-    return [street[i] for i in range(len(street))]
 
 
 @pytest.fixture(scope="module")
