@@ -15,6 +15,7 @@ from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
 from sst_graph.files import atomic_write_text
+from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame, Source
 
 
@@ -31,11 +32,10 @@ def run(args: argparse.Namespace) -> int:
     if args.checkpoint is not None:
         save_checkpoint(tracker, args.checkpoint)
     tracker.settle()
-    last = tracker.current()
+    result = tracker_result(tracker, source.name, args.camera)
     if args.out is not None:
-        result = tracker_result(tracker, source.name, args.camera)
         atomic_write_text(args.out, result.to_json())
-    return _verdict(last)
+    return _verdict(tracker.current(), result)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -72,9 +72,8 @@ def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
             yield frame
 
 
-def _verdict(last: TrackUpdate) -> int:
+def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
     if last.status == "ok":
         return 0
-    weak = "; ".join(f"{w.sentence}: {w.advice}" for w in last.weak_directions)
-    print(f"sst-graph: {last.status}: {weak or last.reason or 'no estimate yet'}", file=sys.stderr)
+    print(f"sst-graph: {last.status}: {'; '.join(result.reasons)}", file=sys.stderr)
     return 3

@@ -96,6 +96,13 @@ class StepAlarm:
         """The statistic of any frames' scores, over its usual size; nothing is learnt from it."""
         return chi_square(scores, joint, model, self.object_sigma_px) / self._scale(joint.core_size)
 
+    def shown(
+        self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel, steps: FloatArray
+    ) -> NDArray[np.bool_]:
+        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold in some frames."""
+        seen = Comparison.of(scores, joint, model, self.object_sigma_px).chi2_of(steps)
+        return np.asarray(seen > self.config.chi2 * self._scale(joint.core_size))
+
     @property
     def alarm(self) -> bool:
         """Past the threshold often enough in a row."""
@@ -114,22 +121,61 @@ def chi_square(
     scores: Sequence[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float = 0.0
 ) -> float:
     """T of the new frames, see :class:`StepAlarm`."""
-    n = joint.core_size
-    places = {track: place for score in scores for track, place in score.places.items()}
-    order = list(places)
-    H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
-    by_side: dict[int, FloatArray] = {}
-    for score in scores:
-        own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
-        H[:, own] += score.belief.information[:n]
-        g += score.belief.vector[:n]
-        M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
-        for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
-            by_side[side] = by_side[side] + row if side in by_side else row
-    if by_side:
-        rows = np.stack(list(by_side.values()))
-        M += model.side * (rows.T @ rows)
-    variance = M + H @ joint.seeing(places, object_sigma_px) @ H.T + _LEAST_INFORMATION * np.eye(n)
+    return Comparison.of(scores, joint, model, object_sigma_px).chi2()
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What new frames say about an estimate that has not heard them.
+
+    Attributes:
+        gradient: (n,) of their cost by extrinsic, offset and biases, there.
+        change: (n, m) how it depends on these and on the biases of the objects seen.
+        noise: (n, n) its variance by the matches.
+        known: (m, m) covariance of the estimate.
+    """
+
+    gradient: FloatArray
+    change: FloatArray
+    noise: FloatArray
+    known: FloatArray
+
+    @classmethod
+    def of(
+        cls, scores: Sequence[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float
+    ) -> Comparison:
+        """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
+        n = joint.core_size
+        places = {track: place for score in scores for track, place in score.places.items()}
+        order = list(places)
+        H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
+        by_side: dict[int, FloatArray] = {}
+        for score in scores:
+            own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
+            H[:, own] += score.belief.information[:n]
+            g += score.belief.vector[:n]
+            M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
+            for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
+                by_side[side] = by_side[side] + row if side in by_side else row
+        if by_side:
+            rows = np.stack(list(by_side.values()))
+            M += model.side * (rows.T @ rows)
+        return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), joint.seeing(places, object_sigma_px))
+
+    def chi2(self) -> float:
+        """T of the frames."""
+        return _squared(self.gradient, self.noise + self.change @ self.known @ self.change.T)
+
+    def chi2_of(self, steps: FloatArray) -> FloatArray:
+        """(k,) T that steps (7, k) of extrinsic and offset would make, were the estimate exact."""
+        biases = self.known.copy()
+        biases[:7], biases[:, :7] = 0.0, 0.0
+        variance = self.noise + self.change @ biases @ self.change.T
+        return np.array([_squared(gradient, variance) for gradient in (self.change[:, :7] @ steps).T])
+
+
+def _squared(gradient: FloatArray, variance: FloatArray) -> float:
+    """g' V^-1 g, scaled so that units do not matter."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(variance), 1e-30))
-    scaled = variance * np.outer(scale, scale) + 1e-9 * np.eye(n)
-    return float((scale * g) @ np.linalg.solve(scaled, scale * g))
+    scaled = variance * np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    return float((scale * gradient) @ np.linalg.solve(scaled, scale * gradient))

@@ -37,7 +37,7 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 7
+VERSION = 8
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -66,6 +66,8 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "inflation": tracker.inflation,
         "undersides": [int(c) for c in tracker.matcher.graph.undersides],
         "alarm": [tracker.watch.alarm.raised, tracker.watch.alarm.quiet],
+        "confirmed": [tracker.watch.confirmation.turn_ns, tracker.watch.confirmation.offset_ns],
+        "suspects": sorted(tracker.watch.confirmation.suspects),
         "window": _put_window(arrays, tracker.window),
         "smoother": None if tracker.smoother is None else _put_smoother(arrays, tracker.smoother),
         "adopted": tracker.adopted is not None,
@@ -128,6 +130,8 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     tracker.milestones = Milestones(first, following, tracker.config.window)
     tracker.watch.scans.extend(head["watched"])
     tracker.watch.alarm.raised, tracker.watch.alarm.quiet = head["alarm"]
+    tracker.watch.confirmation.turn_ns, tracker.watch.confirmation.offset_ns = head["confirmed"]
+    tracker.watch.confirmation.suspects.update(head["suspects"])
     tracker.watch.alarm.usual.extend(arrays["usual"].tolist())
     tracker.adoption.costs.extend((float(a), float(b)) for a, b in arrays["costs"])
     tracker.adoption.adopted = _point(arrays, "adopted") if head["adopted"] else None

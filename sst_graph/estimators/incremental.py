@@ -83,6 +83,7 @@ class Tracker:
         self.attempts = 0
         self.waited = 0
         self.inflation = 1.0
+        self.doubt = ""
 
     @property
     def started(self) -> bool:
@@ -202,7 +203,7 @@ class Tracker:
         smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
         self._take_covariance(smoother)
         self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
-        self.watch.restart()
+        self.watch.begin(stamp_ns)
         self.adoption.restart()
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
@@ -233,7 +234,7 @@ class Tracker:
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
         chi2 = self.watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
-        changed, doubt = self.watch.verdict(before, smoother.model, restless)
+        changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
         if changed is not None:
             return self._change(changed, stamp_ns, chi2)
         self._compare(new, before)
@@ -250,7 +251,7 @@ class Tracker:
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
-        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not doubt, doubt=doubt)
+        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not self.doubt)
 
     def _take_covariance(self, smoother: WindowSmoother) -> None:
         """Take over the covariance of a smoother's estimate.
@@ -350,6 +351,13 @@ class Tracker:
             self._answer(stamp_ns, "the calibration has changed", chi2=chi2), alarm=True
         )
 
+    def _unconfirmed_s(self) -> tuple[float, float]:
+        """Seconds since frames last confirmed where the camera looks, and the offset; 0 if nobody watches."""
+        newest = self.window.last_stamp_ns
+        if newest is None or not self.config.alarm.enabled:
+            return 0.0, 0.0
+        return self.watch.confirmation.ages_s(newest)
+
     def _answer(
         self,
         stamp_ns: int,
@@ -357,14 +365,16 @@ class Tracker:
         *,
         chi2: float | None = None,
         offer: bool = False,
-        doubt: str = "",
     ) -> TrackUpdate:
         point, covariance = self.point, self.covariance[:7, :7]
         status: TrackStatus = "alarm" if self.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
+        turn_s = offset_s = 0.0
         if self.smoother is not None:
             weak = weak_directions(covariance, point.cTl, self.config.calibration.observability)
-            status = "unobservable" if weak else "ok"
+            turn_s, offset_s = self._unconfirmed_s()
+            late = turn_s > self.config.alarm.confirm_s
+            status = "unobservable" if weak else "unconfirmed" if late else "ok"
         return TrackUpdate(
             stamp_ns=stamp_ns,
             T_camera_lidar=point.cTl,
@@ -375,7 +385,9 @@ class Tracker:
             reason=reason,
             matches=0 if self.smoother is None else self.smoother.matches,
             chi2=chi2,
-            doubt=doubt,
+            doubt=self.doubt,
+            unconfirmed_s=turn_s,
+            offset_unconfirmed_s=offset_s,
             adopted=offer and self.adoption.offer(point, status == "ok"),
             weak_directions=weak,
         )

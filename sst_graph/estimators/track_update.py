@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.result import WeakDirection
 
 FloatArray = NDArray[np.float64]
-TrackStatus = Literal["starting", "ok", "unobservable", "alarm"]
+TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,18 @@ class TrackUpdate:
         time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
         covariance: (7, 7) cluster-robust.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
-            converged again; else whether the limits of observability are met.
+            converged again; ``unconfirmed`` where no frames have lately confirmed it; else whether the limits
+            of observability are met.
         accepted: the frame was taken into the estimate; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
         matches: silhouette matches in the window.
         chi2: statistic of the change test, over its usual size, or None where it can't be told.
         doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
         alarm: this frame raised the alarm: the calibration has changed.
+        unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
+            camera; above ``alarm.confirm_s`` the status is ``unconfirmed`` [s].
+        offset_unconfirmed_s: the same for a jump of the clock, which often nothing can show (at rest, or
+            with nothing near); the status does not ask for it [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
     """
@@ -47,6 +52,8 @@ class TrackUpdate:
     chi2: float | None = None
     doubt: str = ""
     alarm: bool = False
+    unconfirmed_s: float = 0.0
+    offset_unconfirmed_s: float = 0.0
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
 
@@ -72,6 +79,8 @@ class TrackUpdate:
             "chi2": self.chi2,
             "doubt": self.doubt,
             "alarm": self.alarm,
+            "unconfirmed_s": self.unconfirmed_s,
+            "offset_unconfirmed_s": self.offset_unconfirmed_s,
             "adopted": self.adopted,
             "weak": [weak.sentence for weak in self.weak_directions],
         }

@@ -48,6 +48,12 @@ class AlarmConfig:
         lost: frames in a row, but for one of them, in which next to nothing of what ought to be in view meets
             the image's labels: the step is larger than matches reach.
         lost_share: share of the boundary points in view that is next to nothing.
+        shown_deg: frames that agree with the estimate confirm it where a turn of the camera by this much
+            about its x or its y axis would be past the threshold; under the wide kernel a turn of 1 degree
+            looks like this one [deg].
+        shown_s: the same of a jump of the clock [s].
+        confirm_s: an estimate is ``unconfirmed`` where nothing has confirmed for longer where the camera
+            looks [s].
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -62,11 +68,15 @@ class AlarmConfig:
     patience: int = 20
     lost: int = 8
     lost_share: float = 0.12
+    shown_deg: float = 0.25
+    shown_s: float = 0.01
+    confirm_s: float = 1.0
     baseline: int = 300
     warm_up: int = 15
 
     def __post_init__(self) -> None:
         _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "lost", "baseline")
+        _require_positive(self, "shown_deg", "shown_s", "confirm_s")
         if self.patience < max(self.frames, self.confirmations):
             raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")
 

@@ -17,6 +17,9 @@ def tracker_result(
     reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
     if last.status == "unobservable":
         status = "unobservable"
+    elif last.status == "unconfirmed":
+        why = f": {last.doubt}" if last.doubt else ""
+        reasons = (f"no frame has confirmed the calibration for the last {last.unconfirmed_s:.1f} s{why}",)
     elif last.status != "ok":
         reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
     entries = {} if tracker.smoother is None else tracker.smoother.entries

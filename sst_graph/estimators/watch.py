@@ -6,8 +6,11 @@ from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from factors.robust import RobustKernel
 from sst_graph.estimators.alarm import Joint, StepAlarm
+from sst_graph.estimators.confirmation import Confirmation, steps
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.tracker_config import AlarmConfig
@@ -42,6 +45,7 @@ class Watch:
         alarm: the statistic of the latest frames.
         scans: the latest frames that were compared.
         kept: the estimate from before a doubt, while there is one.
+        confirmation: when frames last confirmed the estimate.
     """
 
     def __init__(self, matcher: WindowMatcher, config: AlarmConfig, object_sigma_px: float) -> None:
@@ -50,12 +54,18 @@ class Watch:
         self.alarm = StepAlarm(config, object_sigma_px)
         self.scans: deque[int] = deque(maxlen=config.patience)
         self.kept: Before | None = None
+        self.confirmation = Confirmation()
         self._latest: deque[Before] = deque(maxlen=config.frames)
         self._unmet: deque[tuple[bool, frozenset[int]]] = deque(maxlen=config.lost)
         self._kernel = RobustKernel("geman_mcclure", config.kernel_px)
 
+    def begin(self, stamp_ns: int) -> None:
+        """A new calibration begins, which a start has confirmed."""
+        self.restart()
+        self.confirmation.begin(stamp_ns)
+
     def restart(self) -> None:
-        """Forget the frames: a new calibration begins."""
+        """Forget the frames."""
         self.alarm.restart()
         self.scans.clear()
         self._latest.clear()
@@ -100,12 +110,30 @@ class Watch:
         value = self.alarm.check(scores, against.joint, model)
         # 3. Keep an estimate, or let it go.
         if self.alarm.raised > self.config.patience:
+            self.confirmation.suspects |= self.matcher.objects_of(self.scans) - set(restless)
             self.restart()
         elif not self.alarm.raised:
             self.kept = None
         elif self.kept is None:
             self.kept = self._latest[0]
+        # 4. What do they confirm?
+        if value is not None and not self.alarm.raised and not self.far:
+            self._confirm(max(views), point, joint, model, restless)
         return value
+
+    def _confirm(
+        self, newest: int, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]
+    ) -> None:
+        """The latest frames agree with the estimate: note which steps they would have shown."""
+        config, scores = self.config, list(self.alarm.recent)
+        if suspects := self.confirmation.suspects:
+            latest = list(self.scans)[-config.frames :]
+            scores = self.matcher.scores(point, latest, self._kernel, {*suspects, *restless})
+            if not scores or self.alarm.value(scores, joint, model) > config.chi2:
+                return
+        tried = steps(point.cTl, float(np.radians(config.shown_deg)), config.shown_s)
+        stamp_ns = self.matcher.window.stamps_ns()[newest]
+        self.confirmation.take(stamp_ns, self.alarm.shown(scores, joint, model, tried))
 
     @property
     def lost(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from itertools import pairwise
+from pathlib import Path
 
 import cv2
 import gtsam
@@ -11,11 +12,15 @@ import numpy as np
 import pytest
 from streets import EARLY_START, sigmas_apart, tracker_from_truth
 
+from sst_graph import Tracker
 from sst_graph.data.simulator import SimulatedDrive
+from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
+from sst_graph.estimators.tracker_result import tracker_result
 from sst_graph.types import CameraImage, Frame, SemanticClass
+from sst_graph.uncertainty.observability import ObservabilityConfig
 
 STEP = 20
 """Frame from which on the calibration has changed."""
@@ -116,15 +121,20 @@ def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> Frame:
     )
 
 
+def _plainest(frame: Frame, street: SimulatedDrive) -> int:
+    """The vehicle with most points in view."""
+    scan, T = frame.scan, street.truth.cTl
+    assert scan is not None and scan.instances is not None
+    uvs = street.camera.project(scan.points @ T.rotation().matrix().T + T.translation())
+    in_view = (scan.classes == SemanticClass.VEHICLE) & street.camera.in_image(uvs)
+    return int(np.bincount(scan.instances[in_view]).argmax())
+
+
 def test_what_one_object_alone_tells_is_a_doubt(street: SimulatedDrive, frames: list[Frame]) -> None:
     """One car is in view, and its labels are off: no alarm, but it does not go unsaid, and what was believed
     before is kept beside what the frames make of it."""
     tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(warm_up=4)))
-    scan, T = frames[STEP + 7].scan, street.truth.cTl
-    assert scan is not None and scan.instances is not None
-    uvs = street.camera.project(scan.points @ T.rotation().matrix().T + T.translation())
-    in_view = (scan.classes == SemanticClass.VEHICLE) & street.camera.in_image(uvs)
-    instance = int(np.bincount(scan.instances[in_view]).argmax())
+    instance = _plainest(frames[STEP + 7], street)
     doubts, kept = [], []
     for frame in frames[: STEP + 6]:
         update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
@@ -134,6 +144,69 @@ def test_what_one_object_alone_tells_is_a_doubt(street: SimulatedDrive, frames: 
     assert doubts and min(doubts) >= STEP
     assert all(before is kept[0] for before in kept)
     assert kept[0] is not None and kept[0].scan <= doubts[0] and kept[0].point is not tracker.point
+
+
+def _sure_tracker(street: SimulatedDrive, alarm: AlarmConfig) -> Tracker:
+    """A tracker that calls any estimate observable."""
+    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, offset_s=10.0, pair_correlation=2.0)
+    calibration = dataclasses.replace(EARLY_START.calibration, observability=limits)
+    return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration, alarm=alarm))
+
+
+def test_a_knock_that_nothing_can_show_is_not_called_ok(
+    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that is in view moves from then on: no alarm can be raised, and the status says so."""
+    tracker, ages = _sure_tracker(street, AlarmConfig()), []
+    for frame in frames:
+        assert frame.image is not None
+        image = frame.image
+        if frame.index == STEP:
+            monkeypatch.setattr(tracker.window, "restless", lambda: set(tracker.window.objects.live))
+        if frame.index >= STEP:
+            image = _knocked(image, street, 1.5)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        ages.append(update.unconfirmed_s)
+        assert not update.alarm and not (update.adopted and frame.index > STEP + 10)
+        if frame.index < STEP:
+            assert update.status != "unconfirmed"
+    assert ages[STEP - 1] == 0.0
+    np.testing.assert_allclose(np.diff(ages[STEP - 1 :]), 0.1036, atol=2e-3)
+    assert update.status == "unconfirmed" and update.to_dict()["unconfirmed_s"] > 1.0
+    assert tracker_result(tracker).status == "not_converged"
+    assert "no frame has confirmed" in tracker_result(tracker).reasons[0]
+
+
+def test_frames_that_show_nothing_let_the_estimate_age(
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
+) -> None:
+    """The image's labels are missing for a while; when they are back, the estimate is confirmed again."""
+    tracker, status = _sure_tracker(street, AlarmConfig()), []
+    for frame in frames:
+        assert frame.image is not None
+        image = frame.image
+        if STEP <= frame.index < STEP + 12:
+            image = dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        status.append(update.status)
+        if frame.index == STEP + 5:
+            save_checkpoint(tracker, tmp_path / "tracker.npz")
+            resumed = load_checkpoint(tmp_path / "tracker.npz").current()
+            assert resumed.unconfirmed_s == update.unconfirmed_s > 0.5
+            assert resumed.offset_unconfirmed_s == update.offset_unconfirmed_s > 0.5
+    assert "unconfirmed" not in status[: STEP + 8]
+    assert status[STEP + 11] == "unconfirmed"
+    assert status[-1] == "ok" and update.unconfirmed_s == 0.0
+
+
+def test_a_doubt_that_is_given_up_is_no_confirmation(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The estimate has followed the one object by then; that it agrees with it now says nothing."""
+    tracker = _sure_tracker(street, AlarmConfig(warm_up=4, patience=5))
+    instance = _plainest(frames[STEP + 7], street)
+    for frame in frames[: STEP + 14]:
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
+    assert tracker.watch.confirmation.suspects and not tracker.watch.kept
+    assert update.status == "unconfirmed"
 
 
 def test_drift_mode_tells_the_history(street: SimulatedDrive, frames: list[Frame]) -> None:

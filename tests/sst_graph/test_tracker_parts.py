@@ -11,7 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.estimators.adoption import Adoption
-from sst_graph.estimators.alarm import Joint, StepAlarm, chi_square
+from sst_graph.estimators.alarm import Comparison, Joint, StepAlarm, chi_square
+from sst_graph.estimators.confirmation import Confirmation, steps
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
 from sst_graph.estimators.score_sums import ScoreSums, fit_sides
 from sst_graph.estimators.scores import PairScore, SideSums
@@ -124,6 +125,35 @@ def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
         if alarm.check([_score(rng, step, 9000 + 4 * k)], Joint(P, (), N), _model()) and alarm.alarm
     ]
     assert raised and raised[0] < 8
+
+
+def test_steps_that_would_be_seen_are_told_before_they_come() -> None:
+    """What a step is said to make is what frames with that step make, beyond the noise."""
+    rng = np.random.default_rng(5)
+    tried = np.zeros((7, 2))
+    tried[1, 0], tried[6, 1] = 0.02, 0.3
+    scores = [_score(rng, np.zeros(N), 4 * k) for k in range(4)]
+    exact = Joint(np.zeros((N, N)), (), N)
+    small, large = Comparison.of(scores, exact, _model(), 0.0).chi2_of(tried)
+    assert small < 5.0 < 50.0 < large
+    alarm = StepAlarm(AlarmConfig())
+    assert alarm.shown(scores, exact, _model(), tried).tolist() == [False, True]
+    stepped = [_score(rng, np.append(tried[:, 1], [0.0, 0.0]), 4 * k) for k in range(4)]
+    assert chi_square(stepped, exact, _model()) == pytest.approx(large + N, rel=0.3)
+
+
+def test_what_is_confirmed_is_told_apart() -> None:
+    found, T = Confirmation(), gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, 0.3]))
+    assert found.ages_s(10**9) == (0.0, 0.0)
+    found.begin(10**9)
+    found.suspects.add(3)
+    found.take(2 * 10**9, np.array([True, False, True]))
+    assert found.ages_s(4 * 10**9) == (3.0, 2.0) and found.suspects
+    found.take(3 * 10**9, np.array([True, True, False]))
+    assert found.ages_s(4 * 10**9) == (1.0, 2.0) and not found.suspects
+    turned = T.retract(steps(T, 0.01, 0.02)[:6, 1])
+    assert turned.equals(gtsam.Pose3(gtsam.Rot3.Ry(0.01), np.zeros(3)) * T, 1e-9)
+    assert steps(T, 0.01, 0.02)[6].tolist() == [0.0, 0.0, 0.02]
 
 
 def test_settings_out_of_range() -> None:
