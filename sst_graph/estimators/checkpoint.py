@@ -66,7 +66,7 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         "inflation": tracker.inflation,
         "undersides": [int(c) for c in tracker.matcher.graph.undersides],
         "alarm": [tracker.watch.alarm.raised, tracker.watch.alarm.quiet],
-        "confirmed": [tracker.watch.confirmation.turn_ns, tracker.watch.confirmation.offset_ns],
+        "confirmed": [tracker.watch.confirmation.turn_s, tracker.watch.confirmation.offset_s],
         "suspects": sorted(tracker.watch.confirmation.suspects),
         "window": _put_window(arrays, tracker.window),
         "smoother": None if tracker.smoother is None else _put_smoother(arrays, tracker.smoother),
@@ -130,7 +130,7 @@ def _tracker(head: Mapping[str, Any], arrays: Arrays) -> Tracker:
     tracker.milestones = Milestones(first, following, tracker.config.window)
     tracker.watch.scans.extend(head["watched"])
     tracker.watch.alarm.raised, tracker.watch.alarm.quiet = head["alarm"]
-    tracker.watch.confirmation.turn_ns, tracker.watch.confirmation.offset_ns = head["confirmed"]
+    tracker.watch.confirmation.turn_s, tracker.watch.confirmation.offset_s = head["confirmed"]
     tracker.watch.confirmation.suspects.update(head["suspects"])
     tracker.watch.alarm.usual.extend(arrays["usual"].tolist())
     tracker.adoption.costs.extend((float(a), float(b)) for a, b in arrays["costs"])

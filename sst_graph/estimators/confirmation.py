@@ -13,37 +13,36 @@ FloatArray = NDArray[np.float64]
 
 @dataclass
 class Confirmation:
-    """Since when nothing has confirmed the estimate.
+    """For how long nothing has confirmed the estimate.
 
     Attributes:
-        turn_ns: stamp of the scan that last confirmed where the camera looks, or of the start's; None before.
-        offset_ns: the same of the time offset.
+        turn_s: seconds since a frame last confirmed where the camera looks.
+        offset_s: seconds in motion since one last confirmed the time offset; at rest nothing can.
         suspects: tracks of objects that raised a doubt which was given up; they confirm nothing until others
             have: the estimate has followed them, whether they were right or not.
     """
 
-    turn_ns: int | None = None
-    offset_ns: int | None = None
+    turn_s: float = 0.0
+    offset_s: float = 0.0
     suspects: set[int] = field(default_factory=set)
 
-    def begin(self, stamp_ns: int) -> None:
+    def begin(self) -> None:
         """A start confirms all."""
-        self.turn_ns = self.offset_ns = stamp_ns
+        self.turn_s = self.offset_s = 0.0
         self.suspects.clear()
 
-    def take(self, stamp_ns: int, shown: NDArray[np.bool_]) -> None:
-        """A scan agrees with the estimate and would have shown some of :func:`steps`."""
+    def wait(self, seconds: float, moving: bool) -> None:
+        """Time passes."""
+        self.turn_s += seconds
+        self.offset_s += seconds if moving else 0.0
+
+    def take(self, shown: NDArray[np.bool_]) -> None:
+        """The latest frames agree with the estimate and would have shown some of :func:`steps`."""
         if shown[:2].all():
-            self.turn_ns = stamp_ns
+            self.turn_s = 0.0
             self.suspects.clear()
         if shown[2]:
-            self.offset_ns = stamp_ns
-
-    def ages_s(self, stamp_ns: int) -> tuple[float, float]:
-        """Seconds since where the camera looks, and the time offset, were confirmed; 0 before a start."""
-        since = (stamp_ns if then is None else then for then in (self.turn_ns, self.offset_ns))
-        turn, offset = (max(0.0, 1e-9 * (stamp_ns - then)) for then in since)
-        return turn, offset
+            self.offset_s = 0.0
 
 
 def steps(cTl: gtsam.Pose3, turn_rad: float, offset_s: float) -> FloatArray:

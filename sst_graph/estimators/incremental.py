@@ -203,7 +203,7 @@ class Tracker:
         smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
         self._take_covariance(smoother)
         self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
-        self.watch.begin(stamp_ns)
+        self.watch.begin()
         self.adoption.restart()
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
@@ -351,13 +351,6 @@ class Tracker:
             self._answer(stamp_ns, "the calibration has changed", chi2=chi2), alarm=True
         )
 
-    def _unconfirmed_s(self) -> tuple[float, float]:
-        """Seconds since frames last confirmed where the camera looks, and the offset; 0 if nobody watches."""
-        newest = self.window.last_stamp_ns
-        if newest is None or not self.config.alarm.enabled:
-            return 0.0, 0.0
-        return self.watch.confirmation.ages_s(newest)
-
     def _answer(
         self,
         stamp_ns: int,
@@ -366,14 +359,13 @@ class Tracker:
         chi2: float | None = None,
         offer: bool = False,
     ) -> TrackUpdate:
-        point, covariance = self.point, self.covariance[:7, :7]
+        point, covariance, alarm = self.point, self.covariance[:7, :7], self.config.alarm
         status: TrackStatus = "alarm" if self.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
-        turn_s = offset_s = 0.0
+        since = self.watch.confirmation
         if self.smoother is not None:
             weak = weak_directions(covariance, point.cTl, self.config.calibration.observability)
-            turn_s, offset_s = self._unconfirmed_s()
-            late = turn_s > self.config.alarm.confirm_s
+            late = since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
         return TrackUpdate(
             stamp_ns=stamp_ns,
@@ -386,8 +378,8 @@ class Tracker:
             matches=0 if self.smoother is None else self.smoother.matches,
             chi2=chi2,
             doubt=self.doubt,
-            unconfirmed_s=turn_s,
-            offset_unconfirmed_s=offset_s,
+            unconfirmed_s=since.turn_s,
+            offset_unconfirmed_s=since.offset_s,
             adopted=offer and self.adoption.offer(point, status == "ok"),
             weak_directions=weak,
         )

@@ -34,9 +34,10 @@ class TrackUpdate:
         doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
         alarm: this frame raised the alarm: the calibration has changed.
         unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
-            camera; above ``alarm.confirm_s`` the status is ``unconfirmed`` [s].
-        offset_unconfirmed_s: the same for a jump of the clock, which often nothing can show (at rest, or
-            with nothing near); the status does not ask for it [s].
+            camera; the status is ``unconfirmed`` above ``alarm.confirm_s`` [s].
+        offset_unconfirmed_s: time since frames last agreed with it that would have shown a jump of the clock,
+            as far as the LiDAR was faster than ``alarm.confirm_mps``; the same above
+            ``alarm.confirm_offset_s`` [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
     """

@@ -53,7 +53,9 @@ class AlarmConfig:
             looks like this one [deg].
         shown_s: the same of a jump of the clock [s].
         confirm_s: an estimate is ``unconfirmed`` where nothing has confirmed for longer where the camera
-            looks [s].
+            looks ...
+        confirm_offset_s: ... or the time offset, while the LiDAR is fast [s]:
+        confirm_mps: faster than this; where it is slower, a jump of the clock can hardly be seen [m/s].
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -71,12 +73,14 @@ class AlarmConfig:
     shown_deg: float = 0.25
     shown_s: float = 0.01
     confirm_s: float = 1.0
+    confirm_offset_s: float = 3.0
+    confirm_mps: float = 3.0
     baseline: int = 300
     warm_up: int = 15
 
     def __post_init__(self) -> None:
         _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "lost", "baseline")
-        _require_positive(self, "shown_deg", "shown_s", "confirm_s")
+        _require_positive(self, "shown_deg", "shown_s", "confirm_s", "confirm_offset_s")
         if self.patience < max(self.frames, self.confirmations):
             raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from sst_graph.config import to_dict
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
 from sst_graph.uncertainty.gained import KEY, to_document
 
@@ -18,8 +19,7 @@ def tracker_result(
     if last.status == "unobservable":
         status = "unobservable"
     elif last.status == "unconfirmed":
-        why = f": {last.doubt}" if last.doubt else ""
-        reasons = (f"no frame has confirmed the calibration for the last {last.unconfirmed_s:.1f} s{why}",)
+        reasons = _unconfirmed(last)
     elif last.status != "ok":
         reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
     entries = {} if tracker.smoother is None else tracker.smoother.entries
@@ -51,4 +51,12 @@ def tracker_result(
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
             **({} if tracker.config.drift.enabled else {KEY: to_document(tracker.arrivals.gained(drive))}),
         },
+    )
+
+
+def _unconfirmed(last: TrackUpdate) -> tuple[str, ...]:
+    return (
+        "no frame would have shown a change: of where the camera looks for the last "
+        f"{last.unconfirmed_s:.1f} s, of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"
+        + (f"; {last.doubt}" if last.doubt else ""),
     )

@@ -59,10 +59,10 @@ class Watch:
         self._unmet: deque[tuple[bool, frozenset[int]]] = deque(maxlen=config.lost)
         self._kernel = RobustKernel("geman_mcclure", config.kernel_px)
 
-    def begin(self, stamp_ns: int) -> None:
+    def begin(self) -> None:
         """A new calibration begins, which a start has confirmed."""
         self.restart()
-        self.confirmation.begin(stamp_ns)
+        self.confirmation.begin()
 
     def restart(self) -> None:
         """Forget the frames."""
@@ -90,8 +90,12 @@ class Watch:
             point, joint: the estimate, which has not heard them, and its covariance.
             restless: tracks of objects that moved lately; they are not asked.
         """
+        if not self.config.enabled:
+            return None
+        seconds, speed_mps = self.matcher.window.latest_step()
+        self.confirmation.wait(seconds, speed_mps > self.config.confirm_mps)
         new = [scan for scan in waiting if scan not in self.scans]
-        if not new or not self.config.enabled:
+        if not new:
             return None
         # 1. Scans that have an image: does what ought to be in view meet its labels?
         views = self.matcher.in_view(point, new, restless)
@@ -118,12 +122,10 @@ class Watch:
             self.kept = self._latest[0]
         # 4. What do they confirm?
         if value is not None and not self.alarm.raised and not self.far:
-            self._confirm(max(views), point, joint, model, restless)
+            self._confirm(point, joint, model, restless)
         return value
 
-    def _confirm(
-        self, newest: int, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]
-    ) -> None:
+    def _confirm(self, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
         config, scores = self.config, list(self.alarm.recent)
         if suspects := self.confirmation.suspects:
@@ -132,8 +134,7 @@ class Watch:
             if not scores or self.alarm.value(scores, joint, model) > config.chi2:
                 return
         tried = steps(point.cTl, float(np.radians(config.shown_deg)), config.shown_s)
-        stamp_ns = self.matcher.window.stamps_ns()[newest]
-        self.confirmation.take(stamp_ns, self.alarm.shown(scores, joint, model, tried))
+        self.confirmation.take(self.alarm.shown(scores, joint, model, tried))
 
     @property
     def lost(self) -> bool:

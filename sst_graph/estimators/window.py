@@ -98,6 +98,16 @@ class Window:
         """Stamp of the newest scan."""
         return self.scans[-1][1].stamp_ns if self.scans else None
 
+    def latest_step(self) -> tuple[float, float]:
+        """Seconds from the scan before to the newest one, and the LiDAR's speed; 0 if unknown [m/s]."""
+        if len(self.scans) < 2:
+            return 0.0, 0.0
+        seconds = 1e-9 * (self.scans[-1][1].stamp_ns - self.scans[-2][1].stamp_ns)
+        motion = self.motions[-1] if self.motions else None
+        if motion is None or motion.to_ns != self.last_stamp_ns:
+            return seconds, 0.0
+        return seconds, float(np.linalg.norm(motion.aTb.translation())) / seconds
+
     def leaving(self) -> list[int]:
         """The scans that leave when the next one comes, oldest first."""
         surplus = 0 if self.held else min(2, len(self.scans) + 1 - self.size)

@@ -144,13 +144,15 @@ def test_steps_that_would_be_seen_are_told_before_they_come() -> None:
 
 def test_what_is_confirmed_is_told_apart() -> None:
     found, T = Confirmation(), gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, 0.3]))
-    assert found.ages_s(10**9) == (0.0, 0.0)
-    found.begin(10**9)
     found.suspects.add(3)
-    found.take(2 * 10**9, np.array([True, False, True]))
-    assert found.ages_s(4 * 10**9) == (3.0, 2.0) and found.suspects
-    found.take(3 * 10**9, np.array([True, True, False]))
-    assert found.ages_s(4 * 10**9) == (1.0, 2.0) and not found.suspects
+    found.wait(2.0, moving=True)
+    found.wait(1.0, moving=False)
+    assert (found.turn_s, found.offset_s) == (3.0, 2.0)
+    found.take(np.array([True, False, True]))
+    assert (found.turn_s, found.offset_s) == (3.0, 0.0) and found.suspects
+    found.wait(2.0, moving=True)
+    found.take(np.array([True, True, False]))
+    assert (found.turn_s, found.offset_s) == (0.0, 2.0) and not found.suspects
     turned = T.retract(steps(T, 0.01, 0.02)[:6, 1])
     assert turned.equals(gtsam.Pose3(gtsam.Rot3.Ry(0.01), np.zeros(3)) * T, 1e-9)
     assert steps(T, 0.01, 0.02)[6].tolist() == [0.0, 0.0, 0.02]
