@@ -35,6 +35,8 @@ class Alignment:
         c_acceleration: (6,) twist's rate of change [rad/s^2, m/s^2].
         motion_model: "se3" or the first-order "translation" (see :mod:`factors.motion`).
         weights: (n,) or one number: factor on the cost of each match (after the kernel).
+        l_velocities: (n, 3) velocity over ground of the object that each point lies on, in the LiDAR frame
+            [m/s], or None where all stand.
     """
 
     camera: PinholeCamera
@@ -47,6 +49,7 @@ class Alignment:
     c_acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
     motion_model: MotionModel = "se3"
     weights: FloatArray = field(default_factory=lambda: np.ones(()))
+    l_velocities: FloatArray | None = None
 
     def __post_init__(self) -> None:
         store = object.__setattr__
@@ -65,6 +68,9 @@ class Alignment:
             if n and float(np.abs(lengths - 1.0).max()) > 1e-3:
                 worst = lengths[np.abs(lengths - 1.0).argmax()]
                 raise FactorError("normals of an alignment", f"one of length {worst:.3g}", "unit vectors")
+        if self.l_velocities is not None:
+            velocities = checked_array("l_velocities of an alignment", self.l_velocities, (n, 3))
+            store(self, "l_velocities", velocities)
         acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, (6,))
         store(self, "c_acceleration", acceleration)
         if self.motion_model not in get_args(MotionModel):
@@ -85,6 +91,7 @@ class Alignment:
             sigmas_px=self.sigmas_px[index],
             normals=None if self.normals is None else self.normals[index],
             weights=self.weights[index],
+            l_velocities=None if self.l_velocities is None else self.l_velocities[index],
         )
 
     @property
@@ -97,6 +104,11 @@ class Alignment:
         """lPs (3, n), pixels (2, n) and normals (2, n), contiguous by row, for the hot path."""
         normals = None if self.normals is None else np.ascontiguousarray(self.normals.T)
         return np.ascontiguousarray(self.lPs.T), np.ascontiguousarray(self.pixels.T), normals
+
+    @cached_property
+    def velocity_columns(self) -> FloatArray | None:
+        """l_velocities (3, n), contiguous by row, for the hot path."""
+        return None if self.l_velocities is None else np.ascontiguousarray(self.l_velocities.T)
 
     @cached_property
     def common_tau_s(self) -> float | None:

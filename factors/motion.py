@@ -8,6 +8,9 @@ SST-Calib (Kodaira et al., ITSC 2022), ``model="translation"``, has
 
     cP_i = cTl . lP_i - tau_i v_i,   v_i the linear part of w_i (the paper's v_k is -v).
 
+A point of an object that moves over ground by itself, with velocity u_i in the LiDAR frame of its scan, is at
+lP_i + tau_i u_i at the image's instant; that takes the place of lP_i above.
+
 Points are columns here: (3, n); a Jacobian over k residual rows of n points is (cols, k, n).
 
 Where all points share one tau, the scan moves as one rigid body, cP_i = cTl' . lP_i, and every
@@ -162,13 +165,15 @@ class PointwiseMoved:
     """Points with a tau each.
 
     Attributes:
-        lPs, cPs: (3, n) points in the LiDAR, and in the camera at the image's instant [m].
+        lPs, cPs: (3, n) points in the LiDAR, and in the camera at the image's instant, both where the objects
+            they lie on have moved by themselves until then [m].
         lift: None, :meth:`write_rows` gives the derivatives themselves.
         taus_s: (n,) interval of each point [s].
         cRl: (3, 3) rotation of the LiDAR in the camera, before the motion.
         xis: (6, n) twist of the displacement, -tau w.
         rates: (6, n) -d xi / d tau = c_twist - tau c_acceleration.
         model: see :data:`MotionModel`.
+        l_velocities: (3, n) of the objects [m/s], or None.
     """
 
     lPs: FloatArray
@@ -179,6 +184,7 @@ class PointwiseMoved:
     xis: FloatArray
     rates: FloatArray
     model: MotionModel
+    l_velocities: FloatArray | None = None
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
         """Derivatives into out (13, k, n), columns as in :class:`RigidlyMoved`, from the gradients g."""
@@ -188,6 +194,8 @@ class PointwiseMoved:
         np.multiply(by_xi, -self.taus_s, out=out[7:13])
         by_xi *= self.rates[:, None, :]
         np.negative(by_xi.sum(axis=0), out=out[6])
+        if self.l_velocities is not None:
+            out[6] += np.einsum("in,ikn->kn", self.l_velocities, out[3:6])
 
     def _by_motion(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradients by xi (6, k, n), and by the point before the motion, (3, k, n)."""
@@ -223,8 +231,9 @@ def move_points(
     c_twist: FloatArray,
     c_acceleration: FloatArray,
     model: MotionModel = "se3",
+    l_velocities: FloatArray | None = None,
 ) -> RigidlyMoved | PointwiseMoved:
-    """cP = Exp(-tau w) . (cTl . lP).
+    """cP = Exp(-tau w) . (cTl . (lP + tau u)).
 
     Args:
         cTl: pose of the LiDAR in the camera.
@@ -233,7 +242,12 @@ def move_points(
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
         c_acceleration: (6,) its rate of change [rad/s^2, m/s^2].
         model: see :data:`MotionModel`.
+        l_velocities: (3, n) velocity u over ground of the object that each point lies on, in the LiDAR frame
+            [m/s]; None where all stand.
     """
+    if l_velocities is not None:
+        taus_s = np.broadcast_to(np.asarray(taus_s, np.float64), lPs.shape[1:])
+        lPs = lPs + taus_s * l_velocities
     if isinstance(taus_s, float):
         return _move_rigidly(cTl, lPs, taus_s, c_twist, c_acceleration, model)
     R = np.asarray(cTl.rotation().matrix())
@@ -241,7 +255,7 @@ def move_points(
     xis = np.outer(c_twist, -taus_s) + np.outer(0.5 * c_acceleration, taus_s**2)
     rates = c_twist[:, None] - np.outer(c_acceleration, taus_s)
     cPs = cPs + xis[3:] if model == "translation" else _move(xis, cPs)
-    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, model)
+    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, model, l_velocities)
 
 
 def _move_rigidly(

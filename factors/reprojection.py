@@ -174,7 +174,8 @@ def evaluate(
         )
     twist = np.asarray(c_twist, dtype=np.float64)
     taus_s = alignment.taus_s(float(offset_s))
-    moved = move_points(cTl, lPs, taus_s, twist, alignment.c_acceleration, alignment.motion_model)
+    acceleration, model = alignment.c_acceleration, alignment.motion_model
+    moved = move_points(cTl, lPs, taus_s, twist, acceleration, model, alignment.velocity_columns)
     X, Y, Z = moved.cPs
     behind = Z <= MIN_DEPTH_M
     any_behind = bool(behind.any())

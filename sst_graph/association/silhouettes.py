@@ -92,17 +92,23 @@ def match_silhouettes(
     biases_px: Mapping[SemanticClass, float],
     kernel: RobustKernel,
     config: MatchConfig,
+    velocities: Mapping[SemanticClass, FloatArray] | None = None,
 ) -> dict[SemanticClass, SilhouetteMatches]:
     """Each boundary point's nearest contour at the current estimate, where the two face the same way.
 
     The kernel's scale is in pixels here; matches farther than ``gate`` times it are left out.
+
+    Args:
+        velocities: (n, 3) velocity over ground of each boundary point's object, in the LiDAR frame [m/s], of
+            the classes in which some move.
     """
     found = {}
     for c, points in boundaries.items():
         if c not in contours:
             continue
         base_taus = base_tau_s - points.offsets_s
-        uvs, outs = _project(points, camera, cTl, offset_s + base_taus, motion)
+        moving = (velocities or {}).get(c)
+        uvs, outs = _project(points, camera, cTl, offset_s + base_taus, motion, moving)
         feet = contours[c].look_up(uvs)
         way = outs - uvs
         length = np.linalg.norm(way, axis=1)
@@ -110,13 +116,11 @@ def match_silhouettes(
         cosine = (way * feet.normals).sum(axis=1)
         residuals = feet.distances + biases_px.get(c, 0.0)
         ok = feet.valid & (cosine > config.min_cosine) & (np.abs(residuals) < config.gate * kernel.scale)
-        used = np.full(len(ok), True) if config.top_edges else points.edges != Edge.TOP
-        used &= camera.in_image(uvs)
+        used = camera.in_image(uvs) & (config.top_edges | (points.edges != Edge.TOP))
         index = np.flatnonzero(ok & used & _has_a_mask(points.objects, ok & used, used, config))
         if len(index) == 0:
             continue
-        beam_sigma = 0.5 * length[index] * cosine[index] / np.sqrt(3.0)
-        sigmas = np.hypot(config.mask_sigma_px, beam_sigma)
+        sigmas = np.hypot(config.mask_sigma_px, 0.5 * length[index] * cosine[index] / np.sqrt(3.0))
         sides = SIDE_OF[points.edges[index], (way[index, 0] > 0).astype(np.intp)]
         alignment = Alignment(
             camera=camera,
@@ -127,11 +131,8 @@ def match_silhouettes(
             normals=feet.normals[index],
             kernel=kernel,
             c_acceleration=motion.c_acceleration,
-            weights=_shared_weights(
-                points.objects[index] * SIDES + sides,
-                sigmas,
-                np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px),
-            ),
+            weights=_shared_weights(points.objects[index], sides, sigmas, config),
+            l_velocities=None if moving is None else moving[index],
         )
         found[c] = SilhouetteMatches(
             alignment, points.objects[index], sides, index, int(np.count_nonzero(used))
@@ -152,15 +153,24 @@ def _has_a_mask(
     return np.asarray((meets >= config.min_object_share * np.bincount(objects, seen))[objects])
 
 
-def _shared_weights(groups: NDArray[np.intp], sigmas_px: FloatArray, shared_px: FloatArray) -> FloatArray:
-    """(n,) weights under which a group's mean counts with sigma^2 / n + shared^2 instead of sigma^2 / n."""
-    numbers = np.unique(groups, return_inverse=True)[1].reshape(-1)
+def _shared_weights(
+    objects: NDArray[np.intp], sides: NDArray[np.intp], sigmas_px: FloatArray, config: MatchConfig
+) -> FloatArray:
+    """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
+    sigma^2 / n."""
+    shared_px = np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px)
+    numbers = np.unique(objects * SIDES + sides, return_inverse=True)[1].reshape(-1)
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers]
     return np.asarray(1.0 / (1.0 + information * shared_px**2))
 
 
 def _project(
-    points: Boundaries, camera: PinholeCamera, cTl: gtsam.Pose3, taus_s: FloatArray, motion: Motion
+    points: Boundaries,
+    camera: PinholeCamera,
+    cTl: gtsam.Pose3,
+    taus_s: FloatArray,
+    motion: Motion,
+    velocities: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """(n, 2) pixels of boundary points, and of those across the boundary, moved to their image's instant; NaN
     behind the camera."""
@@ -168,6 +178,8 @@ def _project(
     lPs = np.concatenate([points.lPs, points.outward]).T
     common = bool((taus_s == taus_s[0]).all()) if len(taus_s) else True
     taus = float(taus_s[0]) if common and len(taus_s) else np.tile(taus_s, 2)
-    moved = move_points(cTl, np.ascontiguousarray(lPs), taus, motion.c_twist, motion.c_acceleration)
+    both = None if velocities is None else np.tile(velocities.T, 2)
+    columns, twist, acceleration = np.ascontiguousarray(lPs), motion.c_twist, motion.c_acceleration
+    moved = move_points(cTl, columns, taus, twist, acceleration, l_velocities=both)
     uvs = camera.project(moved.cPs.T)
     return uvs[: len(taus_s)], uvs[len(taus_s) :]

@@ -238,20 +238,22 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
     for scan, c, number, speed in head["moving"]:
         window.moving.setdefault(scan, {})[SemanticClass(c), number] = speed
     window.judged_anew = set(head["judged_anew"])
-    _get_persistence(head["persistence"], window)
+    _get_movers(head["persistence"], window)
 
 
-def _get_persistence(rows: Sequence[Any], window: Window) -> None:
-    """What has been found again, and the latest scans for those to come, from the newest backwards."""
+def _get_movers(rows: Sequence[Any], window: Window) -> None:
+    """What has been found again, the latest scans for those to come, and all outlines, backwards in time."""
     persistence, led_by = window.persistence, {motion.to_ns: motion for motion in window.motions}
     persistence.shares = {number: {} for number, _ in window.scans}
     for scan, c, number, shares in rows:
         persistence.shares[scan][SemanticClass(c), number] = np.array(shares)
     wTl = window.wTl
     for number, features in reversed(window.scans):
-        persistence.remember(number, features, wTl)
+        if window.scans[-1][1].stamp_ns - features.stamp_ns <= persistence.memory_ns:
+            persistence.remember(number, features, wTl)
+        window.velocities.add(number, features, window.tracks[number], wTl)
         motion = led_by.get(features.stamp_ns)
-        if motion is None or window.scans[-1][1].stamp_ns - features.stamp_ns > persistence.memory_ns:
+        if motion is None:
             break
         wTl = wTl.compose(motion.aTb.inverse())
 

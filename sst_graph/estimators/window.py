@@ -15,6 +15,7 @@ from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
 from sst_graph.problem.objects import (
+    Mover,
     MovingConfig,
     ObjectId,
     ObjectTracker,
@@ -23,6 +24,7 @@ from sst_graph.problem.objects import (
     standing_share,
 )
 from sst_graph.problem.persistence import ObjectName, Persistence
+from sst_graph.problem.velocity import Velocities
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -68,6 +70,7 @@ class Window:
         moving: speed of the objects of a scan whose sightings say that they move by themselves, by the scan's
             number [m/s].
         persistence: which objects stay where they are, whatever their sightings say.
+        velocities: of those that do not.
         judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
     """
@@ -83,6 +86,7 @@ class Window:
         self.sightings: dict[int, list[Sighting]] = {}
         self.moving: dict[int, dict[ObjectName, float]] = {}
         self.persistence = Persistence()
+        self.velocities = Velocities()
         self.judged_anew: set[int] = set()
         self.next_scan = 0
         self.next_image = 0
@@ -132,6 +136,8 @@ class Window:
         self._judge(number, features.stamp_ns)
         self.persistence.forget(self.first_scan)
         self.judged_anew |= self.persistence.add(number, lean, self.wTl)
+        self.velocities.forget(self.first_scan)
+        self.judged_anew |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
         for by_scan in (self.tracks, self.moving):
             for old in [k for k in by_scan if k < self.first_scan]:
                 del by_scan[old]
@@ -194,14 +200,21 @@ class Window:
     ) -> frozenset[tuple[SemanticClass, int, int]]:
         """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
         lost = [
-            (c, name, round(10.0 * (1.0 - standing_share(speed, tau_s, reach_m))))
-            for (c, name), speed in self.speeds(number).items()
+            (c, name, round(10.0 * (1.0 - standing_share(mover.unknown_mps, tau_s, reach_m))))
+            for (c, name), mover in self.movers(number).items()
         ]
         return frozenset(entry for entry in lost if entry[2] > 0)
 
     def speeds(self, number: int) -> dict[ObjectName, float]:
         """Speed of the objects of a scan that move by themselves [m/s]."""
         return higher_speeds(self.moving.get(number, {}), self.persistence.speeds(number))
+
+    def movers(self, number: int) -> dict[ObjectName, Mover]:
+        """The objects of a scan that move by themselves."""
+        return {
+            name: Mover(speed, self.velocities.of(number, name))
+            for name, speed in self.speeds(number).items()
+        }
 
     def restless(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings.
@@ -216,14 +229,14 @@ class Window:
             if any(speeds[sighting.scan].get(sighting.name, 0.0) > _RESTLESS_MPS for sighting in seen)
         }
 
-    def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, float]]:
-        """Tracks of the objects of some scans, and speeds of the moving ones, by the scan's position."""
+    def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, Mover]]:
+        """Tracks of the objects of some scans, and the moving ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}
-        speeds: dict[ObjectId, float] = {}
+        movers: dict[ObjectId, Mover] = {}
         for position, number in enumerate(numbers):
             tracks.update({(position, c, n): track for (c, n), track in self.tracks[number].items()})
-            speeds.update({(position, c, n): speed for (c, n), speed in self.speeds(number).items()})
-        return tracks, speeds
+            movers.update({(position, c, n): mover for (c, n), mover in self.movers(number).items()})
+        return tracks, movers
 
     def add_image(self, features: ImageFeatures) -> None:
         """Keep an image, with a number of its own, in the order of stamps.

@@ -23,7 +23,7 @@ from sst_graph.association.silhouettes import (
 )
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outlines
-from sst_graph.problem.objects import ObjectId, moving_objects, numbers_in, of_each, standing_share
+from sst_graph.problem.objects import Mover, ObjectId, moving_objects, numbers_in, of_each, standing_share
 from sst_graph.problem.state import (
     EXTRINSIC,
     State,
@@ -37,6 +37,8 @@ from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+Movers = dict[tuple[SemanticClass, int], Mover]
+"""The moving objects of one scan, by class and number within the scan."""
 _Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray | None]
 
 
@@ -57,8 +59,8 @@ class GraphConfig:
         delay_sigma_s: prior deviation of the time offset from the guess [s].
         rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
         rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
-        mover_reach_m: an object that moves so far by itself between its scan and its image keeps half of its
-            weight, a little farther none [m].
+        mover_reach_m: an object that moves so far by itself between its scan and its image, in a way that is
+            not known, keeps half of its weight, one that moves a little farther none [m].
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
     """
 
@@ -118,26 +120,17 @@ class Tracks:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track(smoother) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._moving = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
+        self._movers = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
 
-    def seeing(self, objects: Mapping[ObjectId, int], moving: Mapping[ObjectId, float]) -> Tracks:
-        """The same twists of one drive, with other object tracks and speeds of the moving objects."""
+    def seeing(self, objects: Mapping[ObjectId, int], movers: Mapping[ObjectId, Mover]) -> Tracks:
+        """The same twists of one drive, with other object tracks and moving objects."""
         other = Tracks([])
-        other._tracks, other.objects, other._moving = self._tracks, [objects], [_by_scan(moving)]
+        other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
         return other
 
-    def shares(
-        self, drive: int, scan: int, c: SemanticClass, numbers: NDArray[np.intp], reach_m: float, tau_s: float
-    ) -> FloatArray | None:
-        """(n,) share of their weight that objects of a scan keep, for they may move in an interval.
-
-        None where all keep all of it.
-        """
-        speeds = self._moving[drive].get(scan, {}) if self._moving else {}
-        if not any(own == c for own, _ in speeds):
-            return None
-        shares = {n: standing_share(speeds.get((c, n), 0.0), tau_s, reach_m) for n in numbers_in(numbers)}
-        return of_each(numbers, shares)
+    def movers(self, drive: int, scan: int) -> Movers:
+        """The moving objects of a scan."""
+        return self._movers[drive].get(scan, {}) if self._movers else {}
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -145,11 +138,37 @@ class Tracks:
         return None if track is None else track.at(stamp_ns)
 
 
-def _by_scan(speeds: Mapping[ObjectId, float]) -> dict[int, dict[tuple[SemanticClass, int], float]]:
-    found: dict[int, dict[tuple[SemanticClass, int], float]] = {}
-    for (scan, c, n), speed in speeds.items():
-        found.setdefault(scan, {})[c, n] = speed
+def _by_scan(movers: Mapping[ObjectId, Mover]) -> dict[int, Movers]:
+    found: dict[int, Movers] = {}
+    for (scan, c, n), mover in movers.items():
+        found.setdefault(scan, {})[c, n] = mover
     return found
+
+
+def _shares(
+    movers: Movers, c: SemanticClass, numbers: NDArray[np.intp], reach_m: float, tau_s: float
+) -> FloatArray | None:
+    """(n,) share of their weight that objects of a scan keep, for they may move in an interval.
+
+    None where all keep all of it.
+    """
+    own = {n: mover for (other, n), mover in movers.items() if other == c}
+    if not own:
+        return None
+    unknown = {n: own[n].unknown_mps if n in own else 0.0 for n in numbers_in(numbers)}
+    return of_each(numbers, {n: standing_share(mps, tau_s, reach_m) for n, mps in unknown.items()})
+
+
+def _velocities(
+    movers: Movers, boundaries: Mapping[SemanticClass, Boundaries]
+) -> dict[SemanticClass, FloatArray]:
+    """(n, 3) velocity over ground of each boundary point's object [m/s], by class where some are known."""
+    found: dict[SemanticClass, FloatArray] = {}
+    for (c, n), mover in movers.items():
+        if mover.velocity is not None and c in boundaries:
+            objects = boundaries[c].objects
+            found.setdefault(c, np.zeros((len(objects), 3)))[objects == n] = mover.velocity.l_velocity
+    return {c: velocities for c, velocities in found.items() if velocities.any()}
 
 
 def associate(
@@ -165,15 +184,11 @@ def associate(
             image = drive.images[pair.image]
             l_twist = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
             motion = _camera_motion(l_twist, state.cTl)
-            share = partial(
-                tracks.shares,
-                number,
-                pair.scan,
-                reach_m=config.mover_reach_m,
-                tau_s=offset_s + pair.base_tau_s,
-            )
+            movers, tau_s = tracks.movers(number, pair.scan), offset_s + pair.base_tau_s
+            share = partial(_shares, movers, reach_m=config.mover_reach_m, tau_s=tau_s)
+            boundaries = _told(outlines(drive.scans[pair.scan], config.undersides), share)
             matches = match_silhouettes(
-                _standing(outlines(drive.scans[pair.scan], config.undersides), share),
+                boundaries,
                 image.contours,
                 drive.camera,
                 state.cTl,
@@ -183,6 +198,7 @@ def associate(
                 biases,
                 kernel,
                 config.match,
+                _velocities(movers, boundaries),
             )
             matches = {c: _weighted(m, share(c, m.objects)) for c, m in matches.items()}
             if matches:
@@ -193,9 +209,7 @@ def associate(
     return found
 
 
-def _standing(
-    boundaries: Mapping[SemanticClass, Boundaries], share: _Share
-) -> dict[SemanticClass, Boundaries]:
+def _told(boundaries: Mapping[SemanticClass, Boundaries], share: _Share) -> dict[SemanticClass, Boundaries]:
     """Boundaries without the objects that would keep nothing of their weight."""
     still = {}
     for c, points in boundaries.items():

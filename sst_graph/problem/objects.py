@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from sst_graph.association.boundary import Boundaries
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.persistence import Persistence
+from sst_graph.problem.persistence import ObjectName, Persistence
+from sst_graph.problem.velocity import ObjectVelocity, Velocities
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -118,10 +119,28 @@ def object_tracks(drive: Drive) -> dict[ObjectId, int]:
     return tracks
 
 
+@dataclass(frozen=True)
+class Mover:
+    """An object that moves in the world by itself.
+
+    Attributes:
+        speed_mps: that it passes for [m/s].
+        velocity: where it is followed well enough.
+    """
+
+    speed_mps: float
+    velocity: ObjectVelocity | None = None
+
+    @property
+    def unknown_mps(self) -> float:
+        """How much of its motion is not known."""
+        return self.speed_mps if self.velocity is None else min(self.speed_mps, self.velocity.sigma_mps)
+
+
 def moving_objects(
     drive: Drive, tracks: Mapping[ObjectId, int], config: MovingConfig | None = None
-) -> dict[ObjectId, float]:
-    """Speed [m/s] of the objects that move in the world by themselves, scan by scan.
+) -> dict[ObjectId, Mover]:
+    """The objects that move in the world by themselves, scan by scan.
 
     Around every scan an object's centres within ``window_s`` are fitted by a straight, steady motion. A
     parked object's centre wanders too, as other sides of it come into view, but neither far nor straight.
@@ -129,7 +148,17 @@ def moving_objects(
     """
     poses = _scan_poses(drive)
     followed = _speeds_of_tracks(drive, tracks, poses, config or MovingConfig())
-    return higher_speeds(followed, _speeds_without_tracks(drive, poses))
+    speeds = higher_speeds(followed, _speeds_without_tracks(drive, poses))
+    by_scan: list[dict[ObjectName, int]] = [{} for _ in poses]
+    for (position, c, n), track in tracks.items():
+        by_scan[position][c, n] = track
+    velocities = Velocities()
+    for position, (scan, own, wTl) in enumerate(zip(drive.scans, by_scan, poses, strict=True)):
+        velocities.add(position, scan, own, wTl)
+    return {
+        (position, c, n): Mover(speed, velocities.of(position, (c, n)))
+        for (position, c, n), speed in speeds.items()
+    }
 
 
 def higher_speeds(a: Mapping[_Name, float], b: Mapping[_Name, float]) -> dict[_Name, float]:
@@ -176,13 +205,13 @@ _SHORTEST_S = 0.005
 object that moves by itself does not follow the offset as that of a standing one does."""
 
 
-def standing_share(speed_mps: float, tau_s: float, reach_m: float) -> float:
-    """Share of its weight that an object keeps which moves by itself within a pair's interval.
+def standing_share(unknown_mps: float, tau_s: float, reach_m: float) -> float:
+    """Share of its weight that an object keeps which moves by itself, in a way not known, within an interval.
 
     Half where it comes as far as ``reach_m``; 0 far beyond it. Were it all or nothing, objects would come and
     go with the time offset's last millisecond, and the estimate with them.
     """
-    share = 1.0 / (1.0 + (speed_mps * np.hypot(tau_s, _SHORTEST_S) / reach_m) ** 2)
+    share = 1.0 / (1.0 + (unknown_mps * np.hypot(tau_s, _SHORTEST_S) / reach_m) ** 2)
     return float(share) if share >= _LEAST_SHARE else 0.0
 
 

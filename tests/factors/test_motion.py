@@ -91,26 +91,41 @@ def test_coefficients_by_hand_and_their_derivatives():
         np.testing.assert_allclose(exponential_coefficients(np.array(x))[2:], numerical, rtol=tolerance)
 
 
+def test_an_object_that_drives_along_stays_where_it_is():
+    """Camera and object go forward at 10 m/s: LiDAR x is camera z, and the point stays where it is."""
+    cTl = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.zeros(3))
+    lPs, velocity = np.array([[20.0], [3.0], [1.0]]), np.array([[10.0], [0.0], [0.0]])
+    forward = np.array([0, 0, 0, 0, 0, 10.0])
+    for taus in (0.3, np.array([0.3])):
+        point = move_points(cTl, lPs, taus, forward, STILL, l_velocities=velocity)
+        np.testing.assert_allclose(point.cPs.T, [[-3.0, -1.0, 20.0]], atol=1e-12)
+        parked = move_points(cTl, lPs, taus, forward, STILL)
+        np.testing.assert_allclose(parked.cPs.T, [[-3.0, -1.0, 17.0]], atol=1e-12)
+
+
 @pytest.mark.parametrize("model", ["se3", "translation"])
 @pytest.mark.parametrize("rigid", [True, False])
 @pytest.mark.parametrize("speed", [0.01, 1.0, 10.0])
-def test_derivatives_at_100_points(model, rigid, speed):
+@pytest.mark.parametrize("objects", [False, True])
+def test_derivatives_at_100_points(model, rigid, speed, objects):
     rng = np.random.default_rng(11)
     cTl, twist = gtsam.Pose3.Expmap(rng.normal(size=6)), speed * rng.normal(size=6)
     acceleration, offset_s = speed * rng.normal(size=6), 0.13
     lPs = rng.normal(0.0, 10.0, (3, 100))
     base = -0.04 if rigid else rng.uniform(-0.2, 0.2, 100)
+    velocities = rng.normal(0.0, 10.0, (3, 100)) if objects else None
 
     def cPs(x):
         return move_points(
-            cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model
+            cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model, velocities
         ).cPs
 
-    point = move_points(cTl, lPs, offset_s + base, twist, acceleration, model)
+    point = move_points(cTl, lPs, offset_s + base, twist, acceleration, model, velocities)
     g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()
-    rows = np.empty((6 if rigid else 13, 3, 100))
+    lifted = rigid and not objects
+    rows = np.empty((6 if lifted else 13, 3, 100))
     point.write_rows(g, rows)
-    J = np.tensordot(point.lift, rows, axes=1) if rigid else rows
+    J = np.tensordot(point.lift, rows, axes=1) if lifted else rows
     for column in range(13):
         step = 1e-4 * np.eye(13)[column]
         coarse, fine = (cPs(step) - cPs(-step)) / 2e-4, (cPs(step / 2) - cPs(-step / 2)) / 1e-4

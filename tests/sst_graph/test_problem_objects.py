@@ -93,7 +93,11 @@ def test_a_mover_is_found_and_parked_vehicles_are_not() -> None:
     made = drive(parked, wandering, mover)
     found = moving_objects(made, object_tracks(made))
     assert set(found) == {(k, VEHICLE, 2) for k in range(SCANS)}
-    assert min(found.values()) > np.hypot(6.0, 2.0) - 1e-6
+    assert min(mover.speed_mps for mover in found.values()) > np.hypot(6.0, 2.0) - 1e-6
+    velocity = found[6, VEHICLE, 2].velocity
+    assert velocity is not None and found[6, VEHICLE, 2].unknown_mps == velocity.sigma_mps < 0.2
+    turned = gtsam.Rot3.Yaw(-6 * 0.02).rotate(np.array([6.0, -2.0, 0.0]))
+    np.testing.assert_allclose(velocity.l_velocity, turned, atol=0.1)  # its outline turns with the LiDAR
 
 
 def test_a_mover_is_found_without_a_track() -> None:
@@ -109,7 +113,7 @@ def test_a_slow_vehicle_is_found_by_its_track_alone() -> None:
     made = drive(slow)
     tracks = object_tracks(made)
     found = moving_objects(made, tracks)
-    assert list(found.values()) == pytest.approx([SLOW_MPS] * SCANS, rel=1e-6)
+    assert [mover.speed_mps for mover in found.values()] == pytest.approx([SLOW_MPS] * SCANS, rel=1e-6)
     assert not moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))
     assert not moving_objects(made, {})
 

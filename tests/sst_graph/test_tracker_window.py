@@ -76,7 +76,10 @@ def test_objects_are_judged_as_the_batch_judges_them() -> None:
     found, moving = window.objects_of(range(30))
     assert found == tracks
     assert {number for _, _, number in speeds} == {1, 2, 3, 4}
-    assert moving == pytest.approx(speeds)
+    assert set(moving) == set(speeds)
+    for name, mover in speeds.items():
+        assert moving[name].speed_mps == pytest.approx(mover.speed_mps)
+        assert moving[name].unknown_mps == pytest.approx(mover.unknown_mps)
 
 
 def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
