@@ -33,11 +33,12 @@ from sst_graph.estimators.undersides import UndersideSupport
 from sst_graph.estimators.window import Sighting, Window
 from sst_graph.files import atomic_write_bytes
 from sst_graph.problem.drive import ScanFeatures, apart, image_features, outlines
+from sst_graph.problem.velocity import ObjectVelocity
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 
 FORMAT = "sst-graph/tracker"
-VERSION = 8
+VERSION = 9
 
 Arrays = dict[str, Any]
 _BOUNDARY = ("lPs", "outward", "half_gaps_m", "offsets_s", "edges", "objects")
@@ -199,6 +200,11 @@ def _put_window(arrays: Arrays, window: Window) -> dict[str, Any]:
             for scan, by_name in window.persistence.shares.items()
             for (c, number), shares in by_name.items()
         ],
+        "velocities": [
+            [track, scan, velocity.l_velocity.tolist(), velocity.sigma_mps]
+            for track, known in window.velocities.found.items()
+            for scan, velocity in known.items()
+        ],
         "judged_anew": sorted(window.judged_anew),
     }
 
@@ -239,6 +245,9 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
         window.moving.setdefault(scan, {})[SemanticClass(c), number] = speed
     window.judged_anew = set(head["judged_anew"])
     _get_movers(head["persistence"], window)
+    for track, scan, l_velocity, sigma_mps in head["velocities"]:
+        velocity = ObjectVelocity(np.array(l_velocity), sigma_mps)
+        window.velocities.found.setdefault(track, {})[scan] = velocity
 
 
 def _get_movers(rows: Sequence[Any], window: Window) -> None:
@@ -251,7 +260,7 @@ def _get_movers(rows: Sequence[Any], window: Window) -> None:
     for number, features in reversed(window.scans):
         if window.scans[-1][1].stamp_ns - features.stamp_ns <= persistence.memory_ns:
             persistence.remember(number, features, wTl)
-        window.velocities.add(number, features, window.tracks[number], wTl)
+        window.velocities.remember(number, features, window.tracks[number], wTl)
         motion = led_by.get(features.stamp_ns)
         if motion is None:
             break

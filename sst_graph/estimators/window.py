@@ -159,6 +159,7 @@ class Window:
 
     def judge_all(self) -> None:
         """Judge all latest sightings by what is around them, as at the end of a drive."""
+        self.velocities.judge_all()
         for seen in self.sightings.values():
             self._judge_track(seen, self.scans[-1][1].stamp_ns - _REACH_NS, whole=True)
 
@@ -207,7 +208,8 @@ class Window:
 
     def speeds(self, number: int) -> dict[ObjectName, float]:
         """Speed of the objects of a scan that move by themselves [m/s]."""
-        return higher_speeds(self.moving.get(number, {}), self.persistence.speeds(number))
+        others = higher_speeds(self.persistence.speeds(number), self.velocities.speeds(number))
+        return higher_speeds(self.moving.get(number, {}), others)
 
     def movers(self, number: int) -> dict[ObjectName, Mover]:
         """The objects of a scan that move by themselves."""

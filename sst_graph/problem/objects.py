@@ -148,16 +148,20 @@ def moving_objects(
     """
     poses = _scan_poses(drive)
     followed = _speeds_of_tracks(drive, tracks, poses, config or MovingConfig())
-    speeds = higher_speeds(followed, _speeds_without_tracks(drive, poses))
+    others = _speeds_without_tracks(drive, poses)
     by_scan: list[dict[ObjectName, int]] = [{} for _ in poses]
     for (position, c, n), track in tracks.items():
         by_scan[position][c, n] = track
     velocities = Velocities()
     for position, (scan, own, wTl) in enumerate(zip(drive.scans, by_scan, poses, strict=True)):
-        velocities.add(position, scan, own, wTl)
+        velocities.remember(position, scan, own, wTl)
+    velocities.judge_all()
+    for position in range(len(poses)):
+        lately = {(position, *name): speed for name, speed in velocities.speeds(position).items()}
+        others = higher_speeds(others, lately)
     return {
         (position, c, n): Mover(speed, velocities.of(position, (c, n)))
-        for (position, c, n), speed in speeds.items()
+        for (position, c, n), speed in higher_speeds(followed, others).items()
     }
 
 

@@ -31,11 +31,14 @@ class VelocityConfig:
         window_s: half width of the time around a scan that is looked at [s].
         min_sightings: fewest scans within it.
         least_mps: slower ones have no direction to speak of [m/s].
+        least_sigmas: nor have those whose velocity is not as many deviations from none.
+        least_points: fewest points of an outline.
         end: share of an outline that lies beyond its end, for stray points.
         max_scatter_m: largest rms distance of end and side from a steady motion [m].
         acceleration_mps2: deviation of the velocity's rate of change; it counts where the scans do not lie
             evenly around [m/s^2].
         floor_mps: least deviation of a velocity [m/s].
+        memory_s: an object that moved within this time before or after moves [s].
         reach_m: farthest that a point of an outline may be from the same outline in another scan [m] ...
         kept: ... for this share of the points at least where the outline is moved on ...
         gained: ... and this share more than where it is not. An end that the field of view cuts off moves
@@ -45,10 +48,13 @@ class VelocityConfig:
     window_s: float = 0.35
     min_sightings: int = 4
     least_mps: float = 1.0
+    least_sigmas: float = 3.0
+    least_points: int = 8
     end: float = 0.02
     max_scatter_m: float = 0.25
     acceleration_mps2: float = 1.0
     floor_mps: float = 0.03
+    memory_s: float = 0.8
     reach_m: float = 0.2
     kept: float = 0.4
     gained: float = 0.2
@@ -68,13 +74,19 @@ class ObjectVelocity:
 
 
 class Velocities:
-    """Velocities of the movable objects of the latest scans; scans are told apart by their number."""
+    """Velocities of the movable objects of the latest scans; scans are told apart by their number.
+
+    An object's velocity is found when its scan comes, and again when all around it has been seen.
+
+    Attributes:
+        found: by the object's track and the scan.
+    """
 
     def __init__(self, config: VelocityConfig | None = None) -> None:
         self.config = config or VelocityConfig()
         self._scans: dict[int, _Seen] = {}
         self._sightings: dict[int, dict[int, ObjectName]] = {}
-        self._known: dict[tuple[int, ObjectName], tuple[int, ObjectVelocity | None]] = {}
+        self.found: dict[int, dict[int, ObjectVelocity]] = {}
 
     def add(
         self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
@@ -82,49 +94,93 @@ class Velocities:
         """A further scan, posed at ``wTl``, and the tracks of its objects.
 
         Returns:
-            Numbers of the scans around which all has been seen now.
+            Numbers of the earlier scans about which this tells something new.
         """
         before = max((seen.stamp_ns for seen in self._scans.values()), default=scan.stamp_ns)
-        self._scans[number] = _Seen.of(scan, tracks, wTl)
-        for name in self._scans[number].outlines:
-            self._sightings.setdefault(tracks[name], {})[number] = name
+        self.remember(number, scan, tracks, wTl)
         reach = round(1e9 * self.config.window_s)
-        return {k for k, seen in self._scans.items() if before <= seen.stamp_ns + reach < scan.stamp_ns}
+        whole = {k for k, seen in self._scans.items() if before <= seen.stamp_ns + reach < scan.stamp_ns}
+        return whole.union(*(self._judge(k) for k in sorted({number, *whole}))) - {number}
+
+    def remember(
+        self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
+    ) -> None:
+        """Keep a scan's outlines."""
+        self._scans[number] = _Seen.of(scan, tracks, wTl)
+        for name, track in self._scans[number].tracks.items():
+            self._sightings.setdefault(track, {})[number] = name
+
+    def judge_all(self) -> None:
+        """Look again at all scans, with all that has been seen."""
+        for number in self._scans:
+            self._judge(number)
 
     def forget(self, before: int) -> None:
         """Drop all scans before one."""
         for old in [k for k in self._scans if k < before]:
-            for name, track in self._scans.pop(old).tracks.items():
-                self._known.pop((old, name), None)
-                self._sightings.get(track, {}).pop(old, None)
-                if not self._sightings.get(track, True):
-                    del self._sightings[track]
+            for track in self._scans.pop(old).tracks.values():
+                for by_track in (self._sightings, self.found):
+                    by_track.get(track, {}).pop(old, None)
+                    if not by_track.get(track, True):
+                        del by_track[track]
 
     def of(self, number: int, name: ObjectName) -> ObjectVelocity | None:
         """Velocity of an object of a scan, or None where it is not followed well enough."""
-        if number not in self._scans or name not in self._scans[number].outlines:
-            return None
-        newest = max(self._scans)
-        known = self._known.get((number, name))
-        if known is None or (known[0] < newest and not self._whole(number, known[0])):
-            known = self._known[number, name] = (newest, self._followed(number, name))
-        return known[1]
+        seen = self._scans.get(number)
+        track = None if seen is None else seen.tracks.get(name)
+        return None if track is None else self.found.get(track, {}).get(number)
 
-    def _whole(self, number: int, newest: int) -> bool:
-        """Whether all around a scan had been seen when some scan was the newest."""
-        reach = round(1e9 * self.config.window_s)
-        return self._scans[newest].stamp_ns > self._scans[number].stamp_ns + reach
+    def speeds(self, number: int) -> dict[ObjectName, float]:
+        """Speed of the objects of a scan that are known to have moved a little before or after [m/s]."""
+        found = {}
+        for name, track in self._scans[number].tracks.items() if number in self._scans else ():
+            near = self._known_near(track, number)
+            if near:
+                found[name] = max(float(np.linalg.norm(velocity.l_velocity)) for velocity in near.values())
+        return found
+
+    def _known_near(self, track: int, number: int) -> dict[int, ObjectVelocity]:
+        """What is known of an object a little before or after a scan."""
+        stamp_ns, reach = self._scans[number].stamp_ns, round(1e9 * self.config.memory_s)
+        known = self.found.get(track, {})
+        return {k: v for k, v in known.items() if abs(self._scans[k].stamp_ns - stamp_ns) <= reach}
+
+    def _judge(self, number: int) -> set[int]:
+        """Find the velocities of a scan's objects; scans in which that alone shows, or showed, motion."""
+        here, told = self._scans[number], set[int]()
+        for name, track in here.tracks.items():
+            found, known = self._followed(number, name), self.found.setdefault(track, {})
+            if (found is None) == (number in known):
+                known.pop(number, None)
+                others = {k: self._known_near(track, k) for k in self._sightings[track]}
+                reach = round(1e9 * self.config.memory_s)
+                told |= {
+                    k
+                    for k, near in others.items()
+                    if not near and abs(self._scans[k].stamp_ns - here.stamp_ns) <= reach
+                }
+            if found is not None:
+                known[number] = found
+            if not known:
+                del self.found[track]
+        return told
 
     def _followed(self, number: int, name: ObjectName) -> ObjectVelocity | None:
-        here = self._scans[number]
+        here, reach = self._scans[number], round(1e9 * self.config.window_s)
         sightings = sorted(self._sightings[here.tracks[name]].items())
-        seen = [(self._scans[k], own) for k, own in sightings]
-        times = np.array([1e-9 * (one.stamp_ns - here.stamp_ns) for one, _ in seen])
-        near = np.flatnonzero(np.abs(times) <= self.config.window_s)
-        outlines = [seen[i][0].outlines[seen[i][1]] for i in near]
-        places = [seen[i][0].place for i in near]
-        found = near_end_velocity(times[near], outlines, places, self.config)
-        if found is None or not self._carried(found[0], here.outlines[name], times[near], outlines):
+        near = [(k, own) for k, own in sightings if abs(self._scans[k].stamp_ns - here.stamp_ns) <= reach]
+        few = len(here.outlines[name]) < self.config.least_points
+        if few or len(near) < self.config.min_sightings:
+            return None
+        times_s = np.array([1e-9 * (self._scans[k].stamp_ns - here.stamp_ns) for k, _ in near])
+        centres = np.array([self._scans[k].centres[own] for k, own in near])
+        rough = _slopes(times_s, centres)
+        if np.hypot(*rough) < self.config.least_mps:
+            return None
+        outlines = [self._scans[k].outlines[own] for k, own in near]
+        places = [self._scans[k].place for k, _ in near]
+        found = near_end_velocity(times_s, outlines, places, rough, self.config)
+        if found is None or not self._carried(found[0], here.outlines[name], times_s, outlines):
             return None
         w_velocity, sigma_mps = found
         return ObjectVelocity(here.wTl.rotation().unrotate(np.append(w_velocity, 0.0)), sigma_mps)
@@ -146,12 +202,13 @@ class Velocities:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A scan: stamp, pose, the LiDAR's place (2,), outlines (n, 2) and tracks of its movable objects."""
+    """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects."""
 
     stamp_ns: int
     wTl: gtsam.Pose3
     place: FloatArray
     outlines: dict[ObjectName, FloatArray]
+    centres: dict[ObjectName, tuple[float, float]]
     tracks: dict[ObjectName, int]
 
     @classmethod
@@ -167,23 +224,25 @@ class _Seen:
                 outlines.update({(c, int(n)): part for n, part in zip(numbers, parts, strict=True)})
         followed = {name: outline for name, outline in outlines.items() if name in tracks}
         own = {name: tracks[name] for name in followed}
-        return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, own)
+        centres = {name: tuple((part.sum(axis=0) / len(part)).tolist()) for name, part in followed.items()}
+        return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, centres, own)
 
 
 def near_end_velocity(
-    times_s: FloatArray, outlines: Sequence[FloatArray], places: Sequence[FloatArray], config: VelocityConfig
+    times_s: FloatArray,
+    outlines: Sequence[FloatArray],
+    places: Sequence[FloatArray],
+    rough: FloatArray,
+    config: VelocityConfig,
 ) -> tuple[FloatArray, float] | None:
     """Velocity (2,) at time 0 and its deviation [m/s] of an outline (n, 2), seen from a place (2,) each time.
 
-    None where it is seen too seldom, does not move steadily, or passes alongside.
+    None where it does not move steadily, or passes alongside.
+
+    Args:
+        rough: (2,) velocity, good enough to tell along from across [m/s].
     """
-    if len(times_s) < config.min_sightings:
-        return None
-    t = times_s - times_s.mean()
-    rough = t @ np.stack([outline.mean(axis=0) for outline in outlines]) / (t @ t)
-    speed = float(np.linalg.norm(rough))
-    if speed < config.least_mps:
-        return None
+    speed = float(np.hypot(*rough))
     axes = np.array([[rough[0], rough[1]], [-rough[1], rough[0]]]) / speed
     ends = []
     for outline, place in zip(outlines, places, strict=True):
@@ -191,18 +250,26 @@ def near_end_velocity(
         if along.min() < 0.0 < along.max():
             return None
         ends.append(axes @ place + [_near_end(along, config.end), _near_end(across, config.end)])
-    X = np.stack(ends)
-    slopes = t @ X / (t @ t)
+    X, t = np.stack(ends), times_s - times_s.mean()
+    slopes = _slopes(times_s, X)
     variances = ((X - X.mean(axis=0) - t[:, None] * slopes) ** 2).sum(axis=0) / (len(t) - 2)
     if variances.max() > config.max_scatter_m**2:
         return None
     drift = config.acceleration_mps2 * float(times_s.mean())
     sigma_mps = np.sqrt(variances.mean() / (t @ t) + drift**2 + config.floor_mps**2)
+    if np.hypot(*slopes) < max(config.least_mps, config.least_sigmas * sigma_mps):
+        return None
     return axes.T @ slopes, float(sigma_mps)
 
 
 def _near_end(values: FloatArray, share: float) -> float:
     """The end of some coordinates (n,) that is nearest to 0, but for a share of them."""
     beyond = int(share * len(values))
-    place = beyond if np.median(values) > 0.0 else len(values) - 1 - beyond
+    place = beyond if values.sum() > 0.0 else len(values) - 1 - beyond
     return float(np.partition(values, place)[place])
+
+
+def _slopes(times_s: FloatArray, values: FloatArray) -> FloatArray:
+    """(k,) slopes of the lines that fit values (n, k) over times (n,) best."""
+    t = times_s - times_s.mean()
+    return np.asarray(t @ values / (t @ t))

@@ -109,12 +109,12 @@ def test_a_mover_is_found_without_a_track() -> None:
 
 
 def test_a_slow_vehicle_is_found_by_its_track_alone() -> None:
-    """It overlaps with itself 0.3 s later; twelve centres in a line tell."""
+    """It overlaps with itself 0.3 s later; twelve centres in a line tell, or its near end."""
     made = drive(slow)
     tracks = object_tracks(made)
     found = moving_objects(made, tracks)
-    assert [mover.speed_mps for mover in found.values()] == pytest.approx([SLOW_MPS] * SCANS, rel=1e-6)
-    assert not moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))
+    assert [mover.speed_mps for mover in found.values()] == pytest.approx([SLOW_MPS] * SCANS, rel=0.02)
+    assert set(moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))) == set(found)
     assert not moving_objects(made, {})
 
 

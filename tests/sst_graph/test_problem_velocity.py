@@ -65,6 +65,9 @@ def test_a_moving_box(speed: float, ego: float) -> None:
     velocities = _followed(speed, ego)
     for k in range(12):
         np.testing.assert_allclose(_in_world(velocities.of(k, NAME)), [speed, 0.0, 0.0], atol=1e-6)
+    early = velocities.of(2, NAME), velocities.of(11, NAME)
+    assert early[0] is not None and early[1] is not None and early[1].sigma_mps > 0.15
+    velocities.judge_all()
     sigmas = [found.sigma_mps for k in range(12) if (found := velocities.of(k, NAME)) is not None]
     assert sigmas[5] == pytest.approx(0.03) and sigmas[0] > 0.15 and sigmas[-1] > 0.15
 
@@ -78,7 +81,7 @@ def test_noise_is_told() -> None:
             np.array([[30.0 - 8.0 * t, 3.0], [34.0 - 8.0 * t, 3.0]]) + 0.05 * rng.standard_normal(2)
             for t in times
         ]
-        found = near_end_velocity(times, outlines, [np.zeros(2)] * 7, config)
+        found = near_end_velocity(times, outlines, [np.zeros(2)] * 7, np.array([-7.0, 1.0]), config)
         assert found is not None
         errors.append(found[0] - [-8.0, 0.0])
         sigmas.append(found[1])
@@ -110,6 +113,7 @@ def test_an_end_that_the_field_of_view_cuts_off_is_no_motion() -> None:
     assert velocities.of(5, NAME) is None
     unchecked = Velocities(dataclasses.replace(velocities.config, kept=0.0, gained=-1.0))
     unchecked._scans, unchecked._sightings = velocities._scans, velocities._sightings
+    unchecked.judge_all()
     assert _in_world(unchecked.of(5, NAME))[0] > 5.0
 
 
@@ -121,11 +125,12 @@ def test_what_is_known_grows_with_the_scans_around_and_is_forgotten() -> None:
         whole.append(velocities.add(k, _scan(k * PERIOD_NS, wTl, corners), {NAME: 7}, wTl))
         if k == 6:
             early = velocities.of(6, NAME)
-    assert whole[4] == {0} and whole[11] == {7}
+    # The first velocity tells of all scans before; then those around which all has been seen.
+    assert whole[2] == set() and whole[3] == {0, 1, 2} and whole[11] == {7}
     late = velocities.of(6, NAME)
     assert early is not None and late is not None and late.sigma_mps < 0.3 * early.sigma_mps
     assert velocities.of(6, NAME) is late
     velocities.forget(8)
     assert velocities.of(6, NAME) is None and min(velocities._scans) == 8
     velocities.forget(12)
-    assert not (velocities._scans or velocities._sightings or velocities._known)
+    assert not (velocities._scans or velocities._sightings or velocities.found)
