@@ -28,11 +28,11 @@ STEP = gtsam.Pose3(gtsam.Rot3.Yaw(0.02), np.array([0.7, 0.0, 0.0]))
 
 
 def boundaries(*centres: np.ndarray) -> Boundaries:
-    """Six points around each centre (in the LiDAR frame), object k the k-th."""
-    around = 0.5 * np.vstack([np.eye(3), -np.eye(3)])
+    """Twelve points around each centre (in the LiDAR frame), object k the k-th."""
+    around = np.vstack([0.5 * np.eye(3), -0.5 * np.eye(3), 0.25 * np.eye(3), -0.25 * np.eye(3)])
     lPs = np.concatenate([centre + around for centre in centres])
     n = len(lPs)
-    numbers = np.repeat(np.arange(len(centres)), 6)
+    numbers = np.repeat(np.arange(len(centres)), 12)
     return Boundaries(lPs, lPs.copy(), np.ones(n), np.zeros(n), np.zeros(n, np.uint8), numbers)
 
 
