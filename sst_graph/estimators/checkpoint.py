@@ -246,8 +246,7 @@ def _get_window(arrays: Arrays, head: Mapping[str, Any], tracker: Tracker) -> No
     window.judged_anew = set(head["judged_anew"])
     _get_movers(head["persistence"], window)
     for track, scan, l_velocity, sigma_mps in head["velocities"]:
-        velocity = ObjectVelocity(np.array(l_velocity), sigma_mps)
-        window.velocities.found.setdefault(track, {})[scan] = velocity
+        window.velocities.take_over(scan, track, ObjectVelocity(np.array(l_velocity), sigma_mps))
 
 
 def _get_movers(rows: Sequence[Any], window: Window) -> None:

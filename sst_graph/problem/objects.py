@@ -1,7 +1,7 @@
 """The same object in many scans: tracks through the world, for clusters of matches that err together.
 
 And which of them move by themselves: by the way of their centres where they are followed long enough, which
-tells slow ones best, else by :mod:`sst_graph.problem.persistence`.
+tells slow ones best, by :mod:`sst_graph.problem.persistence`, and by :mod:`sst_graph.problem.velocity`.
 """
 
 from __future__ import annotations
@@ -144,7 +144,8 @@ def moving_objects(
 
     Around every scan an object's centres within ``window_s`` are fitted by a straight, steady motion. A
     parked object's centre wanders too, as other sides of it come into view, but neither far nor straight.
-    Those that do not stay where they are pass for at least as fast as :class:`Persistence` says.
+    Those that do not stay where they are pass for at least as fast as :class:`Persistence` says, those that
+    are followed by their near end shortly before or after for as fast as :class:`Velocities` says.
     """
     poses = _scan_poses(drive)
     followed = _speeds_of_tracks(drive, tracks, poses, config or MovingConfig())
