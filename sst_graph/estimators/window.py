@@ -219,7 +219,7 @@ class Window:
         }
 
     def restless(self) -> set[int]:
-        """Tracks of the objects that were judged to move in any of their latest sightings.
+        """Tracks of the objects that were judged to move in any of their latest sightings, how is not known.
 
         While an object starts or stops, no line fits its places, and it may pass for one that stands.
         """
@@ -229,6 +229,7 @@ class Window:
             track
             for track, seen in self.sightings.items()
             if any(speeds[sighting.scan].get(sighting.name, 0.0) > _RESTLESS_MPS for sighting in seen)
+            and self.velocities.of(seen[-1].scan, seen[-1].name) is None
         }
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, Mover]]:

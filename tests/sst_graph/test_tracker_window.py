@@ -11,6 +11,7 @@ from sst_graph.association.boundary import Boundaries
 from sst_graph.estimators.window import OBJECT_MEMORY, Window
 from sst_graph.problem.drive import Drive, ScanFeatures
 from sst_graph.problem.objects import moving_objects, object_tracks
+from sst_graph.problem.velocity import ObjectVelocity
 from sst_graph.types import RelativeMotion, SemanticClass
 
 CAMERA = PinholeCamera(100.0, 100.0, 50.0, 40.0, 101, 81)
@@ -111,6 +112,11 @@ def test_an_object_that_moved_lately_is_restless() -> None:
     assert 3 not in {n for _, n in window.moving.get(20, {})} and 3 in restless[20]
     assert 3 not in restless[39] and {1, 2} <= restless[39]
     assert all(0 not in names for names in restless.values())
+    # One whose velocity is known at its newest sighting may be asked.
+    (one,) = [track for (_, number), track in window.tracks[39].items() if number == 1]
+    assert one in window.restless()
+    window.velocities.take_over(39, one, ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2))
+    assert one not in window.restless()
 
 
 def test_nothing_grows_with_the_drive() -> None:
