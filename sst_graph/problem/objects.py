@@ -157,12 +157,10 @@ def moving_objects(
     for position, (scan, own, wTl) in enumerate(zip(drive.scans, by_scan, poses, strict=True)):
         velocities.remember(position, scan, own, wTl)
     velocities.judge_all()
-    for position in range(len(poses)):
-        lately = {(position, *name): speed for name, speed in velocities.speeds(position).items()}
-        others = higher_speeds(others, lately)
+    lately = {(k, c, n): mps for k in range(len(poses)) for (c, n), mps in velocities.speeds(k).items()}
     return {
         (position, c, n): Mover(speed, velocities.of(position, (c, n)))
-        for (position, c, n), speed in higher_speeds(followed, others).items()
+        for (position, c, n), speed in higher_speeds(followed, higher_speeds(others, lately)).items()
     }
 
 

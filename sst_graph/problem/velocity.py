@@ -74,7 +74,7 @@ class ObjectVelocity:
 
 
 class Velocities:
-    """Velocities of the movable objects of the latest scans; scans are told apart by their number.
+    """Velocities of the movable objects of the latest scans, which are numbered without gaps as they come.
 
     An object's velocity is found when its scan comes, and again when all around it has been seen.
 
@@ -146,24 +146,30 @@ class Velocities:
 
     def _known_near(self, track: int, number: int) -> dict[int, ObjectVelocity]:
         """What is known of an object a little before or after a scan."""
-        stamp_ns, reach = self._scans[number].stamp_ns, round(1e9 * self.config.memory_s)
-        known = self.found.get(track, {})
-        return {k: v for k, v in known.items() if abs(self._scans[k].stamp_ns - stamp_ns) <= reach}
+        known = self.found.get(track)
+        return (
+            {k: known[k] for k in self._around(number, self.config.memory_s) if k in known} if known else {}
+        )
+
+    def _around(self, number: int, seconds: float) -> list[int]:
+        """The scans within some seconds of one, itself included, in their order."""
+        stamp_ns, reach = self._scans[number].stamp_ns, round(1e9 * seconds)
+        first = last = number
+        while first - 1 in self._scans and stamp_ns - self._scans[first - 1].stamp_ns <= reach:
+            first -= 1
+        while last + 1 in self._scans and self._scans[last + 1].stamp_ns - stamp_ns <= reach:
+            last += 1
+        return list(range(first, last + 1))
 
     def _judge(self, number: int) -> set[int]:
         """Find the velocities of a scan's objects; scans in which that alone shows, or showed, motion."""
-        here, told = self._scans[number], set[int]()
-        for name, track in here.tracks.items():
+        told = set[int]()
+        for name, track in self._scans[number].tracks.items():
             found, known = self._followed(number, name), self.found.setdefault(track, {})
             if (found is None) == (number in known):
                 known.pop(number, None)
-                others = {k: self._known_near(track, k) for k in self._sightings[track]}
-                reach = round(1e9 * self.config.memory_s)
-                told |= {
-                    k
-                    for k, near in others.items()
-                    if not near and abs(self._scans[k].stamp_ns - here.stamp_ns) <= reach
-                }
+                near = [k for k in self._around(number, self.config.memory_s) if k in self._sightings[track]]
+                told |= {k for k in near if not self._known_near(track, k)}
             if found is not None:
                 known[number] = found
             if not known:
@@ -171,9 +177,9 @@ class Velocities:
         return told
 
     def _followed(self, number: int, name: ObjectName) -> ObjectVelocity | None:
-        here, reach = self._scans[number], round(1e9 * self.config.window_s)
-        sightings = sorted(self._sightings[here.tracks[name]].items())
-        near = [(k, own) for k, own in sightings if abs(self._scans[k].stamp_ns - here.stamp_ns) <= reach]
+        here = self._scans[number]
+        sightings = self._sightings[here.tracks[name]]
+        near = [(k, sightings[k]) for k in self._around(number, self.config.window_s) if k in sightings]
         few = len(here.outlines[name]) < self.config.least_points
         if few or len(near) < self.config.min_sightings:
             return None
