@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +60,9 @@ class StepAlarm:
 
     follows chi-square over the unknowns. Its usual size on this data is learnt and divided out, where it is
     more than the model says.
+
+    Attributes:
+        compared: the latest frames that were checked, against the estimate before them.
     """
 
     def __init__(self, config: AlarmConfig, object_sigma_px: float = 0.0) -> None:
@@ -70,10 +73,12 @@ class StepAlarm:
         self.usual: deque[float] = deque(maxlen=config.baseline)
         self.raised = 0
         self.quiet = 0
+        self.compared: Comparison | None = None
 
     def restart(self) -> None:
         """Forget the frames, not their usual size: a new calibration begins."""
         self.recent.clear()
+        self.compared = None
         self.raised = 0
         self.quiet = 0
 
@@ -82,7 +87,8 @@ class StepAlarm:
         self.recent.extend(scores)
         if not scores or len(self.recent) < self.config.frames:
             return None
-        statistic = chi_square(list(self.recent), joint, model, self.object_sigma_px)
+        self.compared = self.compare(self.recent, joint, model)
+        statistic = self.compared.chi2()
         value = statistic / self._scale(joint.core_size)
         self.quiet += 1
         if value > self.config.chi2:
@@ -92,16 +98,18 @@ class StepAlarm:
             self.usual.append(statistic)
         return value
 
-    def value(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float:
-        """The statistic of any frames' scores, over its usual size; nothing is learnt from it."""
-        return chi_square(scores, joint, model, self.object_sigma_px) / self._scale(joint.core_size)
+    def compare(self, scores: Collection[PairScore], joint: Joint, model: ErrorModel) -> Comparison:
+        """Any frames' scores against an estimate; nothing is learnt from it."""
+        return Comparison.of(scores, joint, model, self.object_sigma_px)
 
-    def shown(
-        self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel, steps: FloatArray
-    ) -> NDArray[np.bool_]:
-        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold in some frames."""
-        seen = Comparison.of(scores, joint, model, self.object_sigma_px).chi2_of(steps)
-        return np.asarray(seen > self.config.chi2 * self._scale(joint.core_size))
+    def value(self, compared: Comparison) -> float:
+        """The statistic over its usual size."""
+        return compared.chi2() / self._scale(len(compared.gradient))
+
+    def shown(self, compared: Comparison, steps: FloatArray) -> NDArray[np.bool_]:
+        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold."""
+        least = self.config.chi2 * self._scale(len(compared.gradient))
+        return np.asarray(compared.chi2_of(steps) > least)
 
     @property
     def alarm(self) -> bool:
@@ -115,13 +123,6 @@ class StepAlarm:
             return 1.0
         expected = freedom + 1.28 * float(np.sqrt(2.0 * freedom))
         return max(1.0, float(np.quantile(self.usual, 0.9)) / expected)
-
-
-def chi_square(
-    scores: Sequence[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float = 0.0
-) -> float:
-    """T of the new frames, see :class:`StepAlarm`."""
-    return Comparison.of(scores, joint, model, object_sigma_px).chi2()
 
 
 @dataclass(frozen=True)
@@ -142,7 +143,7 @@ class Comparison:
 
     @classmethod
     def of(
-        cls, scores: Sequence[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float
+        cls, scores: Collection[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float
     ) -> Comparison:
         """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         n = joint.core_size

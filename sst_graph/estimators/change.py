@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -12,8 +13,8 @@ import numpy as np
 from factors import delay_drift, extrinsic_drift
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Point, scaled_inverse
-from sst_graph.estimators.scores import motion_factor, silhouettes_factor
-from sst_graph.problem.state import object_bias_key, twist_key
+from sst_graph.problem.graph import motion_factor, silhouettes_factor
+from sst_graph.problem.state import bias_key, object_bias_key, twist_key
 
 if TYPE_CHECKING:
     from sst_graph.estimators.smoother import WindowSmoother
@@ -171,8 +172,8 @@ class Change:
             epoch = self._epoch_at(new.stamp_ns) if known is None else known.epoch
             if known is not None:
                 self._remove.append(self.ids[scan])
-            key = twist_key(0, new.image)
-            self._add(silhouettes_factor(pair, smoother.classes, smoother.keys(epoch), key), "pair", scan)
+            (E, D), key = smoother.keys(epoch)[:2], twist_key(0, new.image)
+            self._add(silhouettes_factor(pair, E, D, key, partial(bias_key, 0)), "pair", scan)
             if not (self.isam.valueExists(key) or self._values.exists(key)):
                 self._values.insert(key, pair.motion.c_twist)
             self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other, new.left_out)
@@ -189,9 +190,10 @@ class Change:
         for image, scan in firsts.items():
             if image not in self.twists:
                 entry = self.entries[scan]
-                keys, key = smoother.keys(entry.epoch), twist_key(0, image)
-                point = entry.score.belief.point
-                self._add(motion_factor(entry.pair, point, keys, key, smoother.graph), "twist", image)
+                (E, D), key = smoother.keys(entry.epoch)[:2], twist_key(0, image)
+                at = entry.score.belief.point
+                tie = motion_factor(entry.pair, E, D, key, at.cTl, at.offset_s, smoother.graph)
+                self._add(tie, "twist", image)
                 self._tied[image] = scan
 
     def _epoch_at(self, stamp_ns: int) -> int:

@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import GroupedBias, frame_factor, twist_transfer_factor, velocity_factor
 from factors.alignment import weighted_residuals
 from factors.motion import twist_ad
 from sst_graph.association.silhouettes import SIDES
@@ -18,7 +16,7 @@ from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.problem.graph import GraphConfig, PairMatches
 from sst_graph.problem.objects import numbers_in, of_each
-from sst_graph.problem.state import object_bias_key, underside_track
+from sst_graph.problem.state import underside_track
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import curvatures_of, unweighted
@@ -96,37 +94,6 @@ def object_places(
         for c in pair.tracks
         for number in numbers_in(pair.matches[c].objects)
     }
-
-
-def silhouettes_factor(
-    pair: PairMatches, classes: Sequence[SemanticClass], keys: Sequence[int], V_key: int
-) -> gtsam.NonlinearFactor:
-    """Silhouettes of one pair, on the keys of its epoch [E, D, biases...] and its image's twist."""
-    biases: list[int | float | GroupedBias | None] = []
-    for c in pair.matches:
-        tracks = pair.tracks.get(c)
-        if tracks is None:
-            biases.append(keys[2 + classes.index(c)])
-            continue
-        names, groups = np.unique(tracks, return_inverse=True)
-        own = tuple(object_bias_key(0, int(track)) for track in names)
-        biases.append(GroupedBias(own, groups.reshape(-1)))
-    alignments = [matches.alignment for matches in pair.matches.values()]
-    return frame_factor(alignments, keys[0], keys[1], V_key, biases)
-
-
-def motion_factor(
-    pair: PairMatches, point: Point, keys: Sequence[int], V_key: int, config: GraphConfig
-) -> gtsam.NonlinearFactor:
-    """What odometry says of the twist of a pair's image, at the point of its matches."""
-    if pair.l_twist is None:
-        sigmas = np.repeat(config.still_sigma, 3)
-        return velocity_factor(V_key, np.zeros(6), np.diag(sigmas**2))
-    covariance = camera_twist(pair.l_twist, point.cTl).covariance
-    l_twist = pair.l_twist
-    return twist_transfer_factor(
-        V_key, keys[0], keys[1], l_twist.twist, l_twist.acceleration, point.offset_s, covariance
-    )
 
 
 def with_share(pair: PairMatches, share: float) -> PairMatches:
@@ -219,15 +186,15 @@ def _rows(
     """Weighted rows of all matches by unknowns (m, n) and twist (m, 6), residuals and root weights (m,)."""
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
-        alignment, place, objects = matches.alignment, classes.index(c), pair.tracks.get(c)
+        alignment, place = matches.alignment, classes.index(c)
         biases: float | FloatArray = float(point.biases_px[place])
         columns = np.full(len(alignment), 7 + place)
-        if objects is not None:
-            names, groups = np.unique(objects, return_inverse=True)
+        if c in pair.tracks:
+            names, groups = pair.biased[c]
             below = 7 + len(classes) + place
             known = {track: point.core_size + k for k, track in enumerate(point.tracks)}
-            own = [below if t == underside_track(c) else known[t] for t in names.tolist()]
-            columns = np.array(own)[groups.reshape(-1)]
+            own = [below if t == underside_track(c) else known[t] for t in names]
+            columns = np.array(own)[groups]
             biases = np.concatenate([point.biases_px, point.object_biases_px])[columns - 7]
         r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, biases)
         block = np.zeros((len(r), point.size))

@@ -127,14 +127,16 @@ class Watch:
 
     def _confirm(self, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
-        config, scores = self.config, list(self.alarm.recent)
+        config, compared = self.config, self.alarm.compared
         if suspects := self.confirmation.suspects:
             latest = list(self.scans)[-config.frames :]
             scores = self.matcher.scores(point, latest, self._kernel, {*suspects, *restless})
-            if not scores or self.alarm.value(scores, joint, model) > config.chi2:
+            compared = self.alarm.compare(scores, joint, model) if scores else None
+            if compared is not None and self.alarm.value(compared) > config.chi2:
                 return
-        tried = steps(point.cTl, float(np.radians(config.shown_deg)), config.shown_s)
-        self.confirmation.take(self.alarm.shown(scores, joint, model, tried))
+        if compared is not None:
+            tried = steps(point.cTl, float(np.radians(config.shown_deg)), config.shown_s)
+            self.confirmation.take(self.alarm.shown(compared, tried))
 
     @property
     def lost(self) -> bool:
@@ -186,7 +188,7 @@ class Watch:
 
         def value(*without: int) -> float:
             scores = self.matcher.scores_of(pairs, kept.point, {*without, *restless})
-            return self.alarm.value(scores, kept.joint, model)
+            return self.alarm.value(self.alarm.compare(scores, kept.joint, model))
 
         # A step shows more clearly with every frame; labels whose errors last do not.
         more = len(scans) / (config.frames + config.confirmations)

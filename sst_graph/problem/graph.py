@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import gtsam
 import numpy as np
@@ -100,6 +100,15 @@ class PairMatches:
 
     def __len__(self) -> int:
         return sum(len(matches) for matches in self.matches.values())
+
+    @cached_property
+    def biased(self) -> Mapping[SemanticClass, tuple[list[int], NDArray[np.intp]]]:
+        """By class of ``tracks``: the tracks that have a mask bias, and which of them (n,) each match has."""
+        found = {}
+        for c, tracks in self.tracks.items():
+            names, groups = np.unique(tracks, return_inverse=True)
+            found[c] = (names.tolist(), groups.reshape(-1))
+        return found
 
     @property
     def moved(self) -> bool:
@@ -253,39 +262,55 @@ def joint_graph(
     _add_calibration(graph, values, state, guess or state, config)
     _add_biases(graph, values, pairs, state, config)
     for pair in pairs:
-        _add_motion(graph, values, pair, state, config)
-        graph.add(silhouettes_of(pair, state))
+        E, D, V = EXTRINSIC, delay_key(state.clock(pair.drive)), twist_key(pair.drive, pair.pair.image)
+        if not values.exists(V):
+            values.insert(V, pair.motion.c_twist)
+            graph.add(motion_factor(pair, E, D, V, state.cTl, state.offset_s(pair.drive), config))
+        graph.add(silhouettes_factor(pair, E, D, V, partial(bias_key, pair.drive)))
     return graph, values
 
 
-def silhouettes_of(pair: PairMatches, state: State) -> gtsam.CustomFactor:
-    """All silhouette matches of one pair as one condensed factor on E, D, V(image) and mask biases."""
+def silhouettes_factor(
+    pair: PairMatches, E: int, D: int, V: int, bias_of: Callable[[SemanticClass], int]
+) -> gtsam.CustomFactor:
+    """All silhouette matches of one pair as one condensed factor on extrinsic, offset, twist and mask biases.
+
+    Args:
+        bias_of: key of the mask bias that a class's objects share where they have none of their own.
+    """
     biases: list[int | float | GroupedBias | None] = []
     for c in pair.matches:
-        tracks = pair.tracks.get(c)
-        if tracks is None:
-            biases.append(bias_key(pair.drive, c))
-            continue
-        names, groups = np.unique(tracks, return_inverse=True)
-        own = tuple(object_bias_key(pair.drive, int(track)) for track in names)
-        biases.append(GroupedBias(own, groups.reshape(-1)))
-    return frame_factor(
-        [matches.alignment for matches in pair.matches.values()],
-        EXTRINSIC,
-        delay_key(state.clock(pair.drive)),
-        twist_key(pair.drive, pair.pair.image),
-        biases,
-    )
+        if c in pair.tracks:
+            names, groups = pair.biased[c]
+            biases.append(GroupedBias(tuple(object_bias_key(pair.drive, track) for track in names), groups))
+        else:
+            biases.append(bias_of(c))
+    return frame_factor([matches.alignment for matches in pair.matches.values()], E, D, V, biases)
+
+
+def motion_factor(
+    pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, offset_s: float, config: GraphConfig
+) -> gtsam.NonlinearFactor:
+    """What the LiDAR's odometry, where there is one, says of the twist of a pair's image.
+
+    Args:
+        cTl, offset_s: that the matches were made at.
+    """
+    if pair.l_twist is None:
+        sigmas = np.repeat(config.still_sigma, 3)
+        return velocity_factor(V, np.zeros(6), np.diag(sigmas**2))
+    covariance = camera_twist(pair.l_twist, cTl).covariance
+    twist, acceleration = pair.l_twist.twist, pair.l_twist.acceleration
+    return twist_transfer_factor(V, E, D, twist, acceleration, offset_s, covariance)
 
 
 def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[np.intp] | None]]:
     """Key of the mask bias, and the matches that share it (None for all): by object where it is tracked."""
-    tracks = pair.tracks.get(c)
-    if tracks is None:
+    if c not in pair.tracks:
         return [(bias_key(pair.drive, c), None)]
+    names, groups = pair.biased[c]
     return [
-        (object_bias_key(pair.drive, int(track)), np.flatnonzero(tracks == track))
-        for track in np.unique(tracks)
+        (object_bias_key(pair.drive, track), np.flatnonzero(groups == k)) for k, track in enumerate(names)
     ]
 
 
@@ -326,42 +351,7 @@ def _add_biases(
 def tracked_objects(pairs: Sequence[PairMatches]) -> list[tuple[int, SemanticClass, int]]:
     """(drive, class, track) of every object with a mask bias of its own."""
     return sorted(
-        {
-            (pair.drive, c, int(track))
-            for pair in pairs
-            for c, tracks in pair.tracks.items()
-            for track in np.unique(tracks)
-        }
-    )
-
-
-def _add_motion(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    pair: PairMatches,
-    state: State,
-    config: GraphConfig,
-) -> None:
-    """The twist of the pair's image, tied to the LiDAR's odometry where there is one."""
-    key = twist_key(pair.drive, pair.pair.image)
-    if values.exists(key):
-        return
-    values.insert(key, pair.motion.c_twist)
-    if pair.l_twist is None:
-        sigmas = np.repeat(config.still_sigma, 3)
-        graph.add(velocity_factor(key, np.zeros(6), np.diag(sigmas**2)))
-        return
-    covariance = camera_twist(pair.l_twist, state.cTl).covariance
-    graph.add(
-        twist_transfer_factor(
-            key,
-            EXTRINSIC,
-            delay_key(state.clock(pair.drive)),
-            pair.l_twist.twist,
-            pair.l_twist.acceleration,
-            state.offset_s(pair.drive),
-            covariance,
-        )
+        {(pair.drive, c, track) for pair in pairs for c, (names, _) in pair.biased.items() for track in names}
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.estimators.adoption import Adoption
-from sst_graph.estimators.alarm import Comparison, Joint, StepAlarm, chi_square
+from sst_graph.estimators.alarm import Comparison, Joint, StepAlarm
 from sst_graph.estimators.confirmation import Confirmation, steps
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
 from sst_graph.estimators.score_sums import ScoreSums, fit_sides
@@ -102,10 +102,14 @@ def _model() -> ErrorModel:
     return ErrorModel(0.25, 0.0, 1.0)
 
 
+def _chi2(scores: list[PairScore], joint: Joint) -> float:
+    return Comparison.of(scores, joint, _model(), 0.0).chi2()
+
+
 def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
     rng, P = np.random.default_rng(1), 1e-3 * np.eye(N)
     values = [
-        chi_square([_score(rng, x, 4 * k) for k in range(3)], Joint(P, (), N), _model())
+        _chi2([_score(rng, x, 4 * k) for k in range(3)], Joint(P, (), N))
         for x in rng.multivariate_normal(np.zeros(N), P, 300)
     ]
     assert np.mean(values) == pytest.approx(N, rel=0.12)
@@ -134,12 +138,13 @@ def test_steps_that_would_be_seen_are_told_before_they_come() -> None:
     tried[1, 0], tried[6, 1] = 0.02, 0.3
     scores = [_score(rng, np.zeros(N), 4 * k) for k in range(4)]
     exact = Joint(np.zeros((N, N)), (), N)
-    small, large = Comparison.of(scores, exact, _model(), 0.0).chi2_of(tried)
-    assert small < 5.0 < 50.0 < large
     alarm = StepAlarm(AlarmConfig())
-    assert alarm.shown(scores, exact, _model(), tried).tolist() == [False, True]
+    compared = alarm.compare(scores, exact, _model())
+    small, large = compared.chi2_of(tried)
+    assert small < 5.0 < 50.0 < large
+    assert alarm.shown(compared, tried).tolist() == [False, True]
     stepped = [_score(rng, np.append(tried[:, 1], [0.0, 0.0]), 4 * k) for k in range(4)]
-    assert chi_square(stepped, exact, _model()) == pytest.approx(large + N, rel=0.3)
+    assert _chi2(stepped, exact) == pytest.approx(large + N, rel=0.3)
 
 
 def test_what_is_confirmed_is_told_apart() -> None:
@@ -180,7 +185,7 @@ def test_a_direction_without_information_raises_nothing() -> None:
     still = dataclasses.replace(
         score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
     )
-    assert chi_square([still], Joint(1e-6 * np.eye(N), (), N), _model()) < 40.0
+    assert _chi2([still], Joint(1e-6 * np.eye(N), (), N)) < 40.0
 
 
 def test_objects_come_and_go_without_loss() -> None:
