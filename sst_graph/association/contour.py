@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,7 +18,7 @@ _SMOOTHING_PX = 1.0
 BORDER_PX = 3.0
 """Nothing is matched this close to the image's border [px]: objects are cut there."""
 REACH_PX = 64
-"""The field ends this far from the class [px]: beyond every gate (``gate`` times the widest kernel)."""
+"""The field ends this far around the class [px]: beyond every gate (``gate`` times the widest kernel)."""
 MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
 
@@ -46,18 +45,20 @@ class ContourMap:
     """Signed distance field of one class in one mask.
 
     Attributes:
-        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, and flat from
-            :data:`REACH_PX` on [px].
-        unknown: (h, w) 1 near ``IGNORE`` pixels, where a contour is not the object's.
+        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
+            the class that reaches :data:`REACH_PX` beyond it; as at the box's border farther out [px].
+        left, top: the box's first column and row in the image.
+        width, height: of the image.
+        unknown: (height, width) 1 near ``IGNORE`` pixels, where a contour is not the object's; None where
+            there are none.
     """
 
     distance: FloatMap
-    unknown: FloatMap
-
-    @cached_property
-    def veiled(self) -> bool:
-        """Whether any pixel is unknown."""
-        return bool(self.unknown.any())
+    left: int
+    top: int
+    width: int
+    height: int
+    unknown: FloatMap | None
 
     @classmethod
     def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
@@ -66,39 +67,41 @@ class ContourMap:
         inside = (mask == int(semantic_class)).view(np.uint8)
         if cv2.countNonZero(inside) in (0, inside.size):
             return None
-        # Only near the class: elsewhere nothing is matched, and the transform is what an image costs.
+        # Only near the class: elsewhere nothing is matched, and the field is what an image costs.
         x, y, width, height = cv2.boundingRect(inside)
         top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
         box = inside[top : y + height + REACH_PX, left : x + width + REACH_PX]
-        near = cv2.GaussianBlur(signed_distance(np.ascontiguousarray(box)), (0, 0), _SMOOTHING_PX)
-        np.minimum(near, REACH_PX, out=near)
-        below, right = mask.shape[0] - top - len(near), mask.shape[1] - left - near.shape[1]
-        distance = cv2.copyMakeBorder(near, top, below, left, right, cv2.BORDER_CONSTANT, value=REACH_PX)
-        unknown = (mask == int(SemanticClass.IGNORE)).view(np.uint8)
-        if cv2.countNonZero(unknown):
-            unknown = np.asarray(cv2.dilate(unknown, np.ones((5, 5), np.uint8)), np.uint8)
-        return cls(np.asarray(distance, np.float32), unknown.astype(np.float32))
+        distance = cv2.GaussianBlur(signed_distance(np.ascontiguousarray(box)), (0, 0), _SMOOTHING_PX)
+        ignored = (mask == int(SemanticClass.IGNORE)).view(np.uint8)
+        unknown = None
+        if cv2.countNonZero(ignored):
+            unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.float32)
+        return cls(np.asarray(distance, np.float32), left, top, mask.shape[1], mask.shape[0], unknown)
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
-        height, width = self.distance.shape
-        u, v = uvs[:, 0], uvs[:, 1]
-        with np.errstate(invalid="ignore"):
-            valid = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
-            valid &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
+        valid = self.well_inside(uvs[:, 0], uvs[:, 1])
         safe = np.where(valid[:, None], uvs, BORDER_PX + 1.0)
         steps = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
         # All at once: with few points a call costs more than what it does.
-        around = sample(self.distance, (steps[:, None, :] + safe).reshape(-1, 2)).reshape(5, -1)
+        places = (steps[:, None, :] + (safe - [self.left, self.top])).reshape(-1, 2)
+        around = sample(self.distance, places).reshape(5, -1)
         distances = around[0]
         gradient = 0.5 * np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
         length = np.linalg.norm(gradient, axis=1)
         normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
         feet = safe - distances[:, None] * normals
         valid &= length > MIN_GRADIENT
-        if self.veiled:
+        if self.unknown is not None:
             valid &= sample(self.unknown, feet) < 0.1
         return ContourFeet(distances, normals, feet, valid)
+
+    def well_inside(self, u: FloatArray, v: FloatArray) -> NDArray[np.bool_]:
+        """Whether columns and rows are on the image and not close to its border; False for NaN."""
+        with np.errstate(invalid="ignore"):
+            inside = (u > BORDER_PX) & (u < self.width - 1 - BORDER_PX)
+            inside &= (v > BORDER_PX) & (v < self.height - 1 - BORDER_PX)
+        return np.asarray(inside)
 
 
 def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:

@@ -18,7 +18,7 @@ from factors.camera import PinholeCamera
 from factors.motion import cross
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
-from sst_graph.association.contour import BORDER_PX, MIN_GRADIENT, ContourMap
+from sst_graph.association.contour import MIN_GRADIENT, ContourMap
 from sst_graph.association.silhouettes import SIDE_OF, SIDES, MatchConfig
 from sst_graph.types import SemanticClass
 
@@ -311,13 +311,14 @@ def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatAr
 
 def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Signed distances (k,) and normals (2, k) at pixels (2, k) on the image; infinite at ridges."""
-    height, width = contour.distance.shape
+    rows, columns = contour.distance.shape
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
-    valid = (u > BORDER_PX) & (u < width - 1 - BORDER_PX) & (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
-    at = np.where(valid, row * width + column, 0)
+    x0, y0 = column - contour.left, row - contour.top
+    valid = contour.well_inside(u, v) & (x0 >= 0) & (y0 >= 0) & (x0 < columns - 1) & (y0 < rows - 1)
+    at = np.where(valid, y0 * columns + x0, 0)
     field = contour.distance.reshape(-1)
-    a, b, c, d = (field[at + step].astype(np.float64) for step in (0, 1, width, width + 1))
+    a, b, c, d = (field[at + step].astype(np.float64) for step in (0, 1, columns, columns + 1))
     x, y = u - column, v - row
     top, bottom = a + x * (b - a), c + x * (d - c)
     distance = top + y * (bottom - top)
@@ -325,9 +326,9 @@ def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]
     length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
     valid &= length > MIN_GRADIENT
     normals = gradient / np.maximum(length, MIN_GRADIENT)
-    if contour.veiled:
+    if contour.unknown is not None:
         feet = np.rint(uvs - distance * normals).astype(np.intp)
-        feet = np.clip(feet, 0, [[width - 1], [height - 1]])
+        feet = np.clip(feet, 0, [[contour.width - 1], [contour.height - 1]])
         valid &= contour.unknown[feet[1], feet[0]] < 0.5
     return np.where(valid, distance, np.inf), normals
 
