@@ -22,6 +22,8 @@ from sst_graph.problem.drive import (
     image_features,
     scan_features,
 )
+from sst_graph.problem.persistence import ObjectName
+from sst_graph.problem.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -66,6 +68,7 @@ def align_frame(
     from_ns: int | None = None,
     classes: Sequence[SemanticClass] = VEHICLES,
     biases_px: Mapping[SemanticClass, float] | None = None,
+    l_velocities: Mapping[ObjectName, ArrayLike] | None = None,
     kernel: RobustKernel = SLAM_KERNEL,
     config: MatchConfig = SLAM_MATCHES,
 ) -> FrameAlignments:
@@ -85,6 +88,9 @@ def align_frame(
         from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
         classes: to match.
         biases_px: current mask biases by class [px].
+        l_velocities: (3,) velocity over ground of objects that move, in the LiDAR frame of the scan, by class
+            and number within the scan (the data's instance, where all points of the class carry one) [m/s];
+            all others stand. Not with ``lTs``: leave out the vehicles that move there.
         kernel: robust kernel of the matches; its scale, times ``config.gate``, is also the gate [px].
         config: how boundary points meet contours.
 
@@ -92,14 +98,24 @@ def align_frame(
         The matches, possibly none: a frame without any gives no factor.
 
     Raises:
-        DataError: ``lTs`` without ``from_ns`` or the other way round, or twists of a wrong shape.
+        DataError: ``lTs`` without ``from_ns`` or the other way round, or with velocities; twists or
+            velocities of a wrong shape.
     """
     if (lTs is None) != (from_ns is None):
         raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
+    if lTs is not None and l_velocities:
+        raise DataError(
+            "align_frame", "l_velocities with lTs", "objects that stand in a scan of another time"
+        )
     points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
+    boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
+    moving = {
+        name: _finite(f"l_velocities[{name[0].name}, {name[1]}]", velocity, 3)
+        for name, velocity in (l_velocities or {}).items()
+    }
     found = match_silhouettes(
-        {c: boundaries for c, boundaries in points.boundaries.items() if c in classes},
+        boundaries,
         contours.contours,
         camera,
         cTl if lTs is None else cTl * lTs,
@@ -109,6 +125,7 @@ def align_frame(
         biases_px or {},
         kernel,
         config,
+        velocities_of_points(moving, boundaries),
     )
     return _frame_alignments(found)
 
@@ -123,12 +140,12 @@ def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> Frame
 
 def _camera_motion(cTl: gtsam.Pose3, l_twist: ArrayLike, l_acceleration: ArrayLike | None) -> Motion:
     Ad = np.asarray(cTl.AdjointMap())
-    acceleration = np.zeros(6) if l_acceleration is None else _twist("l_acceleration", l_acceleration)
-    return Motion(Ad @ _twist("l_twist", l_twist), Ad @ acceleration)
+    acceleration = np.zeros(6) if l_acceleration is None else _finite("l_acceleration", l_acceleration, 6)
+    return Motion(Ad @ _finite("l_twist", l_twist, 6), Ad @ acceleration)
 
 
-def _twist(name: str, value: ArrayLike) -> FloatArray:
-    twist = np.asarray(value, dtype=np.float64)
-    if twist.shape != (6,) or not np.isfinite(twist).all():
-        raise DataError(f"align_frame: {name}", f"shape {twist.shape}", "6 finite numbers")
-    return twist
+def _finite(name: str, value: ArrayLike, count: int) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (count,) or not np.isfinite(array).all():
+        raise DataError(f"align_frame: {name}", f"shape {array.shape}", f"{count} finite numbers")
+    return array

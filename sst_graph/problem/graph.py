@@ -34,6 +34,7 @@ from sst_graph.problem.state import (
     underside_track,
 )
 from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
+from sst_graph.problem.velocity import velocities_of_points
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -168,18 +169,6 @@ def _shares(
     return of_each(numbers, {n: standing_share(mps, tau_s, reach_m) for n, mps in unknown.items()})
 
 
-def _velocities(
-    movers: Movers, boundaries: Mapping[SemanticClass, Boundaries]
-) -> dict[SemanticClass, FloatArray]:
-    """(n, 3) velocity over ground of each boundary point's object [m/s], by class where some are known."""
-    found: dict[SemanticClass, FloatArray] = {}
-    for (c, n), mover in movers.items():
-        if mover.velocity is not None and c in boundaries:
-            objects = boundaries[c].objects
-            found.setdefault(c, np.zeros((len(objects), 3)))[objects == n] = mover.velocity.l_velocity
-    return {c: velocities for c, velocities in found.items() if velocities.any()}
-
-
 def associate(
     drives: Sequence[Drive], tracks: Tracks, state: State, kernel: RobustKernel, config: GraphConfig
 ) -> list[PairMatches]:
@@ -196,6 +185,7 @@ def associate(
             movers, tau_s = tracks.movers(number, pair.scan), offset_s + pair.base_tau_s
             share = partial(_shares, movers, reach_m=config.mover_reach_m, tau_s=tau_s)
             boundaries = _told(outlines(drive.scans[pair.scan], config.undersides), share)
+            known = {name: mover.velocity.l_velocity for name, mover in movers.items() if mover.velocity}
             matches = match_silhouettes(
                 boundaries,
                 image.contours,
@@ -207,7 +197,7 @@ def associate(
                 biases,
                 kernel,
                 config.match,
-                _velocities(movers, boundaries),
+                velocities_of_points(known, boundaries),
             )
             matches = {c: _weighted(m, share(c, m.objects)) for c, m in matches.items()}
             if matches:

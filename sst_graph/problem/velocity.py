@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sst_graph.association.boundary import Edge
+from sst_graph.association.boundary import Boundaries, Edge
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.problem.drive import ScanFeatures
 from sst_graph.problem.persistence import ObjectName
+from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
@@ -237,6 +238,22 @@ class _Seen:
         own = {name: tracks[name] for name in followed}
         centres = {name: tuple((part.sum(axis=0) / len(part)).tolist()) for name, part in followed.items()}
         return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, centres, own)
+
+
+def velocities_of_points(
+    l_velocities: Mapping[ObjectName, FloatArray], boundaries: Mapping[SemanticClass, Boundaries]
+) -> dict[SemanticClass, FloatArray]:
+    """(n, 3) velocity over ground of each boundary point's object [m/s], by class where any moves.
+
+    Args:
+        l_velocities: (3,) of objects that move, in the LiDAR frame of the scan [m/s].
+    """
+    found: dict[SemanticClass, FloatArray] = {}
+    for (c, n), l_velocity in l_velocities.items():
+        if c in boundaries:
+            objects = boundaries[c].objects
+            found.setdefault(c, np.zeros((len(objects), 3)))[objects == n] = l_velocity
+    return {c: velocities for c, velocities in found.items() if velocities.any()}
 
 
 def near_end_velocity(

@@ -114,6 +114,28 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
     assert on_poses.error(values) == pytest.approx(plain.error(values), rel=1e-3)
 
 
+def test_a_vehicle_that_moves_is_carried_along() -> None:
+    # moved by hand to where it is when the image is taken, it meets the same contours
+    scan, image = frame(2)
+    truth, camera, velocity, offset_s = drive().truth, drive().camera, np.array([0.8, -1.5, 0.1]), 0.05
+    features = scan_features(2, scan, [VEHICLE], PrepareConfig())
+    points, late_s = features.boundaries[VEHICLE], offset_s + 1e-9 * (image.stamp_ns - scan.stamp_ns)
+    number = int(np.bincount(points.objects).argmax())
+    arguments = (image, camera, truth.cTl, offset_s, l_twist(2))
+    found = sst_graph.align_frame(features, *arguments, l_velocities={(VEHICLE, number): velocity})
+    shift = np.where(points.objects[:, None] == number, late_s * velocity, 0.0)
+    carried = replace(points, lPs=points.lPs + shift, outward=points.outward + shift)
+    by_hand = sst_graph.align_frame(replace(features, boundaries={VEHICLE: carried}), *arguments)
+    (a,), (b,) = found.alignments, by_hand.alignments
+    np.testing.assert_allclose(a.pixels, b.pixels, atol=1e-6)
+    assert a.l_velocities is not None
+    own = found.objects[0] == number
+    assert 10 < np.count_nonzero(own) < len(own)
+    np.testing.assert_array_equal(a.l_velocities, np.where(own[:, None], velocity, 0.0))
+    standing = sst_graph.align_frame(features, *arguments)
+    assert len(standing) != len(found) or not np.allclose(standing.alignments[0].pixels, a.pixels, atol=0.1)
+
+
 def _moved(features: ScanFeatures, lTs: gtsam.Pose3, stamp_ns: int) -> ScanFeatures:
     def carried(points: np.ndarray) -> np.ndarray:
         return np.asarray(lTs.transformFrom(points.T)).T
@@ -152,6 +174,12 @@ def test_refuses_half_an_argument() -> None:
         sst_graph.align_frame(*arguments, np.zeros(6), lTs=gtsam.Pose3())
     with pytest.raises(DataError, match="6 finite numbers"):
         sst_graph.align_frame(*arguments, np.zeros(3))
+    with pytest.raises(DataError, match="stand in a scan of another time"):
+        sst_graph.align_frame(
+            *arguments, np.zeros(6), lTs=gtsam.Pose3(), from_ns=0, l_velocities={(VEHICLE, 1): np.ones(3)}
+        )
+    with pytest.raises(DataError, match="3 finite numbers"):
+        sst_graph.align_frame(*arguments, np.zeros(6), l_velocities={(VEHICLE, 1): np.ones(2)})
 
 
 def test_objects_name_the_vehicle_of_each_match() -> None:
