@@ -3,8 +3,8 @@
 The edge lies between the last return on the object and the next beam, so the direction half way is
 unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
 to the neighbour and is skipped. The range is carried on over the half step with the slope of the last
-two returns: on a roof seen at a grazing angle the edge lies a metre behind the last return, and a camera
-beside the LiDAR sees that metre.
+two returns, and along a roof that is seen from above: at a grazing angle it ends a metre behind the last
+return, and a camera beside the LiDAR sees that metre.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class BoundaryConfig:
         min_points: objects with fewer points are left out.
         bottom_edges: find edges towards the ground too.
         ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
-        max_slope_m: most that the range is carried on from the last return to the edge [m].
+        max_slope_m: most that the range is carried on from the last return to the edge, half a roof [m].
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
 
@@ -121,7 +121,7 @@ def find_boundaries(
         parts = [
             _side_edges(points, mask, beams, config, +1),
             _side_edges(points, mask, beams, config, -1),
-            _ring_edges(points, mask, beams, config),
+            _ring_edges(points, mask, beams, config, roofs=c == SemanticClass.VEHICLE),
         ]
         if config.bottom_edges:
             parts.append(_ring_edges(points, mask, beams, config, _ground_heights(points, objects)))
@@ -161,18 +161,27 @@ def _side_edges(
     steps = side * (beams.azimuth[last] - beams.azimuth[before])
     known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
     known &= steps < config.max_steps * beams.step
-    edge = _carried_on(points[last], beams.rho[last], beams.rho[before], known, config)
+    edge = _along_rays(points, beams, last, _carried_on(beams, last, before, known, config))
     half = 0.5 * side * beams.step
     return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), Edge.SIDE)
 
 
 def _carried_on(
-    points: FloatArray, rho: FloatArray, before: FloatArray, known: NDArray[np.bool_], config: BoundaryConfig
+    beams: Beams, last: IntArray, before: IntArray, known: NDArray[np.bool_], config: BoundaryConfig
 ) -> FloatArray:
-    """Points pushed along their rays by half the range step from the return before, where that is known."""
-    push = np.where(known, np.clip(0.5 * (rho - before), -config.max_slope_m, config.max_slope_m), 0.0)
-    push = np.where(np.abs(rho - before) < 2.0 * config.max_slope_m, push, 0.0)
-    return np.asarray(points * (1.0 + push / rho)[:, None])
+    """(n,) half the range step to last returns from those before, where these are known [m]."""
+    step = beams.rho[last] - beams.rho[before]
+    push = np.clip(0.5 * step, -config.max_slope_m, config.max_slope_m)
+    return np.where(known & (np.abs(step) < 2.0 * config.max_slope_m), push, 0.0)
+
+
+def _along_rays(points: FloatArray, beams: Beams, index: IntArray, push: FloatArray) -> FloatArray:
+    """Some points pushed along their rays, which leave the tip of their ring's cone [m]."""
+    farther = 1.0 + push / beams.rho[index]
+    tips = beams.height[beams.ring[index]]
+    moved = points[index] * farther[:, None]
+    moved[:, 2] = tips + (points[index, 2] - tips) * farther
+    return np.asarray(moved)
 
 
 def _turn(points: FloatArray, angle: float) -> FloatArray:
@@ -188,6 +197,7 @@ def _ring_edges(
     beams: Beams,
     config: BoundaryConfig,
     ground: FloatArray | None = None,
+    roofs: bool = False,
 ) -> _Edges:
     """Edges towards the ring above: half way, at the object's range, to that ring's cone.
 
@@ -196,6 +206,9 @@ def _ring_edges(
 
     With the height (n,) [m] of the ground that each point's object stands on, edges towards the ring
     below: the object ends where that ring meets the ground, no matter how far before or behind.
+
+    Args:
+        roofs: whether objects of the class have one: seen from above, they end at its far end.
     """
     up = 1 if ground is None else -1
     ring = beams.ring + up
@@ -207,17 +220,39 @@ def _ring_edges(
     else:
         ok &= points[following, 2] < ground[i] + config.ground_margin_m
     i, following = i[ok], following[ok]
-    rho, tip = beams.rho[i], beams.height[ring[i]]
-    rise = (tip + (points[following, 2] - tip) * rho / beams.rho[following] - points[i, 2]) / rho
-    ok = (up * rise > 0.0) & (up * rise < np.radians(config.max_elevation_gap_deg))
-    i, rise = i[ok], rise[ok]
+    # The two rays: height over range, from their cones' tips.
+    rho, tip, tip_there = beams.rho[i], beams.height[beams.ring[i]], beams.height[ring[i]]
+    slope = (points[i, 2] - tip) / rho
+    slope_there = (points[following, 2] - tip_there) / beams.rho[following]
+    gap = tip_there + slope_there * rho - points[i, 2]
+    ok = (up * gap > 0.0) & (up * gap < np.radians(config.max_elevation_gap_deg) * rho)
+    i, rho, gap, slope, slope_there = (a[ok] for a in (i, rho, gap, slope, slope_there))
     before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
-    edge = _carried_on(points[i], beams.rho[i], beams.rho[before], known & mask[before], config)
-    half = 0.5 * rise * np.hypot(edge[:, 0], edge[:, 1])
+    push = _carried_on(beams, i, before, known & mask[before], config)
+    if roofs:
+        push = np.maximum(push, _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope, config))
+    edge = _along_rays(points, beams, i, push)
+    half = 0.5 * (gap + push * (slope_there - slope))
     lPs, outward = edge.copy(), edge.copy()
     lPs[:, 2] += half
     outward[:, 2] += 3.0 * half
     return _Edges(i, lPs, outward, Edge.TOP if up > 0 else Edge.BOTTOM)
+
+
+def _along_roof(
+    half: FloatArray, middle: FloatArray, slope: FloatArray, config: BoundaryConfig
+) -> FloatArray:
+    """(n,) how far behind the last return the ray half way to the ring above comes down to its height [m].
+
+    A roof seen from above at a grazing angle ends somewhere between the returns of two rings that are metres
+    apart on it, and the upper one misses it; the slope of the last two returns is that of the rear window.
+
+    Args:
+        half: (n,) height of that ray above the last return, at its range [m].
+        middle, slope: (n,) slopes of that ray and of the last return's.
+    """
+    down = np.where(middle < 0.0, half / np.maximum(-middle, 1e-9), np.inf)
+    return np.where(slope < 0.0, np.minimum(down, config.max_slope_m), 0.0)
 
 
 def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:

@@ -120,6 +120,50 @@ def test_the_range_is_carried_on() -> None:
     np.testing.assert_allclose(rho[azimuth < 0.0], recedes[members[0]] - 0.15, atol=1e-3)
 
 
+def roof(phase_deg: float, label: SemanticClass) -> Scan:
+    """A box 0.3 m below the LiDAR from 8 to 10 m away, with a flat roof, before a wall."""
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(AZIMUTHS, ELEVATIONS + np.radians(phase_deg)))
+    ring = np.repeat(np.arange(len(ELEVATIONS)), len(AZIMUTHS))
+    height = np.tan(elevation)
+    on_roof = np.where(height < 0.0, -0.3 / np.minimum(height, -1e-6), np.inf)
+    rho = np.where(on_roof <= 8.0, 8.0, np.where(on_roof < 10.0, on_roof, 40.0))
+    points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), rho * height], axis=1)
+    classes = np.where(rho < 11.0, label, OTHER).astype(np.uint8)
+    return Scan(0, points.astype(np.float32), classes, rings=ring.astype(np.uint16))
+
+
+def test_a_roof_seen_from_above_ends_behind_its_last_return() -> None:
+    """A camera 8 cm lower sees the far end; in the mean over where the rings fall, so does the edge."""
+    truth, errors = (-0.3 + 0.08) / 10.0, dict[SemanticClass, float]()
+    for label in (VEHICLE, SemanticClass.BUILDING):
+        slopes = []
+        for phase in np.arange(0.0, RING_DEG, 0.02):
+            top = find_boundaries(roof(phase, label), [label])[label]
+            top = top.take(np.flatnonzero(top.edges == Edge.TOP))
+            assert len(top) == len(AZIMUTHS)
+            slopes.append(np.mean((top.lPs[:, 2] + 0.08) / np.hypot(top.lPs[:, 0], top.lPs[:, 1])))
+        errors[label] = 721.0 * abs(float(np.mean(slopes)) - truth)
+    assert errors[VEHICLE] < 0.15 < 0.4 < errors[SemanticClass.BUILDING]  # px
+
+
+def test_rays_leave_the_tip_of_their_ring() -> None:
+    """Of lasers that leave the axis 0.15 m above the origin, edges carried on stay on the ring's cone."""
+    azimuth, elevation = (a.ravel() for a in np.meshgrid(AZIMUTHS, ELEVATIONS))
+    on_plate = (np.abs(azimuth) < np.radians(5.0)) & (elevation < np.radians(1.0))
+    step = 0.4
+    rho = np.where(on_plate, 10.0 + step / np.radians(STEP_DEG) * (azimuth + np.radians(5.0)), 60.0)
+    z = 0.15 + rho * np.tan(elevation)
+    points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), z], axis=1)
+    classes = np.where(on_plate, VEHICLE, OTHER).astype(np.uint8)
+    ring = np.repeat(np.arange(len(ELEVATIONS)), len(AZIMUTHS)).astype(np.uint16)
+    found = found_in(Scan(0, points.astype(np.float32), classes, rings=ring))
+    sides = found.take(np.flatnonzero((found.edges == Edge.SIDE) & (found.lPs[:, 1] < 0.0)))
+    _, _, reached = polar_deg(sides.lPs)
+    np.testing.assert_allclose(reached, rho[on_plate].min() - 0.5 * step, atol=1e-3)
+    slopes = np.sort((sides.lPs[:, 2] - 0.15) / reached)
+    np.testing.assert_allclose(slopes, np.tan(ELEVATIONS[np.radians(1.0) > ELEVATIONS]), atol=1e-4)
+
+
 def test_no_edge_across_a_gap_in_the_scan() -> None:
     scan = scene()
     azimuth, _, _ = polar_deg(scan.points)
