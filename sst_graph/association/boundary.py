@@ -3,8 +3,8 @@
 The edge lies between the last return on the object and the next beam, so the direction half way is
 unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
 to the neighbour and is skipped. The range is carried on over the half step with the slope of the last
-two returns, and along a roof that is seen from above: at a grazing angle it ends a metre behind the last
-return, and a camera beside the LiDAR sees that metre.
+two returns, and along a roof that is seen from above: at a grazing angle it ends well behind the last
+return, and a camera beside the LiDAR sees the difference.
 """
 
 from __future__ import annotations
@@ -23,6 +23,10 @@ from sst_graph.types import Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+
+
+_AMID = 2
+"""Beams to either side of a point on a roof that meet the object, too."""
 
 
 class Edge(IntEnum):
@@ -46,7 +50,9 @@ class BoundaryConfig:
         min_points: objects with fewer points are left out.
         bottom_edges: find edges towards the ground too.
         ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
-        max_slope_m: most that the range is carried on from the last return to the edge, half a roof [m].
+        max_slope_m: most that the range is carried on by the slope of the last two returns [m].
+        max_roof_m: most that it is carried on along a roof, from a return anywhere on it to where a camera a
+            little lower loses sight of it [m].
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
 
@@ -59,6 +65,7 @@ class BoundaryConfig:
     bottom_edges: bool = True
     ground_margin_m: float = 0.3
     max_slope_m: float = 1.0
+    max_roof_m: float = 0.6
     cell_m: float = 0.3
 
 
@@ -230,7 +237,8 @@ def _ring_edges(
     before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
     push = _carried_on(beams, i, before, known & mask[before], config)
     if roofs:
-        push = np.maximum(push, _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope, config))
+        along = _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope, config)
+        push = np.maximum(push, np.where(_amid(mask, beams, i), along, 0.0))
     edge = _along_rays(points, beams, i, push)
     half = 0.5 * (gap + push * (slope_there - slope))
     lPs, outward = edge.copy(), edge.copy()
@@ -252,7 +260,19 @@ def _along_roof(
         middle, slope: (n,) slopes of that ray and of the last return's.
     """
     down = np.where(middle < 0.0, half / np.maximum(-middle, 1e-9), np.inf)
-    return np.where(slope < 0.0, np.minimum(down, config.max_slope_m), 0.0)
+    return np.where(slope < 0.0, np.minimum(down, config.max_roof_m), 0.0)
+
+
+def _amid(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:
+    """(n,) whether the class goes on in the ring to both sides of a point: where it does not, the edge above
+    may well be that of a slanting pillar, not of a roof."""
+    place = np.searchsorted(beams.keys, Beams.key(beams.ring[index], beams.azimuth[index]))
+    amid = np.ones(len(index), np.bool_)
+    for steps in (-_AMID, _AMID):
+        beside = beams.order[np.clip(place + steps, 0, len(beams.order) - 1)]
+        gap = np.abs(beams.azimuth[beside] - beams.azimuth[index])
+        amid &= mask[beside] & (beams.ring[beside] == beams.ring[index]) & (gap < (_AMID + 1) * beams.step)
+    return amid
 
 
 def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:

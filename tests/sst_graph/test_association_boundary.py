@@ -121,12 +121,12 @@ def test_the_range_is_carried_on() -> None:
 
 
 def roof(phase_deg: float, label: SemanticClass) -> Scan:
-    """A box 0.3 m below the LiDAR from 8 to 10 m away, with a flat roof, before a wall."""
+    """A box 0.3 m below the LiDAR from 8 to 9.2 m away, with a flat roof, before a wall."""
     azimuth, elevation = (a.ravel() for a in np.meshgrid(AZIMUTHS, ELEVATIONS + np.radians(phase_deg)))
     ring = np.repeat(np.arange(len(ELEVATIONS)), len(AZIMUTHS))
     height = np.tan(elevation)
     on_roof = np.where(height < 0.0, -0.3 / np.minimum(height, -1e-6), np.inf)
-    rho = np.where(on_roof <= 8.0, 8.0, np.where(on_roof < 10.0, on_roof, 40.0))
+    rho = np.where(on_roof <= 8.0, 8.0, np.where(on_roof < 9.2, on_roof, 40.0))
     points = np.stack([rho * np.cos(azimuth), rho * np.sin(azimuth), rho * height], axis=1)
     classes = np.where(rho < 11.0, label, OTHER).astype(np.uint8)
     return Scan(0, points.astype(np.float32), classes, rings=ring.astype(np.uint16))
@@ -134,7 +134,7 @@ def roof(phase_deg: float, label: SemanticClass) -> Scan:
 
 def test_a_roof_seen_from_above_ends_behind_its_last_return() -> None:
     """A camera 8 cm lower sees the far end; in the mean over where the rings fall, so does the edge."""
-    truth, errors = (-0.3 + 0.08) / 10.0, dict[SemanticClass, float]()
+    truth, errors = (-0.3 + 0.08) / 9.2, dict[SemanticClass, float]()
     for label in (VEHICLE, SemanticClass.BUILDING):
         slopes = []
         for phase in np.arange(0.0, RING_DEG, 0.02):
