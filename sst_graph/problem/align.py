@@ -101,19 +101,10 @@ def align_frame(
         DataError: ``lTs`` without ``from_ns`` or the other way round, or with velocities; twists or
             velocities of a wrong shape.
     """
-    if (lTs is None) != (from_ns is None):
-        raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
-    if lTs is not None and l_velocities:
-        raise DataError(
-            "align_frame", "l_velocities with lTs", "objects that stand in a scan of another time"
-        )
+    _check_time(lTs, from_ns, l_velocities)
     points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
     boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
-    moving = {
-        name: _finite(f"l_velocities[{name[0].name}, {name[1]}]", velocity, 3)
-        for name, velocity in (l_velocities or {}).items()
-    }
     found = match_silhouettes(
         boundaries,
         contours.contours,
@@ -125,9 +116,20 @@ def align_frame(
         biases_px or {},
         kernel,
         config,
-        velocities_of_points(moving, boundaries),
+        velocities_of_points(_velocities(l_velocities or {}), boundaries),
     )
     return _frame_alignments(found)
+
+
+def _check_time(
+    lTs: gtsam.Pose3 | None, from_ns: int | None, l_velocities: Mapping[ObjectName, ArrayLike] | None
+) -> None:
+    if (lTs is None) != (from_ns is None):
+        raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
+    if lTs is not None and l_velocities:
+        raise DataError(
+            "align_frame", "l_velocities with lTs", "objects that stand in a scan of another time"
+        )
 
 
 def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> FrameAlignments:
@@ -142,6 +144,12 @@ def _camera_motion(cTl: gtsam.Pose3, l_twist: ArrayLike, l_acceleration: ArrayLi
     Ad = np.asarray(cTl.AdjointMap())
     acceleration = np.zeros(6) if l_acceleration is None else _finite("l_acceleration", l_acceleration, 6)
     return Motion(Ad @ _finite("l_twist", l_twist, 6), Ad @ acceleration)
+
+
+def _velocities(given: Mapping[ObjectName, ArrayLike]) -> dict[ObjectName, FloatArray]:
+    return {
+        (c, n): _finite(f"l_velocities[{c.name}, {n}]", velocity, 3) for (c, n), velocity in given.items()
+    }
 
 
 def _finite(name: str, value: ArrayLike, count: int) -> FloatArray:

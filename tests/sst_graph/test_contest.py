@@ -109,7 +109,13 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     tracks = Tracks([prepared_street()])
     rough = turned(8.0, -6.0, 9.0) if guess else None
     contest = choose_start([prepared_street()], tracks, [VEHICLE], rough, 0.0, JOINT, START)
-    assert off_deg(contest.finalists[0][0]) < 1.0
+    # It leads where the truth leads, which with the few vehicles of this street is 0.9 deg away.
+    found, best = (
+        solve_joint([prepared_street()], State(cTl), JOINT, tracks=tracks).state.cTl
+        for cTl in (contest.finalists[0][0], truth())
+    )
+    assert off_deg(contest.finalists[0][0]) < 2.0
+    assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.between(found).rotation()))) < 0.15
 
 
 def test_a_contest_that_is_switched_off_takes_the_guess() -> None:
