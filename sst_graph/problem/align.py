@@ -75,22 +75,20 @@ def align_frame(
     """Boundary points of a scan matched to the contours of an image, at the current estimate.
 
     Args:
-        scan, image: as the data have them, or their features (:func:`sst_graph.problem.drive.scan_features`,
-            ``image_features``), which spare the work when the same frame is matched again.
+        scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
         camera: of the image.
         cTl: current extrinsic.
         offset_s: current time offset [s].
-        l_twist: (6,) the LiDAR's twist around the image's instant [rad/s, m/s]:
-            ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds``.
+        l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
         l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
         lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
-            at ``from_ns``, ``wTl_a.between(wTl_s)``. Such a scan must be deskewed to its stamp.
+            at ``from_ns``, ``wTl_a.between(wTl_s)``; the scan deskewed to its stamp, no moving vehicles.
         from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
         classes: to match.
         biases_px: current mask biases by class [px].
-        l_velocities: (3,) velocity over ground of objects that move, in the LiDAR frame of the scan, by class
-            and number within the scan (the data's instance, where all points of the class carry one) [m/s];
-            all others stand. Not with ``lTs``: leave out the vehicles that move there.
+        l_velocities: (3,) over ground of objects that move, in the scan's LiDAR frame, by class and number
+            within the scan (the data's instance, where all points of the class carry one) [m/s]; all others
+            stand. Not with ``lTs``.
         kernel: robust kernel of the matches; its scale, times ``config.gate``, is also the gate [px].
         config: how boundary points meet contours.
 
@@ -98,8 +96,7 @@ def align_frame(
         The matches, possibly none: a frame without any gives no factor.
 
     Raises:
-        DataError: ``lTs`` without ``from_ns`` or the other way round, or with velocities; twists or
-            velocities of a wrong shape.
+        DataError: one of ``lTs`` and ``from_ns``, or both with velocities; arrays of a wrong shape.
     """
     _check_time(lTs, from_ns, l_velocities)
     points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
