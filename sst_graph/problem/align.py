@@ -77,8 +77,7 @@ def align_frame(
     Args:
         scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
         camera: of the image.
-        cTl: current extrinsic.
-        offset_s: current time offset [s].
+        cTl, offset_s: current extrinsic, and time offset [s].
         l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
         l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
         lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
