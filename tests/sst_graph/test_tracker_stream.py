@@ -187,7 +187,7 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     for frame in frames[20:]:
         kept.add(frame)
         resumed.add(frame)
-    # The odometry's map begins anew: 0.03 to 0.23 on seven such streets.
+    # The odometry's map begins anew: 0.06 to 0.23 on seven such streets.
     assert sigmas_apart(kept, resumed.point.cTl, resumed.point.offset_s) < 0.3
 
 
