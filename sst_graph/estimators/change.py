@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 
-from factors import delay_drift, extrinsic_drift
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Point, scaled_inverse
-from sst_graph.problem.graph import motion_factor, silhouettes_factor
-from sst_graph.problem.state import bias_key, object_bias_key, twist_key
+from sst_graph.problem.state import object_bias_key, twist_key
 
 if TYPE_CHECKING:
     from sst_graph.estimators.smoother import WindowSmoother
@@ -172,11 +169,11 @@ class Change:
             epoch = self._epoch_at(new.stamp_ns) if known is None else known.epoch
             if known is not None:
                 self._remove.append(self.ids[scan])
-            (E, D), key = smoother.keys(epoch)[:2], twist_key(0, new.image)
-            self._add(silhouettes_factor(pair, E, D, key, partial(bias_key, 0)), "pair", scan)
+            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other, new.left_out)
+            self._add(smoother.pair_factor(self.entries[scan]), "pair", scan)
+            key = twist_key(0, new.image)
             if not (self.isam.valueExists(key) or self._values.exists(key)):
                 self._values.insert(key, pair.motion.c_twist)
-            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other, new.left_out)
 
     def _tie_twists(self) -> None:
         """Odometry's word on each image's twist, by the first scan that meets the image, as in the batch."""
@@ -189,11 +186,7 @@ class Change:
         smoother = self._smoother
         for image, scan in firsts.items():
             if image not in self.twists:
-                entry = self.entries[scan]
-                (E, D), key = smoother.keys(entry.epoch)[:2], twist_key(0, image)
-                at = entry.score.belief.point
-                tie = motion_factor(entry.pair, E, D, key, at.cTl, at.offset_s, smoother.graph)
-                self._add(tie, "twist", image)
+                self._add(smoother.twist_factor(self.entries[scan]), "twist", image)
                 self._tied[image] = scan
 
     def _epoch_at(self, stamp_ns: int) -> int:
@@ -205,15 +198,15 @@ class Change:
                 if stamp_ns >= epoch.start_ns:
                     return epoch.number
             return self.epochs[0].number
-        number, drift = last.number + 1, smoother.drift
-        a, b = smoother.keys(last.number), smoother.keys(number)
-        rate = float(np.radians(drift.rotation_deg))
-        self._add(extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m), "link", number)
-        self._add(delay_drift(a[1], b[1], seconds, drift.offset_s), "link", -number)
-        self._values.insert(b[0], smoother.point.cTl)
-        self._values.insert(b[1], np.array([smoother.point.offset_s]))
-        self.epochs = (*self.epochs, Epoch(number, stamp_ns))
-        return number
+        new = Epoch(last.number + 1, stamp_ns)
+        turn, shift = smoother.drift_factors(last, new)
+        self._add(turn, "link", new.number)
+        self._add(shift, "link", -new.number)
+        E, D = smoother.keys(new.number)[:2]
+        self._values.insert(E, smoother.point.cTl)
+        self._values.insert(D, np.array([smoother.point.offset_s]))
+        self.epochs = (*self.epochs, new)
+        return new.number
 
     def _close_epochs(self) -> None:
         """Epochs that no pair of the window sees any more go into the past."""

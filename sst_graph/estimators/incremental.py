@@ -148,13 +148,14 @@ class Tracker:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
         return [] if self.smoother is None else self.history_store.smoothed(self.smoother)
 
-    def resume(self, smoother: WindowSmoother, scans: set[int], point: Point) -> None:
-        """Go on with a smoother that an earlier run left behind, some of the window's scans in it."""
-        found, _ = self.matcher.match(point, None, share=self._share)
-        smoother.update({k: v for k, v in found.items() if k in scans}, set(), 0, self.window.objects.live)
-        smoother.rest_at(point)
-        self._take_covariance(smoother)
-        self.smoother = smoother
+    def consolidate(self) -> None:
+        """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
+
+        The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
+        """
+        self.odometry.rebuild_map()
+        if self.smoother is not None:
+            self.smoother.relinearize()
 
     def _take_scan(self, scan: Scan) -> int:
         """Features and motion of a scan into the window; its number."""

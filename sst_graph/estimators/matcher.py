@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -38,6 +39,10 @@ class WindowMatcher:
         self._twists: tuple[int, Tracks] | None = None
         self._smoother = MotionSmoother(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it knows, without what it has at hand for the present frame."""
+        return {**vars(self), "_twists": None, "_last": None}
 
     def look_below(self, point: Point) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree about them."""

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from factors import delay_drift, extrinsic_drift
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
@@ -16,8 +20,8 @@ from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
-from sst_graph.problem.graph import GraphConfig
-from sst_graph.problem.state import bias_key, delay_key, object_bias_key, underside_track
+from sst_graph.problem.graph import GraphConfig, motion_factor, silhouettes_factor
+from sst_graph.problem.state import bias_key, delay_key, object_bias_key, twist_key, underside_track
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
 from sst_graph.uncertainty.object_spread import composed
@@ -50,31 +54,28 @@ class WindowSmoother:
 
     def __init__(
         self,
-        past: Gaussian,
+        prior: Gaussian,
         start_ns: int,
         classes: Sequence[SemanticClass],
         graph: GraphConfig,
         drift: DriftConfig,
-        sums: ScoreSums | None = None,
-        model: ErrorModel | None = None,
-        prior: Gaussian | None = None,
-        bent: Gaussian | None = None,
     ) -> None:
-        """past: prior, or what an earlier run left behind (with sums, error model, prior, bent past)."""
+        """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.past, self.bent = past, bent or past
-        self.undecided = Undecided.none(past.point.size)
-        self.prior = prior or past
-        self.sums = sums or ScoreSums.empty(past.point.size)
+        self.prior = self.past = self.bent = prior
+        self.undecided = Undecided.none(prior.point.size)
+        self.sums = ScoreSums.empty(prior.point.size)
         self.entries: dict[int, Entry] = {}
-        self.model = model or ErrorModel(0.0, 0.0, 1.0)
+        self.model = ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
         self._epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
         self.ids: dict[int, int] = {}
         self.twists: dict[int, TwistFactor] = {}
-        self.isam, self.past_id = self._begun()
-        self._point = self.bent.mean()
-        self.epoch_sums = EpochSums.empty(past.point)
+        values = gtsam.Values()
+        insert_point(values, self.keys(0, prior.point.tracks), prior.mean())
+        self.isam, (self.past_id,) = self._linearized(values)
+        self._point = prior.mean()
+        self.epoch_sums = EpochSums.empty(prior.point)
 
     @property
     def point(self) -> Point:
@@ -97,14 +98,6 @@ class WindowSmoother:
         biases += [object_bias_key(0, underside_track(c)) for c in self.classes]
         objects = [object_bias_key(0, track) for track in tracks]
         return [int(gtsam.symbol("E", epoch)), delay_key(epoch), *biases, *objects]
-
-    def _begun(self) -> tuple[gtsam.ISAM2, int]:
-        isam, graph, values = gtsam.ISAM2(_parameters()), gtsam.NonlinearFactorGraph(), gtsam.Values()
-        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
-        graph.add(self.bent.factor(keys))
-        insert_point(values, keys, self.bent.mean())
-        result = isam.update(graph, values)
-        return isam, int(result.getNewFactorsIndices()[0])
 
     def update(
         self,
@@ -143,15 +136,25 @@ class WindowSmoother:
             self.model = self.sums.error_model([entry.score for entry in self.entries.values()])
 
     def rest_at(self, point: Point) -> None:
-        """Answer this estimate until the next update (that of a checkpoint).
-
-        Matches made anew may see objects that it does not know: their biases stay.
-        """
-        own = zip(self._point.tracks, self._point.object_biases_px.tolist(), strict=True)
-        for track, bias in own:
-            if track not in point.tracks:
-                point = point.with_object(track, bias)
+        """Answer this estimate until the next update."""
         self._point = point
+
+    def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
+        """What the matches of a pair say."""
+        (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
+        return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0))
+
+    def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
+        """What odometry says of the twist of a pair's image."""
+        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.belief.point
+        return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s, self.graph)
+
+    def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
+        """The random walk of extrinsic and offset from one epoch to the next."""
+        a, b, drift = self.keys(old.number), self.keys(new.number), self.drift
+        seconds, rate = (new.start_ns - old.start_ns) * 1e-9, float(np.radians(drift.rotation_deg))
+        turn = extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m)
+        return turn, delay_drift(a[1], b[1], seconds, drift.offset_s)
 
     def polish(self, iterations: int = 10) -> None:
         """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
@@ -159,33 +162,70 @@ class WindowSmoother:
         Raises:
             EstimationError: it fails; nothing has changed.
         """
-        graph, factors = gtsam.NonlinearFactorGraph(), self.isam.getFactorsUnsafe()
-        order = [self.past_id]
-        order += [index for epoch in self._epochs for index in epoch.links or ()]
-        order += [*self.ids.values(), *(twist.index for twist in self.twists.values())]
-        for index in order:
-            graph.add(factors.at(index))
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(iterations)
         params.setlambdaInitial(1e-6)
         params.setRelativeErrorTol(1e-9)
         try:
-            values = gtsam.LevenbergMarquardtOptimizer(
-                graph, self.isam.calculateEstimate(), params
-            ).optimize()
-            isam = gtsam.ISAM2(_parameters())
-            new = dict(zip(order, isam.update(graph, values).getNewFactorsIndices(), strict=True))
+            optimizer = gtsam.LevenbergMarquardtOptimizer(
+                self._whole(), self.isam.calculateEstimate(), params
+            )
+            isam, indices = self._linearized(optimizer.optimize())
             tracks = self.past.point.tracks
             point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks)
         except (RuntimeError, ValueError) as error:
             raise EstimationError(f"the window's optimisation failed: {error}") from error
-        self.isam, self.past_id, self._point = isam, new[self.past_id], point
-        self.ids = {scan: new[index] for scan, index in self.ids.items()}
-        self.twists = {image: replace(twist, index=new[twist.index]) for image, twist in self.twists.items()}
-        self._epochs = tuple(
-            replace(epoch, links=None if epoch.links is None else (new[epoch.links[0]], new[epoch.links[1]]))
-            for epoch in self._epochs
-        )
+        self._go_on_with(isam, indices)
+        self._point = point
+
+    def relinearize(self) -> None:
+        """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
+        self._go_on_with(*self._linearized(self.isam.calculateEstimate()))
+
+    def _whole(self) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the window: the past, the walks, the pairs, the twists."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(self.bent.factor(self.keys(self._epochs[0].number, self.past.point.tracks)))
+        for old, new in pairwise(self._epochs):
+            for factor in self.drift_factors(old, new):
+                graph.add(factor)
+        for scan in self.ids:
+            graph.add(self.pair_factor(self.entries[scan]))
+        for twist in self.twists.values():
+            graph.add(self.twist_factor(self.entries[twist.scan]))
+        return graph
+
+    def _linearized(self, values: gtsam.Values) -> tuple[gtsam.ISAM2, list[int]]:
+        """A fresh iSAM2 of all factors at some values, and the factors' indices."""
+        isam = gtsam.ISAM2(_parameters())
+        return isam, list(isam.update(self._whole(), values).getNewFactorsIndices())
+
+    def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
+        """Go on with an iSAM2 of :meth:`_whole`."""
+        new = iter(indices)
+        self.isam, self.past_id = isam, next(new)
+        first, *others = self._epochs
+        linked = (replace(epoch, links=(next(new), next(new))) for epoch in others)
+        self._epochs = (replace(first, links=None), *linked)
+        self.ids = {scan: next(new) for scan in self.ids}
+        self.twists = {image: replace(twist, index=next(new)) for image, twist in self.twists.items()}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but iSAM2; of that, where it is linearized."""
+        values = self.isam.getLinearizationPoint()
+        poses = {key for key in values.keys() if gtsam.symbolChr(key) == ord("E")}  # noqa: SIM118
+        known = [
+            (key, values.atPose3(key) if key in poses else values.atVector(key))
+            for key in values.keys()  # noqa: SIM118
+        ]
+        return {**vars(self), "isam": known}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state)
+        values = gtsam.Values()
+        for key, value in state["isam"]:
+            values.insert(key, value)
+        self._go_on_with(*self._linearized(values))
 
     def walk(self, seconds: float) -> FloatArray:
         """(m,) variances of the random walk of [extrinsic, offset, biases] over some seconds."""

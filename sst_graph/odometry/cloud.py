@@ -73,6 +73,11 @@ def registration_cloud(
         return cloud
     kept = ~parallel
     kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
-    balanced = small_gicp.PointCloud(np.asarray(cloud.points())[kept])
-    small_gicp.estimate_normals_covariances(balanced, num_neighbors=neighbours, num_threads=1)
-    return balanced
+    return surfaces(np.asarray(cloud.points())[kept], neighbours)
+
+
+def surfaces(points: FloatArray, neighbours: int) -> small_gicp.PointCloud:
+    """Points (n, 3) or homogeneous (n, 4) [m] with the covariance of the surface around each."""
+    cloud = small_gicp.PointCloud(points)
+    small_gicp.estimate_normals_covariances(cloud, num_neighbors=neighbours, num_threads=1)
+    return cloud

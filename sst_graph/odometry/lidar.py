@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -11,7 +13,7 @@ import small_gicp
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, usable_points
+from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
 from sst_graph.odometry.movers import MoverConfig, StandingObjects
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
@@ -92,6 +94,7 @@ class LidarOdometry:
     def __init__(self, config: LidarOdometryConfig | None = None) -> None:
         self.config = config or LidarOdometryConfig()
         self._map: small_gicp.GaussianVoxelMap | None = None
+        self._mapped: deque[tuple[small_gicp.PointCloud, FloatArray]] = deque(maxlen=self.config.map_age)
         self._objects = StandingObjects(self.config.movers)
         self._last: Scan | None = None
         self._wTl = np.eye(4)
@@ -219,7 +222,7 @@ class LidarOdometry:
         else:
             step = np.linalg.inv(self._wTl) @ registration.wTl
             self._wTl, self._twist = registration.wTl, registration.twist
-            self._map.insert(registration.cloud, self._wTl)
+            self._insert(registration.cloud)
             self._remember(scan, registration.cloud.size())
             bHa = gtsam.Pose3(step).inverse().AdjointMap()
             floor = np.repeat([config.floor_rad, config.floor_m], 3) ** 2
@@ -242,11 +245,36 @@ class LidarOdometry:
         config = self.config
         points = self._parts(scan)[0].at_stamp(self._twist)
         self._map = None
+        self._mapped.clear()
         if len(points) >= config.min_points:
-            self._map = small_gicp.GaussianVoxelMap(config.map_voxel_m)
-            self._map.set_lru(config.map_age, max(1, config.map_age // 2))
-            cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
-            self._map.insert(cloud, self._wTl)
+            self._map = _empty_map(config)
+            self._insert(registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio))
+
+    def _insert(self, cloud: small_gicp.PointCloud) -> None:
+        """Put a cloud into the map at the current pose."""
+        assert self._map is not None
+        self._map.insert(cloud, self._wTl)
+        self._mapped.append((cloud, self._wTl.copy()))
+
+    def rebuild_map(self) -> None:
+        """Make the map anew of the latest scans alone, as one that was stored makes it."""
+        if self._map is not None:
+            self._map = _empty_map(self.config)
+            for cloud, wTl in self._mapped:
+                self._map.insert(cloud, wTl)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but the map; of the scans in it, points and poses."""
+        state = vars(self) | {"_map": self._map is not None, "_parted": None}
+        points = [(np.asarray(cloud.points())[:, :3], wTl) for cloud, wTl in self._mapped]
+        return state | {"_mapped": points}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state)
+        clouds = [(surfaces(points, self.config.neighbours), wTl) for points, wTl in state["_mapped"]]
+        self._mapped = deque(clouds, maxlen=self.config.map_age)
+        self._map = _empty_map(self.config) if state["_map"] else None
+        self.rebuild_map()
 
     def _parts(self, scan: Scan) -> tuple[_Sweep, _Sweep]:
         """What is still and what may move; the latter counts as still where too little else is left."""
@@ -317,6 +345,12 @@ def _registration_covariance(
     variance = 2.0 * result.error / max(result.num_inliers - 6, 1)
     hessian = np.asarray(result.H) + 1e-6 * np.eye(6)
     return np.asarray(config.inflation**2 * variance * np.linalg.inv(hessian))
+
+
+def _empty_map(config: LidarOdometryConfig) -> small_gicp.GaussianVoxelMap:
+    found = small_gicp.GaussianVoxelMap(config.map_voxel_m)
+    found.set_lru(config.map_age, max(1, config.map_age // 2))
+    return found
 
 
 def _shifts(far: float, step: float) -> list[FloatArray]:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,6 +79,15 @@ class ImageFeatures:
     stamp_ns: int
     mask: NDArray[np.uint8]
     contours: dict[SemanticClass, ContourMap]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The mask, not the distances that follow from it."""
+        return {**vars(self), "contours": tuple(self.contours)}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        contours = _contours(state["mask"], state["contours"])
+        for name, value in {**state, "contours": contours}.items():
+            object.__setattr__(self, name, value)
 
 
 @dataclass(frozen=True)
@@ -227,6 +237,9 @@ def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
 
 def image_features(index: int, image: CameraImage, classes: Sequence[SemanticClass]) -> ImageFeatures:
     """Mask and contours of an image."""
-    fields = {c: ContourMap.of(image.mask, c) for c in classes}
-    contours = {c: field for c, field in fields.items() if field is not None}
-    return ImageFeatures(index, image.stamp_ns, image.mask, contours)
+    return ImageFeatures(index, image.stamp_ns, image.mask, _contours(image.mask, classes))
+
+
+def _contours(mask: NDArray[np.uint8], classes: Sequence[SemanticClass]) -> dict[SemanticClass, ContourMap]:
+    fields = {c: ContourMap.of(mask, c) for c in classes}
+    return {c: field for c, field in fields.items() if field is not None}
