@@ -25,6 +25,8 @@ FloatArray = NDArray[np.float64]
 
 FEIGNED_MARGIN = 2.0
 """What noise feigns counts so many times: its own size is known from the same few motions."""
+TAKEN_BACK = 0.5
+"""Largest part of the variance that scores which cancel one another take back: few may do so by chance."""
 LEAST_GENUINE = 1e-3
 """Of the information in any direction at least this part is taken for genuine, to keep it positive."""
 
@@ -76,8 +78,16 @@ def hand_eye_covariance(
             shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
     residuals = sum(5 if term.has_direction else 3 for term in terms)
     surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags, residuals)
-    covariance = bread + bread @ (surplus + shared @ shared.T) @ bread
+    covariance = _filled(bread, surplus) + bread @ shared @ shared.T @ bread
     return _capped(covariance, priors)
+
+
+def _filled(bread: FloatArray, surplus: FloatArray) -> FloatArray:
+    """(7, 7) bread + bread surplus bread, of which the surplus takes back no more than :data:`TAKEN_BACK`."""
+    root = np.linalg.cholesky(bread)
+    values, vectors = np.linalg.eigh(np.eye(len(bread)) + root.T @ surplus @ root)
+    half = root @ vectors
+    return np.asarray((half * np.maximum(values, 1.0 - TAKEN_BACK)) @ half.T)
 
 
 def _capped(covariance: FloatArray, priors: HandEyePriors) -> FloatArray:
@@ -127,7 +137,9 @@ def _breaks(terms: Sequence[HandEyeTerm]) -> NDArray[np.bool_]:
 def _surplus(
     scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], lags: int, residuals: int
 ) -> FloatArray:
-    """(7, 7) by which the scores' own long-run variance exceeds the model's, where it does.
+    """(7, 7) by which the scores' own long-run variance exceeds the model's, or falls short of it.
+
+    What an image or a scan errs makes the turn before it too large and the next one too small.
 
     Args:
         scores: (n, 7) of the pairs.
@@ -144,9 +156,4 @@ def _surplus(
         total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
     pairs, unknowns = len(scores), len(model)
     total *= pairs / max(pairs - 1, 1) * (residuals - 1) / max(residuals - unknowns, 1)
-    # Along the directions in which the model is the surer of the two.
-    root = np.linalg.cholesky(model + 1e-12 * np.trace(model) * np.eye(len(model)))
-    whitener = np.linalg.inv(root)
-    values, vectors = np.linalg.eigh(whitener @ (total - model) @ whitener.T)
-    half = root @ vectors
-    return np.asarray((half * np.maximum(values, 0.0)) @ half.T)
+    return np.asarray(total - model)

@@ -1,7 +1,7 @@
 """How an answer varies with the objects that happen to be there, and the covariance made of that.
 
 Some objects err as no model of the others says. The answer without each of them is computed (a jackknife over
-objects), and where they are few, or few of them weigh, the covariance grows by the correction of a sandwich
+objects), and where they are few, or few of them weigh, this part grows by the correction of a sandwich
 for few clusters (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI).
 """
 
@@ -52,15 +52,15 @@ def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: floa
         flatness: mean robust weight over mean curvature.
     """
     if spread is not None:
-        own = _MODEL_SHARE * covariance + _OBJECT_SHARE * spread.jackknife
-        covariance = spread.correction * own
+        covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * spread.correction * spread.jackknife
     return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
 
 
-_MODEL_SHARE, _OBJECT_SHARE = 0.30, 0.145
+_MODEL_SHARE, _OBJECT_SHARE = 0.33, 0.145
 """Parts of the covariance under the error model, and of the jackknife over objects, in the answer's: set on
 simulated drives so that the normalised error squared is neither too large on drives with few or moving
-vehicles, where the model alone is too sure, nor too small on the others."""
+vehicles, where the model alone is too sure, nor too small on the others. That the correction for few objects
+belongs to the jackknife alone is the likelihood's choice there, too."""
 _FEWEST = 10.0
 """Largest correction for few objects."""
 _LEFT_OUT = 0.98
