@@ -1,19 +1,19 @@
 """Objects of this package as JSON and bytes, and back: what refers to one thing still does.
 
 Plain values, containers, arrays, poses and instances of the package's own classes can be stored; the latter
-by their attributes, or by ``__getstate__`` and ``__setstate__`` where a class has them. Reading calls no
-constructor and no other code of theirs than these two, whatever the bytes say.
+by their attributes, or by ``__getstate__`` and ``__setstate__`` where a class has them. Reading imports
+nothing, and calls no constructor and no other code of theirs than these two, whatever the bytes say.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+import sys
 import zlib
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from importlib import import_module
 from typing import Any, Literal, TypeVar
 
 import gtsam
@@ -52,7 +52,7 @@ def restored(node: Node, data: bytes | memoryview) -> Any:
     """
     try:
         return _Reader(memoryview(data)).value(node)
-    except (ArithmeticError, AttributeError, ImportError, LookupError, TypeError, zlib.error) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, zlib.error) as error:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
@@ -209,11 +209,11 @@ def _name(cls: type) -> str:
 
 
 def _class(name: str) -> type:
-    """The class of a name, if it is one of the package's."""
+    """The class of a name, if it is one of the package's, in a module that is there already."""
     module, _, path = name.partition(":")
-    if not name.startswith(_PACKAGES):
+    if not name.startswith(_PACKAGES) or module not in sys.modules:
         raise ValueError(f"a class {name}")
-    found: Any = import_module(module)
+    found: Any = sys.modules[module]
     for part in path.split("."):
         found = getattr(found, part)
     if not isinstance(found, type) or _name(found) != name:

@@ -110,6 +110,7 @@ def test_strangers_are_not_stored(value: object) -> None:
         ["object", "sst_graph.files:atomic_write_bytes", ["dict", [], 1], 0],
         ["object", "sst_graph.files:Path", ["dict", [], 1], 0],
         ["object", "sst_graph.nothing:Nothing", ["dict", [], 1], 0],
+        ["object", "sst_graph.cli.__main__:main", ["dict", [], 1], 0],
         ["object", "factors.robust:RobustKernel", ["dict", [["scale", 1.0]], 1], 0],
         ["enum", "sst_graph.types:SemanticClass", 999],
         ["array", "<f8", [3], "C", False, [0, 24], 0],
