@@ -3,6 +3,7 @@
 Some objects err as no model of the others says. The answer without each of them is computed (a jackknife over
 objects), and where they are few, or few of them weigh, this part grows by the correction of a sandwich
 for few clusters (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI).
+Where objects disagree by more than the error model allows, its part grows by as much.
 """
 
 from __future__ import annotations
@@ -42,6 +43,15 @@ class ObjectSpread:
         """G / (G - 1), the usual correction of a covariance by G clusters; with one, nothing tells it."""
         return min(self.number / max(self.number - 1.0, 1e-9), _FEWEST)
 
+    def disagreement(self, covariance: FloatArray) -> float:
+        """How much more the extrinsic's variances are over the objects than in a covariance, if they are.
+
+        Birge's ratio (Physical Review 40, 1932): it is never below 1, for objects may agree by chance.
+        """
+        ratios = np.diag(self.jackknife)[:6] / np.diag(covariance)[:6]
+        mean = float(np.exp(np.log(np.maximum(ratios, 1e-12)).mean()))
+        return min(max(mean, 1.0), _FARTHEST_APART)
+
 
 def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: float) -> FloatArray:
     """(n, n) covariance of an answer.
@@ -52,7 +62,10 @@ def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: floa
         flatness: mean robust weight over mean curvature.
     """
     if spread is not None:
-        covariance = _MODEL_SHARE * covariance + _OBJECT_SHARE * spread.correction * spread.jackknife
+        # With less than two objects of like weight no jackknife tells how they vary.
+        alone = spread.correction / ObjectSpread(spread.jackknife, 2.0).correction
+        model = _MODEL_SHARE * max(spread.disagreement(covariance), alone) * covariance
+        covariance = model + _OBJECT_SHARE * spread.correction * spread.jackknife
     return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
 
 
@@ -63,6 +76,8 @@ vehicles, where the model alone is too sure, nor too small on the others. That t
 belongs to the jackknife alone is the likelihood's choice there, too."""
 _FEWEST = 10.0
 """Largest correction for few objects."""
+_FARTHEST_APART = 10.0
+"""Largest disagreement among objects that is believed."""
 _LEFT_OUT = 0.98
 """Largest part of what is known of a direction that is left out. Matches whose twists are given may seem to
 tell a direction better than all matches together do, whose twists are not."""

@@ -9,7 +9,7 @@ import pytest
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.object_sums import ObjectBeliefs, ObjectSums
 from sst_graph.estimators.settling import Milestones
-from sst_graph.uncertainty.object_spread import ObjectSpread
+from sst_graph.uncertainty.object_spread import ObjectSpread, composed
 
 TRACKS = (4, 7, 9)
 N = 8 + len(TRACKS)
@@ -108,6 +108,24 @@ def test_one_object_cannot_be_left_out() -> None:
     assert not spread.jackknife.any() and spread.number == 1.0
     several = ObjectSpread(spread.jackknife, 5.0)
     assert spread.correction > several.correction == pytest.approx(1.25)
+
+
+def test_objects_that_disagree_beyond_the_model_make_it_grow() -> None:
+    """Birge's ratio over the extrinsic: never below 1; the jackknife's own part comes on top."""
+    model, shape = np.diag(np.arange(1.0, 9.0)), np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 0.0, 0.0])
+    found = [
+        composed(model, ObjectSpread(ratio * shape, 5.0), 1.0)[7, 7] / model[7, 7]
+        for ratio in (0.1, 1.0, 3.0)
+    ]
+    assert found[0] == pytest.approx(found[1]) and found[2] == pytest.approx(3.0 * found[1])
+    of_six = [composed(model, ObjectSpread(r * shape, 5.0), 1.0)[0, 0] for r in (0.0, 1.0)]
+    assert of_six[1] > of_six[0] == pytest.approx(found[0])
+
+
+def test_an_object_alone_is_not_believed_as_several_are() -> None:
+    nothing = np.zeros((8, 8))
+    alone, two, many = (composed(np.eye(8), ObjectSpread(nothing, n), 1.0)[0, 0] for n in (1.0, 2.0, 9.0))
+    assert alone == pytest.approx(5.0 * two) and two == pytest.approx(many)
 
 
 def test_the_number_of_objects_counts_those_gone() -> None:
