@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -20,6 +21,9 @@ from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
+
+_OTHER_BASIN_RAD = float(np.radians(2.0))
+"""Poses that are turned by more are of different basins."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +48,19 @@ class _Solved:
     cost: float
     point: Point
 
+    def turned_from(self, other: _Solved) -> bool:
+        """Whether the two are poses of different basins."""
+        turn = gtsam.Rot3.Logmap(self.point.cTl.between(other.point.cTl).rotation())
+        return float(np.linalg.norm(turn)) > _OTHER_BASIN_RAD
+
+
+class _Unsettled(EstimationError):
+    """A solution that still moved when its iterations ended, as far as it came."""
+
+    def __init__(self, message: str, reached: _Solved) -> None:
+        super().__init__(message)
+        self.reached = reached
+
 
 def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     """The batch solution of the window.
@@ -53,23 +70,40 @@ def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     explain them better by ``start_gain``, and within a solution a step of the offset is damped.
 
     Raises:
-        EstimationError: too little to see, an ambiguous start, or a solution that did not settle.
+        EstimationError: too little to see, an ambiguous start, or a solution that did not settle, or did
+            while one that did not explains the labels better.
     """
     reach = config.calibration.start.search.delay_s
     free = guess.search and reach > 0.0
-    solved, reasons = [], []
+    solved, unsettled, reasons = [], [], []
     for delay_s in (0.0, reach) if free else (0.0,):
         try:
             solved.append(_best(drive, guess, config, delay_s))
         except EstimationError as error:
             reasons.append(str(error))
+            if isinstance(error, _Unsettled):
+                unsettled.append(error.reached)
     if not solved:
         raise EstimationError(reasons[-1])
     best, *others = solved
     for other in others:
         if other.cost < (1.0 - config.start_gain) * best.cost:
             best = other
+    _refuse_beside(best, unsettled, config)
     return best.point
+
+
+def _refuse_beside(best: _Solved, unsettled: Sequence[_Solved], config: TrackerConfig) -> None:
+    """Refuse a solution if one of another basin is clearly better, though it has not come to rest.
+
+    At a steady speed the time offset may slide along with the translation for ever.
+    """
+    for other in unsettled:
+        if best.turned_from(other) and other.cost < (1.0 - config.start_gain) * best.cost:
+            raise EstimationError(
+                f"another pose explains the labels better (cost {other.cost:.3f} against {best.cost:.3f} a "
+                "point), but has not settled"
+            )
 
 
 def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> _Solved:
@@ -78,18 +112,22 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    solved, reasons = [], []
+    solved, unsettled, reasons = [], [], []
     for start in _starts(drive, guess, config, delay_s):
         try:
             solved.append(_solution(drive, start, config))
         except EstimationError as error:
             reasons.append(str(error))
+            if isinstance(error, _Unsettled):
+                unsettled.append(error.reached)
     if not solved:
+        if unsettled:
+            raise _Unsettled(reasons[0], min(unsettled, key=lambda reached: reached.cost))
         raise EstimationError(reasons[0])
     best, *others = sorted(solved, key=lambda solution: solution.cost)
+    _refuse_beside(best, unsettled, config)
     for other in others:
-        turn = gtsam.Rot3.Logmap(best.point.cTl.between(other.point.cTl).rotation())
-        if np.linalg.norm(turn) > np.radians(2.0) and best.cost > (1.0 - config.start_gain) * other.cost:
+        if best.turned_from(other) and best.cost > (1.0 - config.start_gain) * other.cost:
             raise EstimationError(
                 f"two poses explain the labels alike (cost {best.cost:.3f} and {other.cost:.3f} a point)"
             )
@@ -124,15 +162,16 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> _Solved:
     """The joint method from a start, its offset damped."""
     calibration = config.calibration
     solution = solve_joint([drive], start, _damped(config))
+    state = solution.state
+    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
+    point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
     if not solution.converged:
-        raise EstimationError(f"the first solution still moved after {solution.outer_iterations} iterations")
+        message = f"the first solution still moved after {solution.outer_iterations} iterations"
+        raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
     if explained(solution) < calibration.start.min_explained:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
-    state = solution.state
     _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
-    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
     return _Solved(_cost(drive, point, config), point)
 
 
