@@ -27,9 +27,9 @@ class Arrivals:
         self.rows: deque[FloatArray] = deque(maxlen=MOST)
         self._last: FloatArray | None = None
 
-    def restart(self, covariance: FloatArray | None = None) -> None:
-        """A new calibration begins, or goes on from a covariance (7, 7)."""
-        self._last = covariance
+    def restart(self) -> None:
+        """A new calibration begins."""
+        self._last = None
 
     def take(self, scan: int, covariance: FloatArray) -> None:
         """A scan was taken in and left this covariance (7, 7)."""

@@ -73,7 +73,7 @@ class Persistence:
 
     def add(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> set[int]:
         """The next scan, posed at ``wTl``; numbers of the earlier ones that it tells something new about."""
-        here = self.remember(number, scan, wTl)
+        here = self._remember(number, scan, wTl)
         horizons = self.config.horizons_s
         self.shares[number] = {name: np.full(len(horizons), np.nan) for name in here.names}
         others = [self._nearest(number, scan.stamp_ns, seconds) for seconds in horizons]
@@ -84,17 +84,13 @@ class Persistence:
                 self._note(other, horizon, self._places[other].found_in(here))
         return {other for other, speeds in before.items() if self.speeds(other) != speeds}
 
-    def remember(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
+    def _remember(self, number: int, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
         """Keep the places of a scan's objects for the scans that follow."""
         self._places[number] = places = _Places.of(scan, wTl, self.config)
-        since = scan.stamp_ns - self.memory_ns
+        # No scan to come is compared with one that is older.
+        since = scan.stamp_ns - round(1.5e9 * max(self.config.horizons_s))
         self._places = {k: kept for k, kept in self._places.items() if kept.stamp_ns >= since}
         return places
-
-    @property
-    def memory_ns(self) -> int:
-        """Age of the oldest scan that one to come is compared with."""
-        return round(1.5e9 * max(self.config.horizons_s))
 
     def forget(self, before: int) -> None:
         """Drop all scans before one."""

@@ -111,11 +111,6 @@ class Velocities:
         for name, track in self._scans[number].tracks.items():
             self._sightings.setdefault(track, {})[number] = name
 
-    def take_over(self, number: int, track: int, velocity: ObjectVelocity) -> None:
-        """What an earlier run has found of an object; nothing where the scan is not kept."""
-        if number in self._scans:
-            self.found.setdefault(track, {})[number] = velocity
-
     def judge_all(self) -> None:
         """Look again at all scans, with all that has been seen."""
         for number in self._scans:

@@ -115,7 +115,7 @@ def test_an_object_that_moved_lately_is_restless() -> None:
     # One whose velocity is known at its newest sighting may be asked.
     (one,) = [track for (_, number), track in window.tracks[39].items() if number == 1]
     assert one in window.restless()
-    window.velocities.take_over(39, one, ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2))
+    window.velocities.found[one] = {39: ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2)}
     assert one not in window.restless()
 
 
