@@ -28,6 +28,7 @@ _Order = Literal["C", "F"]
 _Kept = TypeVar("_Kept")
 
 _PACKAGES = ("sst_graph.", "factors.")
+_SEQUENCES = (tuple, list, set, frozenset)
 _PLAIN = (bool, int, float, str, type(None))
 _COMPRESSED_BYTES = 65_536
 """Masks of this size or more are compressed."""
@@ -78,11 +79,11 @@ class _Writer:
     def _parts_of(self, value: object) -> list[Node]:
         if isinstance(value, np.ndarray):
             return self._array(value)
-        if isinstance(value, tuple | list | set | frozenset):
+        if isinstance(value, _SEQUENCES) and type(value) in _SEQUENCES:
             return [type(value).__name__, [self.node(one) for one in value]]
         if isinstance(value, deque):
             return ["deque", [self.node(one) for one in value], value.maxlen]
-        if isinstance(value, dict):
+        if type(value) is dict:
             return ["dict", [[self.node(key), self.node(one)] for key, one in value.items()]]
         if isinstance(value, gtsam.Pose3):
             return ["pose", self.node(np.asarray(value.matrix()))]

@@ -213,9 +213,8 @@ class WindowSmoother:
     def __getstate__(self) -> dict[str, Any]:
         """All but iSAM2; of that, where it is linearized."""
         values = self.isam.getLinearizationPoint()
-        poses = {key for key in values.keys() if gtsam.symbolChr(key) == ord("E")}  # noqa: SIM118
         known = [
-            (key, values.atPose3(key) if key in poses else values.atVector(key))
+            (key, values.atPose3(key) if gtsam.symbolChr(key) == ord("E") else values.atVector(key))
             for key in values.keys()  # noqa: SIM118
         ]
         return {**vars(self), "isam": known}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -75,30 +76,40 @@ def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     """
     reach = config.calibration.start.search.delay_s
     free = guess.search and reach > 0.0
-    solved, unsettled, reasons = [], [], []
-    for delay_s in (0.0, reach) if free else (0.0,):
-        try:
-            solved.append(_best(drive, guess, config, delay_s))
-        except EstimationError as error:
-            reasons.append(str(error))
-            if isinstance(error, _Unsettled):
-                unsettled.append(error.reached)
+    delays = (0.0, reach) if free else (0.0,)
+    solved, failed = _tried([partial(_best, drive, guess, config, delay_s) for delay_s in delays])
     if not solved:
-        raise EstimationError(reasons[-1])
+        raise failed[-1]
     best, *others = solved
     for other in others:
         if other.cost < (1.0 - config.start_gain) * best.cost:
             best = other
-    _refuse_beside(best, unsettled, config)
+    _refuse_beside(best, failed, config)
     return best.point
 
 
-def _refuse_beside(best: _Solved, unsettled: Sequence[_Solved], config: TrackerConfig) -> None:
+def _tried(ways: Sequence[Callable[[], _Solved]]) -> tuple[list[_Solved], list[EstimationError]]:
+    """The solutions, and why there are no others."""
+    solved, failed = [], []
+    for way in ways:
+        try:
+            solved.append(way())
+        except EstimationError as error:
+            failed.append(error)
+    return solved, failed
+
+
+def _unsettled(failed: Sequence[EstimationError]) -> list[_Solved]:
+    """What those reached that only did not come to rest."""
+    return [error.reached for error in failed if isinstance(error, _Unsettled)]
+
+
+def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: TrackerConfig) -> None:
     """Refuse a solution if one of another basin is clearly better, though it has not come to rest.
 
     At a steady speed the time offset may slide along with the translation for ever.
     """
-    for other in unsettled:
+    for other in _unsettled(failed):
         if best.turned_from(other) and other.cost < (1.0 - config.start_gain) * best.cost:
             raise EstimationError(
                 f"another pose explains the labels better (cost {other.cost:.3f} against {best.cost:.3f} a "
@@ -112,20 +123,14 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    solved, unsettled, reasons = [], [], []
-    for start in _starts(drive, guess, config, delay_s):
-        try:
-            solved.append(_solution(drive, start, config))
-        except EstimationError as error:
-            reasons.append(str(error))
-            if isinstance(error, _Unsettled):
-                unsettled.append(error.reached)
+    starts = _starts(drive, guess, config, delay_s)
+    solved, failed = _tried([partial(_solution, drive, start, config) for start in starts])
     if not solved:
-        if unsettled:
-            raise _Unsettled(reasons[0], min(unsettled, key=lambda reached: reached.cost))
-        raise EstimationError(reasons[0])
+        if reached := _unsettled(failed):
+            raise _Unsettled(str(failed[0]), min(reached, key=lambda one: one.cost))
+        raise failed[0]
     best, *others = sorted(solved, key=lambda solution: solution.cost)
-    _refuse_beside(best, unsettled, config)
+    _refuse_beside(best, failed, config)
     for other in others:
         if best.turned_from(other) and best.cost > (1.0 - config.start_gain) * other.cost:
             raise EstimationError(

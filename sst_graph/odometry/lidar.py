@@ -258,22 +258,20 @@ class LidarOdometry:
 
     def rebuild_map(self) -> None:
         """Make the map anew of the latest scans alone, as one that was stored makes it."""
-        if self._map is not None:
-            self._map = _empty_map(self.config)
-            for cloud, wTl in self._mapped:
-                self._map.insert(cloud, wTl)
+        made = _empty_map(self.config)
+        for cloud, wTl in self._mapped:
+            made.insert(cloud, wTl)
+        self._map = made if self._mapped else None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the map; of the scans in it, points and poses."""
-        state = vars(self) | {"_map": self._map is not None, "_parted": None}
         points = [(np.asarray(cloud.points())[:, :3], wTl) for cloud, wTl in self._mapped]
-        return state | {"_mapped": points}
+        return {**vars(self), "_map": None, "_parted": None, "_mapped": points}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         vars(self).update(state)
         clouds = [(surfaces(points, self.config.neighbours), wTl) for points, wTl in state["_mapped"]]
         self._mapped = deque(clouds, maxlen=self.config.map_age)
-        self._map = _empty_map(self.config) if state["_map"] else None
         self.rebuild_map()
 
     def _parts(self, scan: Scan) -> tuple[_Sweep, _Sweep]:

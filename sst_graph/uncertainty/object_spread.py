@@ -63,7 +63,7 @@ def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: floa
     """
     if spread is not None:
         # With less than two objects of like weight no jackknife tells how they vary.
-        alone = spread.correction / ObjectSpread(spread.jackknife, 2.0).correction
+        alone = spread.correction / _OF_TWO
         model = _MODEL_SHARE * max(spread.disagreement(covariance), alone) * covariance
         covariance = model + _OBJECT_SHARE * spread.correction * spread.jackknife
     return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
@@ -74,6 +74,8 @@ _MODEL_SHARE, _OBJECT_SHARE = 0.33, 0.145
 simulated drives so that the normalised error squared is neither too large on drives with few or moving
 vehicles, where the model alone is too sure, nor too small on the others. That the correction for few objects
 belongs to the jackknife alone is the likelihood's choice there, too."""
+_OF_TWO = 2.0
+"""The correction for two objects."""
 _FEWEST = 10.0
 """Largest correction for few objects."""
 _FARTHEST_APART = 10.0

@@ -110,11 +110,13 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     rough = turned(8.0, -6.0, 9.0) if guess else None
     contest = choose_start([prepared_street()], tracks, [VEHICLE], rough, 0.0, JOINT, START)
     # It leads where the truth leads, which with the few vehicles of this street is 0.9 deg away.
+    finalist = contest.finalists[0][0]
     found, best = (
         solve_joint([prepared_street()], State(cTl), JOINT, tracks=tracks).state.cTl
-        for cTl in (contest.finalists[0][0], truth())
+        for cTl in (finalist, truth())
     )
-    assert off_deg(contest.finalists[0][0]) < 2.0
+    assert off_deg(best) < 1.0
+    assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.between(finalist).rotation()))) < 0.6
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.between(found).rotation()))) < 0.15
 
 
