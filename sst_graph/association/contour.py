@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -49,8 +50,9 @@ class ContourMap:
             the class that reaches :data:`REACH_PX` beyond it; as at the box's border farther out [px].
         left, top: the box's first column and row in the image.
         width, height: of the image.
-        unknown: (height, width) 1 near ``IGNORE`` pixels, where a contour is not the object's; None where
-            there are none.
+        unknown: 1 near ``IGNORE`` pixels, where a contour is not the object's, and where the picture shows no
+            edge along it; in the same box.
+        edges: what the picture shows along the contour, if it was asked; in ``distance`` already.
     """
 
     distance: FloatMap
@@ -58,11 +60,25 @@ class ContourMap:
     top: int
     width: int
     height: int
-    unknown: FloatMap | None
+    unknown: NDArray[np.uint8]
+    edges: PictureEdges | None = None
 
     @classmethod
-    def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> ContourMap | None:
-        """The field of a class in a mask (h, w); None where the class is absent or fills the image."""
+    def of(
+        cls,
+        mask: NDArray[np.uint8],
+        semantic_class: SemanticClass,
+        picture: Picture | None = None,
+        config: PictureConfig | None = None,
+        edges: PictureEdges | None = None,
+    ) -> ContourMap | None:
+        """The field of a class in a mask (h, w); None where the class is absent or fills the image.
+
+        Args:
+            picture: (h, w, 3) BGR that the contour follows; by default, or where it has another size, none.
+            config: how it does.
+            edges: what was found in the picture before; it is not asked again.
+        """
         # Compared with a plain int, for an enum makes all pixels int64.
         inside = (mask == int(semantic_class)).view(np.uint8)
         if cv2.countNonZero(inside) in (0, inside.size):
@@ -70,13 +86,19 @@ class ContourMap:
         # Only near the class: elsewhere nothing is matched, and the field is what an image costs.
         x, y, width, height = cv2.boundingRect(inside)
         top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
-        box = inside[top : y + height + REACH_PX, left : x + width + REACH_PX]
-        distance = cv2.GaussianBlur(signed_distance(np.ascontiguousarray(box)), (0, 0), _SMOOTHING_PX)
-        ignored = (mask == int(SemanticClass.IGNORE)).view(np.uint8)
-        unknown = None
-        if cv2.countNonZero(ignored):
-            unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.float32)
-        return cls(np.asarray(distance, np.float32), left, top, mask.shape[1], mask.shape[0], unknown)
+        part = slice(top, y + height + REACH_PX), slice(left, x + width + REACH_PX)
+        box = np.ascontiguousarray(inside[part])
+        distance = np.asarray(cv2.GaussianBlur(signed_distance(box), (0, 0), _SMOOTHING_PX), np.float32)
+        ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
+        unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.uint8)
+        config = config or PictureConfig()
+        if edges is None and picture is not None and config.use and picture.shape[:2] == mask.shape:
+            edges = find_picture_edges(box, distance, picture[part], config)
+        if edges is not None:
+            shifts, unseen = edges.fields(box)
+            distance -= cv2.GaussianBlur(shifts, (0, 0), _SMOOTHING_PX)
+            unknown |= unseen
+        return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
@@ -92,9 +114,15 @@ class ContourMap:
         normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
         feet = safe - distances[:, None] * normals
         valid &= length > MIN_GRADIENT
-        if self.unknown is not None:
-            valid &= sample(self.unknown, feet) < 0.1
+        valid &= ~self.is_unknown(feet)
         return ContourFeet(distances, normals, feet, valid)
+
+    def is_unknown(self, feet: FloatArray) -> NDArray[np.bool_]:
+        """Whether nothing is known of the contour at points of it, (n, 2)."""
+        rows, columns = self.unknown.shape
+        column, row = np.rint(feet - [self.left, self.top]).astype(np.intp).T
+        found = self.unknown[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
+        return np.asarray(found > 0, np.bool_)
 
     def well_inside(self, u: FloatArray, v: FloatArray) -> NDArray[np.bool_]:
         """Whether columns and rows are on the image and not close to its border; False for NaN."""
@@ -109,7 +137,7 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
 
     The border runs half way between an inside pixel's centre and its outside neighbour's.
     """
-    distance = np.asarray(cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+    distance = np.asarray(cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
     distance -= 0.5
     # The nearest pixel outside touches the same part of the region: each stretch of columns on its own.
     occupied = np.concatenate([[False], inside.any(axis=0), [False]])
@@ -118,7 +146,7 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
         _, y, _, height = cv2.boundingRect(np.ascontiguousarray(inside[:, start:end]))
         box = (slice(max(0, y - 1), y + height + 1), slice(left, end + 1))
         region = np.ascontiguousarray(inside[box])
-        inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+        inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_5)
         np.subtract(0.5, inner, out=distance[box], where=region.view(np.bool_))
     return distance
 

@@ -326,10 +326,7 @@ def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]
     length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
     valid &= length > MIN_GRADIENT
     normals = gradient / np.maximum(length, MIN_GRADIENT)
-    if contour.unknown is not None:
-        feet = np.rint(uvs - distance * normals).astype(np.intp)
-        feet = np.clip(feet, 0, [[contour.width - 1], [contour.height - 1]])
-        valid &= contour.unknown[feet[1], feet[0]] < 0.5
+    valid &= ~contour.is_unknown((uvs - distance * normals).T)
     return np.where(valid, distance, np.inf), normals
 
 

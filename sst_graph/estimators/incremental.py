@@ -122,7 +122,8 @@ class Tracker:
         """Take in an image; it is used as soon as a scan close to it in true time is there."""
         try:
             check_image(image, self.camera, self.window, self.point.offset_s, self.config.late_s)
-            self.window.add_image(image_features(self.window.next_image, image, self.classes))
+            picture = self.config.calibration.prepare.picture
+            self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
         except (DataError, FactorError, ValueError) as error:
             return self._answer(image.stamp_ns, str(error))
         return self._answer(image.stamp_ns)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from factors.camera import PinholeCamera
 from sst_graph.association.boundary import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.association.contour import ContourMap
+from sst_graph.association.picture_edges import PictureConfig
 from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -33,6 +34,7 @@ class PrepareConfig:
 
     Attributes:
         boundary: boundary points.
+        picture: how the masks' contours follow the picture.
         lidar_odometry: motion between scans.
         visual_odometry: motion between images.
         use_visual_odometry: track image features at all.
@@ -40,6 +42,7 @@ class PrepareConfig:
     """
 
     boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
+    picture: PictureConfig = field(default_factory=PictureConfig)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
     use_visual_odometry: bool = True
@@ -73,7 +76,10 @@ class ScanFeatures:
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What is kept of an image: its mask and the signed distance to each class's contour."""
+    """What is kept of an image: its mask and the signed distance to each class's contour.
+
+    Of the picture no more is kept than what it shows along the contours.
+    """
 
     index: int
     stamp_ns: int
@@ -81,11 +87,12 @@ class ImageFeatures:
     contours: dict[SemanticClass, ContourMap]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The mask, not the distances that follow from it."""
-        return {**vars(self), "contours": tuple(self.contours)}
+        """The mask and the picture's edges, not the distances that follow from them."""
+        return {**vars(self), "contours": {c: contour.edges for c, contour in self.contours.items()}}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        contours = _contours(state["mask"], state["contours"])
+        fields = {c: ContourMap.of(state["mask"], c, edges=edges) for c, edges in state["contours"].items()}
+        contours = {c: field for c, field in fields.items() if field is not None}
         for name, value in {**state, "contours": contours}.items():
             object.__setattr__(self, name, value)
 
@@ -162,7 +169,7 @@ def prepare_drive(
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
                     pairs.append(ImagePair(tracks, direction))
-            images.append(image_features(frame.index, frame.image, classes))
+            images.append(image_features(frame.index, frame.image, classes, config.picture))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
@@ -235,11 +242,10 @@ def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
     return np.concatenate(parts)
 
 
-def image_features(index: int, image: CameraImage, classes: Sequence[SemanticClass]) -> ImageFeatures:
-    """Mask and contours of an image."""
-    return ImageFeatures(index, image.stamp_ns, image.mask, _contours(image.mask, classes))
-
-
-def _contours(mask: NDArray[np.uint8], classes: Sequence[SemanticClass]) -> dict[SemanticClass, ContourMap]:
-    fields = {c: ContourMap.of(mask, c) for c in classes}
-    return {c: field for c, field in fields.items() if field is not None}
+def image_features(
+    index: int, image: CameraImage, classes: Sequence[SemanticClass], config: PictureConfig | None = None
+) -> ImageFeatures:
+    """Mask and contours of an image; the contours follow its picture."""
+    fields = {c: ContourMap.of(image.mask, c, image.pixels, config) for c in classes}
+    contours = {c: field for c, field in fields.items() if field is not None}
+    return ImageFeatures(index, image.stamp_ns, image.mask, contours)
