@@ -1,4 +1,4 @@
-"""LiDAR points and mask contours drawn over the camera image, before and after a calibration."""
+"""LiDAR points and the masks' contours drawn over the camera image, before and after a calibration."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.association.contour import ContourMap
 from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
@@ -21,6 +22,7 @@ Colour = tuple[int, int, int]
 IN_MASK: Colour = (80, 220, 60)
 OUT_OF_MASK: Colour = (60, 60, 255)
 CONTOUR: Colour = (0, 230, 255)
+NOT_ASKED: Colour = (0, 110, 200)
 CLASS_COLOURS: dict[SemanticClass, Colour] = {
     SemanticClass.GROUND: (160, 90, 130),
     SemanticClass.TERRAIN: (110, 150, 110),
@@ -68,8 +70,9 @@ def draw_overlay(
     """The image with the scan's points and the contours of the vehicle mask -> (h + strip, w, 3) BGR.
 
     Vehicle points are green inside the vehicle mask and red outside; the others take the colour of
-    their class. Points are moved to the image's instant by ``c_twist`` (6,) [rad/s, m/s], the camera's
-    twist in its own frame; None leaves them where they were at their own time.
+    their class. Contours follow the picture, as they do in a calibration by default, and are darker where
+    it shows no edge and nothing is matched. Points are moved to the image's instant by ``c_twist`` (6,)
+    [rad/s, m/s], the camera's twist in its own frame; None leaves them where they were at their own time.
 
     Raises:
         DataError: the frame lacks its scan or its image, or the image has another size than the camera.
@@ -78,7 +81,7 @@ def draw_overlay(
     uvs, classes = _projected(scan, image, camera, cTl, offset_s, c_twist)
     zoom = -(-MIN_WIDTH_PX // camera.width)
     picture = _enlarged(_backdrop(image), zoom)
-    _draw_contours(picture, _enlarged(image.mask == SemanticClass.VEHICLE, zoom))
+    _draw_contours(picture, ContourMap.of(image.mask, SemanticClass.VEHICLE, image.pixels), zoom)
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
     _draw_classes(picture, uvs, classes)
@@ -190,9 +193,17 @@ def _draw_points(picture: Picture, uvs: FloatArray, colour: Colour, size_px: int
             picture[np.minimum(rows + down, height - 1), np.minimum(columns + right, width - 1)] = colour
 
 
-def _draw_contours(picture: Picture, mask: NDArray[np.bool_]) -> None:
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-    cv2.drawContours(picture, contours, -1, CONTOUR, 1, cv2.LINE_8)
+def _draw_contours(picture: Picture, contour: ContourMap | None, zoom: int) -> None:
+    """The contour that points are matched to, as it follows the picture; darker where nothing is matched."""
+    if contour is None:
+        return
+    outlines, _ = cv2.findContours(
+        (_enlarged(contour.distance, zoom) < 0.0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE
+    )
+    for columns, rows in (outline[:, 0].T for outline in outlines):
+        unknown = contour.unknown[rows // zoom, columns // zoom] > 0
+        colours = np.where(unknown[:, None], NOT_ASKED, CONTOUR)
+        picture[rows + contour.top * zoom, columns + contour.left * zoom] = colours
 
 
 def _at(mask: NDArray[np.uint8], uvs: FloatArray) -> NDArray[np.uint8]:
@@ -209,7 +220,8 @@ def _strip(width: int, caption: str, inside: int, outside: int) -> Picture:
         (f"{caption}   " if caption else "", (255, 255, 255)),
         (f"vehicle points in the mask: {share}   ", IN_MASK),
         (f"outside: {outside}   ", OUT_OF_MASK),
-        ("mask contour", CONTOUR),
+        ("contour   ", CONTOUR),
+        ("not asked", NOT_ASKED),
     ]
     text = "".join(words for words, _ in parts)
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6

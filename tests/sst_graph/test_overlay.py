@@ -12,7 +12,7 @@ from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 from sst_graph.viz import Placement, before_after, draw_overlay
-from sst_graph.viz.overlay import IN_MASK, MIN_WIDTH_PX, OUT_OF_MASK
+from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_ASKED, OUT_OF_MASK
 
 CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
 WHERE = gtsam.Pose3()
@@ -43,6 +43,18 @@ def test_vehicle_points_are_green_inside_and_red_outside_the_mask() -> None:
     picture = draw_overlay(frame, CAMERA, WHERE, 0.0)
     assert _pixels_of(picture, IN_MASK) == {(400, 100), (401, 100), (400, 101), (401, 101)}
     assert _pixels_of(picture, OUT_OF_MASK) == {(500, 100), (501, 100), (500, 101), (501, 101)}
+
+
+def test_the_contour_follows_the_picture_and_is_dark_where_it_shows_nothing() -> None:
+    """The object is drawn two pixels inside its mask's left side, and has no lower side to be seen."""
+    frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
+    assert frame.image is not None
+    pixels = frame.image.pixels.copy()
+    pixels[80:, 382:421] = 220
+    picture = draw_overlay(replace(frame, image=replace(frame.image, pixels=pixels)), CAMERA, WHERE, 0.0)
+    found, dark = _pixels_of(picture, CONTOUR), _pixels_of(picture, NOT_ASKED)
+    assert {u for u, v in found if v == 100} == {382, 420}
+    assert {u for u, v in dark if v == 120} >= set(range(390, 410)) and not any(v < 110 for _, v in dark)
 
 
 def test_points_behind_or_beside_the_image_are_left_out() -> None:
