@@ -81,14 +81,16 @@ def test_trees_and_images_are_made_anew() -> None:
     assert np.array_equal(
         _again(cKDTree(points)).query(points[:5], 3)[1], cKDTree(points).query(points[:5], 3)[1]
     )
-    mask = np.zeros((60, 80), np.uint8)
+    mask, picture = np.zeros((60, 80), np.uint8), np.full((60, 80, 3), 70, np.uint8)
     mask[20:40, 30:60] = VEHICLE
-    image = image_features(
-        4, CameraImage(7, mask, np.zeros((0, 0, 3), np.uint8)), (VEHICLE, SemanticClass.PERSON)
-    )
-    found = _again(image)
-    assert (found.index, found.stamp_ns, [*found.contours]) == (4, 7, [VEHICLE])
-    assert np.array_equal(found.contours[VEHICLE].distance, image.contours[VEHICLE].distance)
+    picture[19:35, 31:60] = 180
+    for pixels in (np.zeros((0, 0, 3), np.uint8), picture):
+        image = image_features(4, CameraImage(7, mask, pixels), (VEHICLE, SemanticClass.PERSON))
+        found = _again(image)
+        assert (found.index, found.stamp_ns, [*found.contours]) == (4, 7, [VEHICLE])
+        for name in ("distance", "unknown"):
+            assert np.array_equal(*(getattr(part.contours[VEHICLE], name) for part in (found, image)))
+    assert image.contours[VEHICLE].unknown.any() and len(stored(image)[1]) < picture.size
     assert isinstance(_again(LidarOdometry()), LidarOdometry)
 
 
