@@ -63,8 +63,9 @@ class PictureConfig:
     min_share: float = 0.2
 
     def __post_init__(self) -> None:
-        if self.reach_px < 1.0 or self.mask_sigma_px <= 0.0 or self.along_px < 2:
-            raise ValueError("reach_px of 1 or more, mask_sigma_px above 0, along_px of 2 or more expected")
+        for name, least in (("reach_px", 1.0), ("mask_sigma_px", 0.1), ("along_px", 2)):
+            if not getattr(self, name) >= least:
+                raise ValueError(f"{name} {getattr(self, name):g}: expected {least:g} or more")
 
 
 @dataclass(frozen=True)
