@@ -75,8 +75,7 @@ def align_frame(
     """Boundary points of a scan matched to the contours of an image, at the current estimate.
 
     Args:
-        scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work;
-            the mask's contours follow the picture, unless ``image_features`` is told otherwise.
+        scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
         camera: of the image.
         cTl, offset_s: current extrinsic, and time offset [s].
         l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
