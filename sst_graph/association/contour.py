@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
+from sst_graph.association.sampling import sampled
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 
-_REMAP_LIMIT = 30_000
 _SMOOTHING_PX = 1.0
 BORDER_PX = 3.0
 """Nothing is matched this close to the image's border [px]: objects are cut there."""
@@ -153,10 +153,6 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
 
 def sample(field: FloatMap, uvs: FloatArray) -> FloatArray:
     """(n,) bilinear values of a field (h, w) at pixels uvs (n, 2); the border is extended."""
-    values = np.empty(len(uvs))
-    for start in range(0, len(uvs), _REMAP_LIMIT):
-        u, v = uvs[start : start + _REMAP_LIMIT].T.astype(np.float32, order="C")[:, :, None]
-        values[start : start + _REMAP_LIMIT] = cv2.remap(
-            field, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        ).reshape(-1)
-    return values
+    if len(uvs) == 0:
+        return np.zeros(0)
+    return np.asarray(sampled(field, uvs[None])[0], np.float64)

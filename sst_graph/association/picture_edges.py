@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+
+from sst_graph.association.sampling import sampled
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
@@ -35,7 +36,6 @@ _AROUND_PX = 2
 """How far around a contour pixel it is not asked, either."""
 _EVERY = 2
 """One of so many contour pixels is asked: neighbours show the same."""
-_REMAP_LIMIT = 30_000
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def _strength(
     """(m, n) change of colour at m distances outside of n contour pixels' contour, averaged along it, in
     grey levels a pixel (root of the sum of squares over the channels)."""
     beside = pixels[None] + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[:, None]
-    around = _sampled(distance, beside)
+    around = sampled(distance, beside)
     normals = np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-6)[:, None]
     feet = pixels - around[0][:, None] * normals
@@ -158,13 +158,13 @@ def _strength(
     asked = np.concatenate([[ts[0] - _STEP_PX], ts, [ts[-1] + _STEP_PX]])
     places = feet[None] + asked[:, None, None] * normals[None]
     blurred = np.asarray(cv2.GaussianBlur(picture, (3, 3), _BLUR_PX), np.uint8)
-    colours = _sampled(blurred, places).astype(np.float32)
+    colours = sampled(blurred, places).astype(np.float32)
     change = (colours[2:] - colours[:-2]) / np.float32(2.0 * _STEP_PX)
     # First with its sign, which holds along an edge and not in a texture; then its size.
     size = along + 1
     steady = cv2.blur(change, (size, 1), borderType=cv2.BORDER_REPLICATE)
     strength = np.sqrt(np.einsum("ijk,ijk->ij", steady, steady))
-    strength *= np.abs(_sampled(distance, places[1:-1]) - ts[:, None]) < _OWN_PX
+    strength *= np.abs(sampled(distance, places[1:-1]) - ts[:, None]) < _OWN_PX
     size = 2 * along + 1
     return np.asarray(cv2.blur(strength, (size, 1), borderType=cv2.BORDER_REPLICATE), np.float32)
 
@@ -186,17 +186,3 @@ def _best_edges(
     rival = np.where(np.abs(ts[:, None] - shifts) > _RIVAL_PX, likely, 0.0).max(axis=0)
     clear &= rival < config.max_rival * likely[likeliest, column]
     return np.asarray(shifts), np.asarray(clear)
-
-
-def _sampled(
-    field: NDArray[np.float32] | Picture, places: NDArray[np.float64] | NDArray[np.intp]
-) -> NDArray[Any]:
-    """Bilinear values of a field (h, w) or (h, w, k) at places (a, b, 2): (a, b) or (a, b, k)."""
-    u, v = (np.ascontiguousarray(places[..., k], np.float32) for k in (0, 1))
-    parts = []
-    for start in range(0, u.shape[1], _REMAP_LIMIT):
-        some = slice(start, start + _REMAP_LIMIT)
-        parts.append(
-            cv2.remap(field, u[:, some], v[:, some], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        )
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)

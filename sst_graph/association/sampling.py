@@ -1,0 +1,29 @@
+"""Values between the pixels of a field or a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_REMAP_LIMIT = 30_000
+"""OpenCV takes fewer than 32,768 columns."""
+
+
+def sampled(
+    field: NDArray[np.float32] | NDArray[np.uint8], places: NDArray[np.float64] | NDArray[np.intp]
+) -> NDArray[Any]:
+    """Bilinear values of a field (h, w) or (h, w, k) at columns and rows (a, b, 2): (a, b) or (a, b, k).
+
+    The border is extended.
+    """
+    u, v = (np.ascontiguousarray(places[..., k], np.float32) for k in (0, 1))
+    parts = []
+    for start in range(0, u.shape[1], _REMAP_LIMIT):
+        some = slice(start, start + _REMAP_LIMIT)
+        parts.append(
+            cv2.remap(field, u[:, some], v[:, some], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        )
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
