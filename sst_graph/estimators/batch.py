@@ -35,6 +35,7 @@ from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
+from sst_graph.uncertainty.common_error import common_covariance
 from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
@@ -163,11 +164,11 @@ def answer_joint(
         solution = heard.solution
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
-    model = robust.model
+    model, cTl = robust.model, solution.state.cTl
     return Answer(
-        solution.state.cTl,
+        cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7],
+        covariance[:7, :7] + common_covariance(cTl, drives[0].camera, config.common_error),
         _frames_used(drives, solution),
         remarks=_remarks(drives),
         doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),

@@ -14,6 +14,7 @@ from sst_graph.estimators.start import StartConfig
 from sst_graph.estimators.undersides import UndersideConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.common_error import CommonErrorConfig
 from sst_graph.uncertainty.observability import ObservabilityConfig
 
 Method = Literal["joint", "paper", "static", "semalign", "motion"]
@@ -42,6 +43,7 @@ class CalibrationConfig:
         semalign: sampled starts.
         motion: hand-eye calibration.
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
+        common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
         observability: when a direction counts as unobservable.
     """
 
@@ -57,4 +59,5 @@ class CalibrationConfig:
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
+    common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

@@ -33,6 +33,7 @@ from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
+from sst_graph.uncertainty.common_error import common_covariance
 from sst_graph.uncertainty.observability import weak_directions
 
 _LOG = logging.getLogger(__name__)
@@ -147,7 +148,13 @@ class Tracker:
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
-        return [] if self.smoother is None else self.history_store.smoothed(self.smoother)
+        if self.smoother is None:
+            return []
+        entries = self.history_store.smoothed(self.smoother)
+        return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
+
+    def _common(self, cTl: gtsam.Pose3) -> FloatArray:
+        return common_covariance(cTl, self.camera, self.config.calibration.common_error)
 
     def consolidate(self) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
@@ -361,19 +368,20 @@ class Tracker:
         chi2: float | None = None,
         offer: bool = False,
     ) -> TrackUpdate:
-        point, covariance, alarm = self.point, self.covariance[:7, :7], self.config.alarm
+        point, config, alarm = self.point, self.config.calibration, self.config.alarm
+        covariance = self.covariance[:7, :7] + self._common(point.cTl)
         status: TrackStatus = "alarm" if self.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
         since = self.watch.confirmation
         if self.smoother is not None:
-            weak = weak_directions(covariance, point.cTl, self.config.calibration.observability)
+            weak = weak_directions(covariance, point.cTl, config.observability)
             late = since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
         return TrackUpdate(
             stamp_ns=stamp_ns,
             T_camera_lidar=point.cTl,
             time_offset_s=point.offset_s,
-            covariance=covariance.copy(),
+            covariance=covariance,
             status=status,
             accepted=not reason,
             reason=reason,
