@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate
+from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.problem.drive import Progress
 from sst_graph.result import CalibrationResult
 
@@ -28,7 +28,8 @@ class WindowsConfig:
 
     Attributes:
         data: folders of drives that bring a nominal calibration, the guess of every window.
-        windows: numbers of equal windows that each drive is cut into, one row of the table each.
+        windows: numbers of equal windows that each drive is cut into, one row of the table each; and, with
+            several drives, one more for windows of the same number in one graph.
         shift: image shift.
         calibration: settings of the method.
     """
@@ -44,7 +45,7 @@ class WindowsConfig:
 
 
 def run(config: WindowsConfig, progress: Progress | None = None) -> str:
-    """A Markdown table: one row for every drive and number of windows.
+    """A Markdown table: one row for every drive and number of windows, and for all drives in one graph.
 
     Raises:
         ConfigError: no data.
@@ -52,30 +53,50 @@ def run(config: WindowsConfig, progress: Progress | None = None) -> str:
     """
     if not config.data:
         raise ConfigError("data: found none, expected folders, such as --set 'data=[\"DRIVE\"]'")
-    rows = [_HEADER, "|---|---|---|---|---|---|---|"]
-    for path in config.data:
+    rows = [_HEADER, "|---|---|---|---|---|---|---|---|"]
+    together = [config.data] if len(config.data) > 1 else []
+    for paths in [*((path,) for path in config.data), *together]:
         for done, count in enumerate(config.windows):
-            rows.append(_row(path, count, config))
+            rows.append(_row(paths, count, config))
             if progress is not None:
-                progress(path, done + 1, len(config.windows))
+                progress(" + ".join(paths), done + 1, len(config.windows))
     return "\n".join(rows) + "\n"
 
 
 _HEADER = (
     "| drive | windows | rotation [deg]: spread / claimed | translation [cm] | time offset [ms] "
-    "| spread in claimed sigmas: rotation, translation, offset | status |"
+    "| spread in claimed sigmas: rotation, translation, offset "
+    "| error, RMS: QAD [deg], ATD [cm], offset [ms] | status |"
 )
 
 
-def _row(path: str, count: int, config: WindowsConfig) -> str:
-    whole = open_source(path, image_shift=config.shift)
-    edges = np.linspace(0, len(whole), count + 1).round().astype(int)
-    results = []
-    for first, last in itertools.pairwise(edges):
-        window = open_source(path, image_shift=config.shift, frames=f"{first}:{last}")
-        results.append(calibrate(window, window.nominal, config.calibration))
-    cells = [whole.name, str(count), *spread_cells(results), ", ".join(result.status for result in results)]
-    return "| " + " | ".join(cells) + " |"
+def _row(paths: Sequence[str], count: int, config: WindowsConfig) -> str:
+    """Drives cut into ``count`` windows each; those of the same number go into one graph."""
+    wholes = [open_source(path, image_shift=config.shift) for path in paths]
+    edges = [np.linspace(0, len(whole), count + 1).round().astype(int) for whole in wholes]
+    results, errors = [], []
+    for i in range(count):
+        windows = [
+            open_source(path, image_shift=config.shift, frames=f"{edge[i]}:{edge[i + 1]}")
+            for path, edge in zip(paths, edges, strict=True)
+        ]
+        result = calibrate(windows, windows[0].nominal, config.calibration)
+        results.append(result)
+        truth = windows[0].truth
+        if truth is not None and result.status != "not_converged":
+            errors.append(calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, None))
+    names, states = (" + ".join(w.name for w in wholes), ", ".join(result.status for result in results))
+    return "| " + " | ".join([names, str(count), *spread_cells(results), error_cell(errors), states]) + " |"
+
+
+def error_cell(errors: Sequence[CalibrationErrors]) -> str:
+    """Root of the mean square over windows of QAD [deg], ATD [cm] and the offset's error [ms]."""
+    if not errors:
+        return "–"
+    values = [[error.qad_deg, 100.0 * error.atd_m] for error in errors]
+    offsets = [1e3 * error.time_offset_s for error in errors if error.time_offset_s is not None]
+    roots = [*np.sqrt(np.mean(np.square(values), axis=0)), np.sqrt(np.mean(np.square(offsets or [np.nan])))]
+    return ", ".join("–" if np.isnan(root) else f"{root:.2f}" for root in roots)
 
 
 def spread_cells(results: Sequence[CalibrationResult]) -> list[str]:

@@ -14,7 +14,14 @@ from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig
 from sst_graph.estimators.start import StartConfig
 from sst_graph.experiments import windows
-from sst_graph.experiments.windows import WindowsConfig, deviations_of, spread_cells, spread_in_sigmas
+from sst_graph.experiments.windows import (
+    WindowsConfig,
+    deviations_of,
+    error_cell,
+    spread_cells,
+    spread_in_sigmas,
+)
+from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import CalibrationResult
 from tests.sst_graph.streets import standing_street
 
@@ -72,3 +79,28 @@ def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     spread, claimed = (float(part) for part in cells[2].split(" / "))
     assert spread > 0.0 and claimed > 0.0
     assert all(float(ratio) > 0.0 for ratio in cells[5].split(", ")[:2])
+    assert all(0.0 < float(error) < 2.0 for error in cells[6].split(", ")[:1])
+
+
+def test_several_drives_have_rows_of_their_own_and_one_together(tmp_path: Path) -> None:
+    folders = []
+    for motion in ("no_stop", "mixed"):
+        folders.append(str(tmp_path / motion))
+        small = SimulationConfig(
+            seed=4, frames=4, width=621, height=188, motion=motion, azimuth_step_deg=0.35
+        )
+        write_drive(simulate(small), Path(folders[-1]))
+    known = replace(CalibrationConfig(), start=StartConfig(enabled=False))
+    table = windows.run(WindowsConfig(tuple(folders), (2,), calibration=known))
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["no_stop/00", "mixed/00", "no_stop/00 + mixed/00"]
+    claims = [float(row[2].split(" / ")[1]) for row in rows]
+    assert claims[2] < min(claims[:2])
+
+
+def test_errors_are_roots_of_mean_squares() -> None:
+    made = ((3.0, 0.001), (4.0, None))
+    errors = [CalibrationErrors(qad, 0.0, 0.01 * qad, seconds, None) for qad, seconds in made]
+    assert error_cell(errors) == "3.54, 3.54, 1.00"
+    assert error_cell([errors[1]]) == "4.00, 4.00, –"
+    assert error_cell([]) == "–"
