@@ -96,7 +96,7 @@ class ContourMap:
             edges = find_picture_edges(box, distance, picture[part], config)
         if edges is not None:
             shifts, unseen = edges.fields(box)
-            distance -= cv2.GaussianBlur(shifts, (0, 0), _SMOOTHING_PX)
+            distance -= shifts
             unknown |= unseen
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
 

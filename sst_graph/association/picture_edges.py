@@ -34,6 +34,8 @@ _OWN_PX = 0.7
 """A place belongs to a contour pixel if its distance to the contour is what it would be by this much [px]."""
 _AROUND_PX = 2
 """How far around a contour pixel it is not asked, either."""
+_SMOOTHING_PX = 1.0
+"""Gaussian smoothing of the shifts across the field, in pixels of the image [px]."""
 _EVERY = 2
 """One of so many contour pixels is asked: neighbours show the same."""
 
@@ -81,7 +83,8 @@ class PictureEdges:
     seen: NDArray[np.bool_]
 
     def fields(self, inside: NDArray[np.uint8]) -> tuple[FloatMap, NDArray[np.uint8]]:
-        """Shift at the contour pixel nearest to each pixel (h, w) [px]; (h, w) 1 near what is not seen."""
+        """Shift at the contour pixel nearest to each pixel (h, w), smoothed [px]; (h, w) 1 near what is not
+        seen."""
         u, v = np.concatenate(contour_pixels(inside)).T
         height, width = (side // 2 + side % 2 for side in inside.shape)
         # Of half the size: shifts vary slowly along a contour, and this is what costs.
@@ -93,7 +96,8 @@ class PictureEdges:
         by_label = np.zeros(int(labels.max()) + 1, np.float32)
         on = counts > 0
         by_label[labels[on]] = sums[on] / counts[on]
-        shifts = cv2.resize(by_label[labels], (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
+        smooth = cv2.GaussianBlur(by_label[labels], (0, 0), 0.5 * _SMOOTHING_PX)
+        shifts = cv2.resize(smooth, (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
         unseen = np.zeros(inside.shape, np.uint8)
         unseen[v[~self.seen], u[~self.seen]] = 1
         around = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)

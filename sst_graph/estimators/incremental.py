@@ -153,6 +153,10 @@ class Tracker:
         entries = self.history_store.smoothed(self.smoother)
         return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
 
+    def _reported(self) -> FloatArray:
+        """(7, 7) covariance of the present estimate, with what all contours may err by together."""
+        return self.covariance[:7, :7] + self._common(self.point.cTl)
+
     def _common(self, cTl: gtsam.Pose3) -> FloatArray:
         return common_covariance(cTl, self.camera, self.config.calibration.common_error)
 
@@ -217,7 +221,7 @@ class Tracker:
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
         self.entered.extend(found)
         self.arrivals.restart()
-        self.arrivals.take(self.window.next_scan - 1, self.covariance[:7, :7])
+        self.arrivals.take(self.window.next_scan - 1, self._reported())
         _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
         return self._answer(stamp_ns)
 
@@ -256,7 +260,7 @@ class Tracker:
         self._begin_or_end_settling(number)
         self._take_covariance(smoother)
         if new:
-            self.arrivals.take(number, self.covariance[:7, :7])
+            self.arrivals.take(number, self._reported())
         # 4. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
@@ -369,7 +373,7 @@ class Tracker:
         offer: bool = False,
     ) -> TrackUpdate:
         point, config, alarm = self.point, self.config.calibration, self.config.alarm
-        covariance = self.covariance[:7, :7] + self._common(point.cTl)
+        covariance = self._reported()
         status: TrackStatus = "alarm" if self.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
         since = self.watch.confirmation

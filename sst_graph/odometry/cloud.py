@@ -63,17 +63,36 @@ def registration_cloud(
         neighbours: points from which a covariance is estimated.
         plane_ratio: most points of the main direction, per point of another direction.
     """
-    cloud, _ = small_gicp.preprocess_points(points, voxel_m, neighbours, 1)
-    normals = np.asarray(cloud.normals())[:, :3]
-    main = np.linalg.eigh(normals.T @ normals)[1][:, 2]
-    parallel = np.abs(normals @ main) > PARALLEL_COSINE
+    # As a cloud at once: of an array, small_gicp copies point by point.
+    cloud = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(points), voxel_m)
+    lPs = np.asarray(cloud.points())
+    parallel = _along_main_direction(cloud, lPs, voxel_m, neighbours)
     members = np.flatnonzero(parallel)
-    allowed = max(int(plane_ratio * (len(normals) - len(members))), 10 * neighbours)
-    if len(members) <= allowed:
-        return cloud
-    kept = ~parallel
-    kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
-    return surfaces(np.asarray(cloud.points())[kept], neighbours)
+    allowed = max(int(plane_ratio * (len(lPs) - len(members))), 10 * neighbours)
+    if len(members) > allowed:
+        kept = ~parallel
+        kept[members[np.linspace(0, len(members) - 1, allowed).astype(np.intp)]] = True
+        lPs = lPs[kept]
+    return surfaces(lPs, neighbours)
+
+
+def _along_main_direction(
+    cloud: small_gicp.PointCloud, points: FloatArray, voxel_m: float, neighbours: int
+) -> NDArray[np.bool_]:
+    """(n,) whether a cloud's points (n, 4) lie on surfaces of its main direction.
+
+    Judged on a coarser cloud, for the nearest point of which each speaks: the covariances of the finer one
+    are estimated once only.
+    """
+    coarse, tree = small_gicp.preprocess_points(cloud, _COARSER * voxel_m, neighbours, 1)
+    normals = np.asarray(coarse.normals())[:, :3]
+    main = np.linalg.eigh(normals.T @ normals)[1][:, 2]
+    nearest = np.asarray(tree.batch_nearest_neighbor_search(points, num_threads=1)[0], np.intp)
+    return np.asarray((np.abs(normals @ main) > PARALLEL_COSINE)[nearest])
+
+
+_COARSER = 2.0
+"""Edge of the voxels in which surface directions are judged, in edges of those that are registered."""
 
 
 def surfaces(points: FloatArray, neighbours: int) -> small_gicp.PointCloud:

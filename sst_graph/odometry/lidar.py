@@ -47,8 +47,9 @@ class LidarOdometryConfig:
         search_m, search_step_m: where the speed is unknown (first pair, or after a failure), shifts of the
             start up to this far in the LiDAR's horizontal plane, and this far apart, are tried [m].
         search_iterations: Gauss-Newton steps of each trial.
-        rest_m, rest_inlier_ratio: no other shift is tried where the scan, begun where it is predicted, stays
-            within this distance [m] with at least this fraction of its points paired: it stands.
+        rest_m, rest_inlier_ratio: no farther shift is tried where the best of the nearest ones stays within
+            this distance of the prediction [m] with at least this fraction of its points paired: it stands.
+            Along a street's walls a scan may well stay where it was begun; its neighbours tell.
         missed_cost: what a point without a voxel to pair with costs in the choice among trials.
         min_inlier_ratio: a registration with fewer points paired than this fraction has failed.
         compensations: most registrations of one scan while its sweep compensation settles.
@@ -76,7 +77,7 @@ class LidarOdometryConfig:
     search_step_m: float = 0.6
     search_iterations: int = 6
     rest_m: float = 0.02
-    rest_inlier_ratio: float = 0.5
+    rest_inlier_ratio: float = 0.65
     missed_cost: float = 1.0
     min_inlier_ratio: float = 0.3
     compensations: int = 3
@@ -166,8 +167,8 @@ class LidarOdometry:
         if self._map is None or len(points) < config.min_points:
             return wTl
         cloud = registration_cloud(points, 2.0 * self._voxel_m, config.neighbours, config.plane_ratio)
-        best, least = wTl, np.inf
-        for shift in _shifts(config.search_m, config.search_step_m):
+        best, least, paired = wTl, np.inf, 0.0
+        for number, shift in enumerate(_shifts(config.search_m, config.search_step_m)):
             start = wTl.copy()
             start[:3, 3] += wTl[:3, :3] @ shift
             result = self._registered(cloud, start, config.search_iterations)
@@ -175,9 +176,9 @@ class LidarOdometry:
             missed = cloud.size() - result.num_inliers
             misfit = (2.0 * result.error + config.missed_cost * missed) / cloud.size()
             if np.isfinite(found).all() and misfit < least:
-                best, least = _orthonormal(found), misfit
-            rests = float(np.linalg.norm(found[:3, 3] - start[:3, 3])) < config.rest_m
-            if not shift.any() and rests and missed <= (1.0 - config.rest_inlier_ratio) * cloud.size():
+                best, least, paired = _orthonormal(found), misfit, result.num_inliers / cloud.size()
+            rests = float(np.linalg.norm(best[:3, 3] - wTl[:3, 3])) < config.rest_m
+            if number == _AROUND and rests and paired >= config.rest_inlier_ratio:
                 return best
         return best
 
@@ -351,11 +352,15 @@ def _empty_map(config: LidarOdometryConfig) -> small_gicp.GaussianVoxelMap:
     return found
 
 
+_AROUND = 8
+"""Shifts on a ring."""
+
+
 def _shifts(far: float, step: float) -> list[FloatArray]:
-    """Horizontal translations (3,) on rings ``step`` apart up to ``far``, eight to a ring, none first [m]."""
+    """Horizontal translations (3,) [m]: none first, then on rings ``step`` apart up to ``far``."""
     shifts = [np.zeros(3)]
     for radius in np.arange(step, far + 1e-9, step):
-        for angle in np.arange(8) * (np.pi / 4.0):
+        for angle in np.arange(_AROUND) * (2.0 * np.pi / _AROUND):
             shifts.append(radius * np.array([np.cos(angle), np.sin(angle), 0.0]))
     return shifts
 

@@ -70,7 +70,12 @@ def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.int
     if len(points) == 0:
         return np.zeros(0, np.intp)
     x, y, z = _cells(points, voxel_m)
-    return np.unique((x * (y.max() + 1) + y) * (z.max() + 1) + z, return_index=True)[1]
+    keys = (x * (y.max() + 1) + y) * (z.max() + 1) + z
+    # Sorted together with their places: several times faster than sorting places by keys.
+    ordered = np.sort(keys * len(keys) + np.arange(len(keys)))
+    voxels = ordered // len(keys)
+    first = np.flatnonzero(np.concatenate([[True], voxels[1:] != voxels[:-1]]))
+    return np.asarray(ordered[first] - voxels[first] * len(keys), np.intp)
 
 
 def _objects(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
