@@ -52,7 +52,7 @@ MEASURES = {
 
 
 def _as_drawn() -> CalibrationConfig:
-    """Contours where the masks have them: in fog pictures hardly show edges (docs/slam.md)."""
+    """Contours where the masks have them: on small images following the picture brings nothing."""
     return CalibrationConfig(prepare=PrepareConfig(picture=PictureConfig(use=False)))
 
 

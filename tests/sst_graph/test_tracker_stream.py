@@ -11,7 +11,6 @@ import pytest
 from streets import EARLY_START, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker
-from sst_graph.config import with_overrides
 from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
@@ -51,15 +50,13 @@ def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[
 
 
 def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Frame]) -> None:
-    """On contours as the masks have them; sigmas where they follow the picture: docs/online.md."""
-    tracker = tracker_from_truth(
-        street, with_overrides(EARLY_START, ["calibration.prepare.picture.use=false"])
-    )
+    """Of the same matches: those towards the ground included, where the tracker makes any."""
+    tracker = tracker_from_truth(street)
     for frame in frames[:20]:
         tracker.add(frame)
     tracker.settle()
     drive, _ = tracker.window.drive()
-    state, config = tracker.point.state(tracker.classes), tracker.config.calibration.joint.graph
+    state, config = tracker.point.state(tracker.classes), tracker.matcher.graph
     tracks = object_tracks(drive)
     kernel = tracker.matcher.kernel
     pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, config)
@@ -68,7 +65,7 @@ def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Fram
     state = state_from(values, state, pairs)
     expected = robust_covariance(graph, values, pairs, state, [tracks]).matrix
     ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
-    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+    np.testing.assert_allclose(ratio, 1.0, atol=0.02)
 
 
 def test_the_result_tells_what_each_scan_brought(running: Path) -> None:
