@@ -26,7 +26,7 @@ class CommonErrorConfig:
             camera is known to the digit, lie 0.08 to 0.15 px too high (docs/accuracy.md).
     """
 
-    sigma_px: float = 0.15
+    sigma_px: float = 0.1
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.sigma_px < np.inf:
