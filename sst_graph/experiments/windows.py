@@ -85,7 +85,8 @@ def _row(paths: Sequence[str], count: int, config: WindowsConfig) -> str:
         truth = windows[0].truth
         if truth is not None and result.status != "not_converged":
             errors.append(calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, None))
-    names, states = (" + ".join(w.name for w in wholes), ", ".join(result.status for result in results))
+    names = " + ".join(whole.name for whole in wholes)
+    states = ", ".join(result.status for result in results)
     return "| " + " | ".join([names, str(count), *spread_cells(results), error_cell(errors), states]) + " |"
 
 
