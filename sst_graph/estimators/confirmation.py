@@ -8,6 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.uncertainty.common_error import camera_turns
+
 FloatArray = NDArray[np.float64]
 
 
@@ -48,6 +50,6 @@ class Confirmation:
 def steps(cTl: gtsam.Pose3, turn_rad: float, offset_s: float) -> FloatArray:
     """(7, 3) of extrinsic and time offset: turns of the camera about its x and its y axis, a clock's jump."""
     found = np.zeros((7, 3))
-    found[:6, :2] = cTl.inverse().AdjointMap()[:, :2] * turn_rad
+    found[:6, :2] = camera_turns(cTl) * turn_rad
     found[6, 2] = offset_s
     return found

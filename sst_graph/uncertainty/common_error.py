@@ -37,7 +37,7 @@ def common_covariance(cTl: gtsam.Pose3, camera: PinholeCamera, config: CommonErr
     """(7, 7) covariance of extrinsic and offset by the common error, to be added to that of the matches.
 
     A shift of the picture is a turn of the camera about its own centre, to first order about the picture's
-    middle: Exp(d_c) cTl = cTl Exp(Ad(cTl^-1) d_c).
+    middle (:func:`camera_turns`).
 
     Args:
         cTl: the extrinsic.
@@ -47,9 +47,15 @@ def common_covariance(cTl: gtsam.Pose3, camera: PinholeCamera, config: CommonErr
         In the order of the extrinsic's tangent (right perturbation: rotation [rad], translation [m]) and the
         offset [s], which it leaves alone.
     """
-    turns = np.zeros((6, 2))
-    turns[0, 0], turns[1, 1] = config.sigma_px / camera.fy, config.sigma_px / camera.fx
-    root = cTl.inverse().AdjointMap() @ turns
+    root = camera_turns(cTl) * (config.sigma_px / np.array([camera.fy, camera.fx]))
     covariance = np.zeros((7, 7))
     covariance[:6, :6] = root @ root.T
     return covariance
+
+
+def camera_turns(cTl: gtsam.Pose3) -> FloatArray:
+    """(6, 2) tangents of the extrinsic for turns of the camera by 1 rad about its own x and y axis.
+
+    Exp(d_c) cTl = cTl Exp(Ad(cTl^-1) d_c).
+    """
+    return np.asarray(cTl.inverse().AdjointMap()[:, :2])
