@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -27,6 +27,19 @@ class Adoption:
     def restart(self) -> None:
         """Forget the comparison; the calibration in use stays until a better one has shown itself."""
         self.costs.clear()
+
+    def hear(self, cost: Callable[[Point], float | None], candidate: Point, guess: Point | None) -> None:
+        """New frames, before they are used, by what they cost at a point.
+
+        Args:
+            candidate: the estimate before them.
+            guess: what is in use while nothing has been adopted.
+        """
+        in_use = self.adopted or guess
+        ours = theirs = cost(candidate)
+        if in_use is not None and float(np.abs(candidate.core().local(in_use.core())).max()) > 0.0:
+            theirs = cost(in_use)
+        self.compare(ours, theirs)
 
     def compare(self, candidate: float | None, in_use: float | None) -> None:
         """Held-out costs of one frame: of the candidate made before it, and of the one in use."""

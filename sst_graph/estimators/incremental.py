@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import deque
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -21,6 +22,7 @@ from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.renewal import scans_to_match
+from sst_graph.estimators.rhythm import Clocks, Jump
 from sst_graph.estimators.settling import Milestones, Settling, settle_window
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
@@ -74,6 +76,7 @@ class Tracker:
         self.joint = Joint(self.covariance, (), len(self.covariance))
         sigma_px = calibration.joint.graph.object_bias_sigma_px
         self.watch = Watch(self.matcher, self.config.alarm, sigma_px)
+        self.clocks = Clocks(self.config.alarm.chi2)
         self.adoption = Adoption(self.config.adoption)
         self.history_store = History(self.config.drift.history)
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
@@ -123,6 +126,7 @@ class Tracker:
         """Take in an image; it is used as soon as a scan close to it in true time is there."""
         try:
             check_image(image, self.camera, self.window, self.point.offset_s, self.config.late_s)
+            self.clocks.take_image(image.stamp_ns, self.window.place)
             picture = self.config.calibration.prepare.picture
             self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
         except (DataError, FactorError, ValueError) as error:
@@ -132,10 +136,14 @@ class Tracker:
     def add_scan(self, scan: Scan) -> TrackUpdate:
         """Take in a scan, match it and whatever of the window is to be renewed, and estimate."""
         try:
+            check_scan(scan, self.window)
+            jump = self.clocks.take_scan(scan.stamp_ns, self.window.place)
             number = self._take_scan(scan)
         except (DataError, FactorError, ValueError, RuntimeError) as error:
             return self._answer(scan.stamp_ns, str(error))
         try:
+            if jump is not None and self.config.alarm.stamps:
+                return self._jumped(jump, scan.stamp_ns)
             if self.smoother is None:
                 return self._start(scan.stamp_ns)
             return self._track(scan.stamp_ns, number)
@@ -171,7 +179,6 @@ class Tracker:
 
     def _take_scan(self, scan: Scan) -> int:
         """Features and motion of a scan into the window; its number."""
-        check_scan(scan, self.window)
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
         if calibration.undersides.use == "never":
@@ -249,8 +256,9 @@ class Tracker:
         chi2 = self.watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
         changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
         if changed is not None:
-            return self._change(changed, stamp_ns, chi2)
-        self._compare(new, before)
+            return self._change(changed, stamp_ns, self.watch.since, chi2, "the calibration has changed")
+        if new:
+            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, self.guess.point(self.classes))
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
         if new or not missing <= {number}:
@@ -328,49 +336,39 @@ class Tracker:
         """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
         return 1.0 / self.inflation if self.config.drift.enabled else 1.0
 
-    def _compare(self, new: list[int], before: Point) -> None:
-        """Held-out costs of the new frames."""
-        if not new:
-            return
-        in_use = self.adoption.adopted or self._guess_point()
-        other = candidate = self.matcher.cost(before, new)
-        if in_use is not None and float(np.abs(before.core().local(in_use.core())).max()) > 0.0:
-            other = self.matcher.cost(in_use, new)
-        self.adoption.compare(candidate, other)
+    def _jumped(self, jump: Jump, stamp_ns: int) -> TrackUpdate:
+        """A sensor's stamps have jumped: what came before says nothing of the time offset."""
+        image, scan = jump.place
+        if jump.sensor == "image":
+            self.window.forget_images_before(image)
+        since = self.window.next_scan - scan
+        if self.started:
+            before = self.watch.before(scan) or self.point
+            return self._change(before, stamp_ns, since, jump.chi2, jump.sentence)
+        self.window.keep_scans(since)
+        self.waited = len(self.window.scans)
+        return self._answer(stamp_ns, jump.sentence)
 
-    def _guess_point(self) -> Point | None:
-        if self.guess.cTl is None:
-            return None
-        return Point.unbiased(self.guess.cTl, self.guess.offset_s, self.classes)
-
-    def _change(self, point: Point, stamp_ns: int, chi2: float | None) -> TrackUpdate:
-        """The calibration has changed: begin again from the frames since, near the estimate before them.
+    def _change(self, near: Point, stamp_ns: int, since: int, chi2: float | None, why: str) -> TrackUpdate:
+        """The calibration has changed: begin again from the ``since`` latest scans, near an estimate before.
 
         Where the labels have left what ought to be in view, it is looked for all around.
         """
-        _LOG.warning("tracker: alarm at %d ns, chi-square %.0f", stamp_ns, chi2 or 0.0)
-        self.guess = Guess(point.cTl, point.offset_s, search=self.watch.far)
+        _LOG.warning("tracker: alarm at %d ns, chi-square %.0f: %s", stamp_ns, chi2 or 0.0, why)
+        self.guess = Guess(near.cTl, near.offset_s, search=self.watch.far)
         self.stop_settling()
-        self.smoother, self.alarmed = None, True
+        self.smoother, self.alarmed, self.doubt = None, True, ""
         self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
-        # Frames before the first that was past the threshold may be from before the change.
-        self.window.keep_scans(self.watch.since)
+        self.window.keep_scans(since)
         self.waited = len(self.window.scans)
         self.entered.clear()
         self.history_store.cut()
         self.watch.restart()
         self.adoption.restart()
-        return dataclasses.replace(
-            self._answer(stamp_ns, "the calibration has changed", chi2=chi2), alarm=True
-        )
+        return dataclasses.replace(self._answer(stamp_ns, why, chi2=chi2), alarm=True)
 
     def _answer(
-        self,
-        stamp_ns: int,
-        reason: str = "",
-        *,
-        chi2: float | None = None,
-        offer: bool = False,
+        self, stamp_ns: int, reason: str = "", *, chi2: float | None = None, offer: bool = False
     ) -> TrackUpdate:
         point, config, alarm = self.point, self.config.calibration, self.config.alarm
         covariance = self._reported()

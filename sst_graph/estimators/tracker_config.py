@@ -56,6 +56,8 @@ class AlarmConfig:
             looks ...
         confirm_offset_s: ... or the time offset, while the LiDAR is fast [s]:
         confirm_mps: faster than this; where it is slower, a jump of the clock can hardly be seen [m/s].
+        stamps: a jump in the rhythm of either sensor's stamps is an alarm, too; not for sensors whose rate
+            goes up and down, as of a camera whose exposure sets it.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
         warm_up: frames after the start (or a restart) before anything is called an alarm.
@@ -75,6 +77,7 @@ class AlarmConfig:
     confirm_s: float = 1.0
     confirm_offset_s: float = 3.0
     confirm_mps: float = 3.0
+    stamps: bool = True
     baseline: int = 300
     warm_up: int = 15
 

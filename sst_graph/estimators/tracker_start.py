@@ -41,6 +41,10 @@ class Guess:
     offset_s: float
     search: bool = True
 
+    def point(self, classes: tuple[SemanticClass, ...]) -> Point | None:
+        """As an estimate without mask biases; None where nothing is known."""
+        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes)
+
 
 @dataclass(frozen=True)
 class _Solved:

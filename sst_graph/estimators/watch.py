@@ -174,6 +174,12 @@ class Watch:
             return None, "a single object says that the calibration has changed: a step, or its labels"
         return None, "what ought to be in view does not meet the image's labels" if self.far else ""
 
+    def before(self, scan: int) -> Point | None:
+        """The latest estimate that has not heard a scan, among those from before the latest frames."""
+        known = [before for before in (self.kept, *self._latest) if before is not None]
+        earlier = [before for before in known if before.scan <= scan]
+        return earlier[-1].point if earlier else known[0].point if known else None
+
     def _contradicted(self, model: ErrorModel, restless: Collection[int]) -> Before | None:
         """The estimate from before a doubt, if all frames since say that the calibration has changed.
 

@@ -98,6 +98,11 @@ class Window:
         return self.scans[0][0] if self.scans else self.next_scan
 
     @property
+    def place(self) -> tuple[int, int]:
+        """Numbers of the next image and the next scan."""
+        return self.next_image, self.next_scan
+
+    @property
     def last_stamp_ns(self) -> int | None:
         """Stamp of the newest scan."""
         return self.scans[-1][1].stamp_ns if self.scans else None
@@ -258,6 +263,10 @@ class Window:
         """Drop images of a camera stamp before ``before_ns``, but never the newest two."""
         while len(self.images) > 2 and self.images[0].stamp_ns < before_ns:
             del self.images[0]
+
+    def forget_images_before(self, number: int) -> None:
+        """Drop all images that came before the one of a number."""
+        self.images = [image for image in self.images if image.index >= number]
 
     def keep_scans(self, last: int) -> None:
         """Forget all scans but the last few."""

@@ -26,6 +26,10 @@ STEP = 20
 """Frame from which on the calibration has changed."""
 
 
+BY_LABELS = AlarmConfig(warm_up=4, stamps=False)
+"""What the labels alone tell of a clock."""
+
+
 def _turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
     """The image of a turned camera; ``border`` says what it shows where it did not look before."""
     K = street.camera.matrix
@@ -83,8 +87,8 @@ def jumped(tracker: Tracker, frames: list[Frame], jump_ms: int) -> list[TrackUpd
 def test_a_jump_in_the_first_seconds_raises_the_alarm(
     street: SimulatedDrive, frames: list[Frame], jump_ms: int
 ) -> None:
-    """Two seconds after the start: noticed within ten frames though the estimate gives way, and learnt."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(warm_up=4)))
+    """Two seconds after the start: the labels tell within ten frames, though the estimate gives way."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
     updates = jumped(tracker, frames[: STEP + 14], jump_ms)
     alarms = [i for i, update in enumerate(updates) if update.alarm]
     assert len(alarms) == 1 and alarms[0] < 10
@@ -97,9 +101,50 @@ def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
     street: SimulatedDrive, frames: list[Frame], jump_ms: int
 ) -> None:
     """With one object left out the others may tell too little for an alarm so early: there is doubt then."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(warm_up=4)))
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
     told = [update.alarm or bool(update.doubt) for update in jumped(tracker, frames[: STEP + 10], jump_ms)]
     assert any(told)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "jump_ms"), [("image", -30), ("image", 30), ("scan", 30), ("image", -200)]
+)
+def test_a_jump_breaks_the_rhythm_of_stamps(
+    street: SimulatedDrive, frames: list[Frame], sensor: str, jump_ms: int
+) -> None:
+    """Noticed within six frames though nothing is in view that tells it; learnt from what comes into view."""
+    tracker, updates = tracker_from_truth(street, EARLY_START), []
+    for frame in frames:
+        assert frame.image is not None and frame.scan is not None
+        image, scan = frame.image, frame.scan
+        late = jump_ms * 1_000_000 if frame.index >= STEP else 0
+        if sensor == "image":
+            image = dataclasses.replace(image, stamp_ns=image.stamp_ns + late)
+        else:
+            scan = dataclasses.replace(scan, stamp_ns=scan.stamp_ns + late)
+        if STEP <= frame.index < STEP + 6:
+            image = dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
+        updates.append(tracker.add(dataclasses.replace(frame, image=image, scan=scan)))
+    alarms = [i for i, update in enumerate(updates) if update.alarm]
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 6
+    told = updates[alarms[0]]
+    assert f"{sensor} stamps jumped" in told.reason and told.status == "alarm"
+    assert told.chi2 is not None and told.chi2 > tracker.config.alarm.chi2
+    offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
+    assert tracker.started and abs(updates[-1].time_offset_s - offset_s) < 2.0 * updates[-1].sigmas[6] < 0.03
+
+
+def test_a_jump_before_the_start_begins_the_window_anew(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Frames from before it would say something else of the offset."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=30))
+    for frame in frames[: STEP + 5]:
+        assert frame.image is not None
+        late = 30_000_000 if frame.index >= STEP else 0
+        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + late)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+    assert not tracker.started and not update.alarm and "jumped by +30 ms" in update.reason
+    assert tracker.window.first_scan == STEP and len(tracker.window.scans) == tracker.waited == 5
+    assert len(tracker.window.images) == 5
 
 
 def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames: list[Frame]) -> None:
