@@ -147,11 +147,11 @@ def _cone_heights(z: FloatArray, rho: FloatArray, counts: IntArray) -> FloatArra
         z, rho: (rings, n) of points of each ring [m].
         counts: (rings,) how many points each ring has.
     """
-    terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho], axis=2)
+    terms = np.stack([np.ones_like(rho), rho, rho**2, z, z * rho], axis=1)
     base = 1.0 / np.maximum(rho, 1.0)
     weight, tip = base, np.zeros(len(rho))
     for _ in range(_ROUNDS):
-        s = ((weight**2)[:, None, :] @ terms)[:, 0, :].T
+        s = (terms @ (weight * weight)[:, :, None])[:, :, 0].T
         det = s[0] * s[2] - s[1] ** 2
         safe = np.where(det > 1e-9 * np.maximum(s[0] * s[2], 1e-12), det, np.inf)
         slope, tip = (s[0] * s[4] - s[1] * s[3]) / safe, (s[2] * s[3] - s[1] * s[4]) / safe

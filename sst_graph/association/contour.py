@@ -22,6 +22,8 @@ REACH_PX = 64
 """The field ends this far around the class [px]: beyond every gate (``gate`` times the widest kernel)."""
 MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
+_CROSS = np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])[:, :, None]
+"""A pixel and its neighbours: columns and rows, (2, 5, 1)."""
 
 
 @dataclass(frozen=True)
@@ -103,19 +105,20 @@ class ContourMap:
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
         valid = self.well_inside(uvs[:, 0], uvs[:, 1])
-        safe = np.where(valid[:, None], uvs, BORDER_PX + 1.0)
-        steps = np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+        if len(uvs) == 0:
+            return ContourFeet(np.zeros(0), uvs, uvs, valid)
+        safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
         # All at once: with few points a call costs more than what it does.
-        places = (steps[:, None, :] + (safe - [self.left, self.top])).reshape(-1, 2)
-        around = sample(self.distance, places).reshape(5, -1)
-        distances = around[0]
-        gradient = 0.5 * np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
-        length = np.linalg.norm(gradient, axis=1)
-        normals = np.where(length[:, None] > 1e-6, gradient / np.maximum(length, 1e-6)[:, None], [1.0, 0.0])
-        feet = safe - distances[:, None] * normals
+        u, v = safe[:, None] - np.array([self.left, self.top])[:, None, None] + _CROSS
+        centre, right, left, below, above = np.asarray(sampled(self.distance, u, v), np.float64)
+        gradient = 0.5 * np.stack([right - left, below - above])
+        length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
+        steep = length > 1e-6
+        normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
+        feet = safe - centre * normals
         valid &= length > MIN_GRADIENT
-        valid &= ~self.is_unknown(feet)
-        return ContourFeet(distances, normals, feet, valid)
+        valid &= ~self.is_unknown(feet.T)
+        return ContourFeet(centre, normals.T, feet.T, valid)
 
     def is_unknown(self, feet: FloatArray) -> NDArray[np.bool_]:
         """Whether nothing is known of the contour at points of it, (n, 2)."""
@@ -149,10 +152,3 @@ def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
         inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_5)
         np.subtract(0.5, inner, out=distance[box], where=region.view(np.bool_))
     return distance
-
-
-def sample(field: FloatMap, uvs: FloatArray) -> FloatArray:
-    """(n,) bilinear values of a field (h, w) at pixels uvs (n, 2); the border is extended."""
-    if len(uvs) == 0:
-        return np.zeros(0)
-    return np.asarray(sampled(field, uvs[None])[0], np.float64)

@@ -154,21 +154,21 @@ def _strength(
     """(m, n) change of colour at m distances outside of n contour pixels' contour, averaged along it, in
     grey levels a pixel (root of the sum of squares over the channels)."""
     beside = pixels[None] + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[:, None]
-    around = sampled(distance, beside)
+    around = sampled(distance, beside[..., 0], beside[..., 1])
     normals = np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-6)[:, None]
     feet = pixels - around[0][:, None] * normals
     # Colours half a pixel to either side of the places asked.
     asked = np.concatenate([[ts[0] - _STEP_PX], ts, [ts[-1] + _STEP_PX]])
-    places = feet[None] + asked[:, None, None] * normals[None]
+    u, v = (feet[:, k] + asked[:, None] * normals[:, k] for k in (0, 1))
     blurred = np.asarray(cv2.GaussianBlur(picture, (3, 3), _BLUR_PX), np.uint8)
-    colours = sampled(blurred, places).astype(np.float32)
+    colours = sampled(blurred, u, v).astype(np.float32)
     change = (colours[2:] - colours[:-2]) / np.float32(2.0 * _STEP_PX)
     # First with its sign, which holds along an edge and not in a texture; then its size.
     size = along + 1
     steady = cv2.blur(change, (size, 1), borderType=cv2.BORDER_REPLICATE)
     strength = np.sqrt(np.einsum("ijk,ijk->ij", steady, steady))
-    strength *= np.abs(sampled(distance, places[1:-1]) - ts[:, None]) < _OWN_PX
+    strength *= np.abs(sampled(distance, u[1:-1], v[1:-1]) - ts[:, None]) < _OWN_PX
     size = 2 * along + 1
     return np.asarray(cv2.blur(strength, (size, 1), borderType=cv2.BORDER_REPLICATE), np.float32)
 

@@ -13,17 +13,21 @@ _REMAP_LIMIT = 30_000
 
 
 def sampled(
-    field: NDArray[np.float32] | NDArray[np.uint8], places: NDArray[np.float64] | NDArray[np.intp]
+    field: NDArray[np.float32] | NDArray[np.uint8],
+    u: NDArray[np.float64] | NDArray[np.intp],
+    v: NDArray[np.float64] | NDArray[np.intp],
 ) -> NDArray[Any]:
-    """Bilinear values of a field (h, w) or (h, w, k) at columns and rows (a, b, 2): (a, b) or (a, b, k).
+    """Bilinear values of a field (h, w) or (h, w, k) at columns u and rows v (a, b): (a, b) or (a, b, k).
 
     The border is extended.
     """
-    u, v = (np.ascontiguousarray(places[..., k], np.float32) for k in (0, 1))
+    columns, rows = np.ascontiguousarray(u, np.float32), np.ascontiguousarray(v, np.float32)
     parts = []
     for start in range(0, u.shape[1], _REMAP_LIMIT):
         some = slice(start, start + _REMAP_LIMIT)
         parts.append(
-            cv2.remap(field, u[:, some], v[:, some], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            cv2.remap(
+                field, columns[:, some], rows[:, some], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            )
         )
     return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)

@@ -18,12 +18,12 @@ from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.undecided import REACH_SIGMAS, Other
 from sst_graph.estimators.undersides import UndersideSupport, underside_support
 from sst_graph.estimators.window import Window
-from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outline_size, outlines
 from sst_graph.problem.graph import PairMatches, Tracks, associate
+from sst_graph.problem.trajectory import GrowingTrack
 from sst_graph.types import SemanticClass
 
-_SMOOTHED = 20
+_SMOOTHED = 12
 """So many of the latest motions are smoothed anew with every scan."""
 
 
@@ -37,7 +37,7 @@ class WindowMatcher:
         self.graph = config.calibration.joint.graph
         self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
         self._twists: tuple[int, Tracks] | None = None
-        self._smoother = MotionSmoother(_SMOOTHED)
+        self._growing = GrowingTrack(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -213,7 +213,7 @@ class WindowMatcher:
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""
         if self._twists is None or self._twists[0] != self.window.next_scan:
-            self._twists = (self.window.next_scan, Tracks([part], smoother=self._smoother))
+            self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
         twists = self._twists[1]
         return (
             twists.seeing(*self.window.objects_of(numbers))

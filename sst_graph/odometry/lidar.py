@@ -67,7 +67,7 @@ class LidarOdometryConfig:
     map_age: int = 20
     near_m: float = 1.0
     far_m: float = 100.0
-    max_points: int = 25_000
+    max_points: int = 40_000
     min_points: int = 200
     neighbours: int = 6
     plane_ratio: float = 0.5

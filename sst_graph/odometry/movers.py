@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 from scipy.spatial import cKDTree
 
 FloatArray = NDArray[np.float64]
@@ -81,9 +81,9 @@ def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.int
 def _objects(points: FloatArray, cell_m: float) -> NDArray[np.intp]:
     """(n,) number of the connected patch of ground plan that each point stands on."""
     x, y = _cells(points[:, :2], cell_m)
-    plan = np.zeros((x.max() + 1, y.max() + 1), np.bool_)
-    plan[x, y] = True
-    numbers, _ = ndimage.label(plan, structure=np.ones((3, 3)))
+    plan = np.zeros((x.max() + 1, y.max() + 1), np.uint8)
+    plan[x, y] = 1
+    _, numbers = cv2.connectedComponents(plan, connectivity=8)
     return np.asarray(numbers[x, y], np.intp)
 
 

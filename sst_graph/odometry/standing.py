@@ -66,6 +66,38 @@ def at_rest(motions: Sequence[RelativeMotion], config: StandingConfig | None = N
     ]
 
 
+class Rest:
+    """:func:`at_rest` for motions of which some are new in each call.
+
+    What is told of a motion stays when enough others have followed.
+    """
+
+    def __init__(self, config: StandingConfig | None = None) -> None:
+        self.config = config or StandingConfig()
+        self._motions: list[RelativeMotion] = []
+        self._told: list[RelativeMotion] = []
+
+    def told(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
+        """As :func:`at_rest`; a motion that the call before had is known by being the same object."""
+        # A motion's neighbours decide, as far as a stretch reaches, and a stop at the least.
+        reach = self.config.longest_stretch + self.config.min_motions
+        known = self._known(motions)[: -reach or None]
+        start = max(0, len(known) - reach)
+        told = known + at_rest(motions[start:], self.config)[len(known) - start :]
+        self._motions, self._told = list(motions), told
+        return list(told)
+
+    def _known(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
+        """What the call before told of the first of these motions."""
+        oldest = next(iter(motions), None)
+        first = next((i for i, motion in enumerate(self._motions) if motion is oldest), None)
+        if first is None:
+            return []
+        pairs = zip(self._motions[first:], motions, strict=False)
+        alike = next((i for i, (a, b) in enumerate(pairs) if a is not b), len(self._motions) - first)
+        return self._told[first : first + alike]
+
+
 def _at_rest(motions: Sequence[RelativeMotion], config: StandingConfig) -> NDArray[np.bool_]:
     """(n,) whether motions, or stretches of them, are surely below the speeds of the configuration."""
     found = np.zeros(len(motions), np.bool_)

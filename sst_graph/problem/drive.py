@@ -17,10 +17,8 @@ from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
-from sst_graph.odometry.smoothing import MotionSmoother
-from sst_graph.odometry.standing import at_rest
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
-from sst_graph.problem.trajectory import TwistTrack
+from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
 
 FloatArray = NDArray[np.float64]
@@ -130,15 +128,13 @@ class Drive:
         stamps = self.image_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
-    def lidar_track(self, smoother: MotionSmoother | None = None) -> TwistTrack | None:
+    def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
         """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
 
         Args:
-            smoother: one that has seen most of the motions before.
+            growing: has seen most of the motions before.
         """
-        if not self.lidar_motions:
-            return None
-        return TwistTrack((smoother or MotionSmoother()).smoothed(at_rest(self.lidar_motions)))
+        return (growing or GrowingTrack()).of(self.lidar_motions)
 
 
 def prepare_drive(

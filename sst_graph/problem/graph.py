@@ -21,7 +21,6 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
-from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.objects import Mover, ObjectId, moving_objects, numbers_in, of_each, standing_share
 from sst_graph.problem.state import (
@@ -33,7 +32,7 @@ from sst_graph.problem.state import (
     twist_key,
     underside_track,
 )
-from sst_graph.problem.trajectory import TwistSample, TwistTrack, camera_twist
+from sst_graph.problem.trajectory import GrowingTrack, TwistSample, TwistTrack, camera_twist
 from sst_graph.problem.velocity import velocities_of_points
 from sst_graph.types import SemanticClass
 
@@ -124,10 +123,10 @@ class Tracks:
         self,
         drives: Sequence[Drive],
         objects: Sequence[Mapping[ObjectId, int]] | None = None,
-        smoother: MotionSmoother | None = None,
+        growing: GrowingTrack | None = None,
     ) -> None:
-        """smoother: of a single drive whose motions grow."""
-        self._tracks: list[TwistTrack | None] = [drive.lidar_track(smoother) for drive in drives]
+        """growing: of a single drive whose motions grow."""
+        self._tracks: list[TwistTrack | None] = [drive.lidar_track(growing) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._movers = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]

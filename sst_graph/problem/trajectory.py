@@ -9,6 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.odometry.smoothing import MotionSmoother
+from sst_graph.odometry.standing import Rest
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
@@ -62,6 +64,19 @@ class TwistTrack:
             overshoot = span * (max(-fraction, fraction - 1.0))
             covariance = covariance + np.diag((slope * overshoot) ** 2)
         return TwistSample(before.mean_twist + fraction * span * slope, slope, covariance)
+
+
+class GrowingTrack:
+    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero while it stands."""
+
+    def __init__(self, reach: int | None = None) -> None:
+        """reach: how many of the latest motions are smoothed anew each time; None: all."""
+        self._rest, self._smoother = Rest(), MotionSmoother(reach)
+
+    def of(self, motions: Sequence[RelativeMotion]) -> TwistTrack | None:
+        """The track of consecutive motions; None without any. Those of the call before are known again by
+        being the same objects."""
+        return TwistTrack(self._smoother.smoothed(self._rest.told(motions))) if motions else None
 
 
 def _covariance(motion: RelativeMotion) -> FloatArray:

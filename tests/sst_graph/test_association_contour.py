@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.association.contour import ContourMap, sample, signed_distance
+from sst_graph.association.contour import ContourMap, signed_distance
+from sst_graph.association.sampling import sampled
 from sst_graph.types import SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -86,4 +87,5 @@ def test_bilinear_samples_beyond_one_batch() -> None:
     field = np.add.outer(3.0 * np.arange(50), 2.0 * np.arange(70)).astype(np.float32)
     uvs = np.random.default_rng(0).uniform([0.0, 0.0], [69.0, 49.0], (70_000, 2))
     # remap works in steps of 1/32 px
-    np.testing.assert_allclose(sample(field, uvs), uvs @ [2.0, 3.0], atol=(2.0 + 3.0) / 32.0)
+    found = sampled(field, uvs[None, :, 0], uvs[None, :, 1])[0]
+    np.testing.assert_allclose(found, uvs @ [2.0, 3.0], atol=(2.0 + 3.0) / 32.0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from sst_graph.odometry.standing import StandingConfig, at_rest
+from sst_graph.odometry.standing import Rest, StandingConfig, at_rest
 from sst_graph.types import RelativeMotion
 
 PERIOD_NS = 100_000_000
@@ -45,3 +45,19 @@ def test_a_standing_drive_and_a_moving_one() -> None:
     driving = motions(1.0, 2.0, 3.0)
     assert all(a is b for a, b in zip(at_rest(driving), driving, strict=True))
     assert at_rest([]) == []
+
+
+def test_motions_that_come_one_by_one() -> None:
+    """What is told of them at last is what all together tell, and what has not changed is not told anew."""
+    stop = [0.03, -0.02, 0.05, 0.0, 0.02]
+    given = motions(2.0, 1.0, 0.3, *stop, 0.4, 0.01, 0.02, 1.0, *stop, 0.1, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0)
+    rest, latest = Rest(), []
+    for k in range(1, len(given) + 1):
+        before, latest = latest, rest.told(given[:k])
+        assert [m.aTb.equals(gtsam.Pose3(), 0.0) for m in latest] == [
+            m.aTb.equals(gtsam.Pose3(), 0.0) for m in at_rest(given[:k])
+        ]
+    assert sum(a is b for a, b in zip(before, latest, strict=False)) >= len(given) - 7
+    # The oldest leave, as from a window.
+    assert all(a is b for a, b in zip(rest.told(given[5:])[:8], latest[5:13], strict=True))
+    assert rest.told(motions(1.0, 2.0))[0].aTb.translation()[0] > 0.0 and rest.told([]) == []
