@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sst_graph.config import to_dict
 from sst_graph.estimators.config import CalibrationConfig
+from sst_graph.estimators.rhythm import jumps_of
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
 from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, weak_directions
@@ -60,7 +61,8 @@ def result_of(
     """The result: unobservable where the covariance says so, not_converged where there are doubts."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = weak_directions(answer.covariance, answer.cTl, config.observability, advice)
-    status: Status = "not_converged" if answer.doubts else "unobservable" if weak else "ok"
+    doubts = (*answer.doubts, *(_jumps(drives) if config.check_stamps else ()))
+    status: Status = "not_converged" if doubts else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(
         T_camera_lidar=answer.cTl,
@@ -68,7 +70,7 @@ def result_of(
         covariance=answer.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*answer.doubts, *answer.remarks, *sentences),
+        reasons=(*doubts, *answer.remarks, *sentences),
         weak_directions=weak,
         frames_used=answer.frames,
         drive_offsets=answer.drive_offsets,
@@ -79,6 +81,20 @@ def result_of(
         diagnostics=answer.diagnostics,
         versions=_versions(),
     )
+
+
+def _jumps(drives: Sequence[Drive]) -> list[str]:
+    """Where the clocks of drives have jumped, so that no one time offset holds."""
+    found = []
+    for drive in drives:
+        for jump in jumps_of(drive.image_stamps_ns, drive.scan_stamps_ns):
+            image, scan = jump.place
+            frame = drive.images[image].index if jump.sensor == "image" else drive.scans[scan].index
+            found.append(
+                f"{drive.name}: {jump.sentence} at frame {frame}: "
+                "calibrate the frames before it and those from it on apart"
+            )
+    return found
 
 
 def no_answer(

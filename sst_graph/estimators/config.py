@@ -45,6 +45,8 @@ class CalibrationConfig:
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
         common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
         observability: when a direction counts as unobservable.
+        check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
+            no one time offset; not for sensors whose rate goes up and down.
     """
 
     method: Method = "joint"
@@ -61,3 +63,4 @@ class CalibrationConfig:
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
     common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
+    check_stamps: bool = True

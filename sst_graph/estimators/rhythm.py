@@ -10,6 +10,7 @@ one: they are left to the labels. Where both sensors' stamps jump alike, their o
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -144,10 +145,14 @@ class Rhythm:
         return Jump(self.sensor, self._from, seconds, (seconds / self._usual()[1]) ** 2)
 
 
+JUMP_CHI2 = 25.0
+"""What is beyond this, against the rhythm's variance, is a jump: five sigmas."""
+
+
 class Clocks:
     """The rhythms of camera and LiDAR, and which of their jumps change the offset between them."""
 
-    def __init__(self, chi2: float) -> None:
+    def __init__(self, chi2: float = JUMP_CHI2) -> None:
         """chi2: what is beyond it, against a rhythm's variance, is a jump."""
         self.chi2 = chi2
         self.images, self.scans = Rhythm("image"), Rhythm("scan")
@@ -175,3 +180,15 @@ class Clocks:
             self._jump = None
         else:
             self._jump, self._waited = jump, 0
+
+
+def jumps_of(image_stamps_ns: Sequence[int], scan_stamps_ns: Sequence[int]) -> list[Jump]:
+    """The jumps of a whole drive's rising stamps that change the offset between camera and LiDAR."""
+    clocks, found, images = Clocks(), [], 0
+    for scan, stamp_ns in enumerate(scan_stamps_ns):
+        while images < len(image_stamps_ns) and image_stamps_ns[images] <= stamp_ns:
+            clocks.take_image(image_stamps_ns[images], (images, scan))
+            images += 1
+        jump = clocks.take_scan(stamp_ns, (images, scan))
+        found += [] if jump is None else [jump]
+    return found

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from streets import prepared_street
 
-from sst_graph.estimators.rhythm import Clocks, Jump, Rhythm
+from sst_graph.estimators import CalibrationConfig
+from sst_graph.estimators.answer import Answer, Guess, result_of
+from sst_graph.estimators.rhythm import Clocks, Jump, Rhythm, jumps_of
+from sst_graph.problem.drive import Drive
 
 CHI2 = 25.0
 PERIOD_NS = 100_000_000
@@ -118,3 +125,42 @@ def test_sensors_that_jump_alike_keep_their_offset(behind: int) -> None:
     """The clock that stamps both was set; one of them shows it a frame later."""
     assert not together(later(steady(), 40, 30.0), later(steady(), 40 + behind, 30.0))
     assert together(later(steady(), 40, 30.0), later(steady(), 40 + behind, 45.0))
+
+
+def test_the_jumps_of_a_whole_drive() -> None:
+    """Scans at 10 Hz, images at 30 Hz, a little later; the images' clock jumps, later the scans'."""
+    images = 7_000_000 + np.arange(240, dtype=np.int64) * 33_333_333
+    images = later(images, 90, 13.0)
+    first, second = jumps_of(images.tolist(), later(steady(80), 60, -40.0).tolist())
+    assert (first.sensor, second.sensor) == ("image", "scan")
+    assert first.place[0] == 90 and second.place[1] == 60
+    assert first.seconds == pytest.approx(0.013) and second.seconds == pytest.approx(-0.04)
+    assert jumps_of(images[:90].tolist(), steady(80).tolist()) == []
+
+
+def long_drive(milliseconds: float) -> Drive:
+    """Three frames over and over; the stamps of images jump at frame 45, the twentieth."""
+    three, images = prepared_street(), later(steady(40), 20, milliseconds).tolist()
+    scans = [
+        dataclasses.replace(three.scans[k % 3], stamp_ns=stamp, index=25 + k)
+        for k, stamp in enumerate(steady(40).tolist())
+    ]
+    shown = [
+        dataclasses.replace(three.images[k % 3], stamp_ns=stamp, index=25 + k)
+        for k, stamp in enumerate(images)
+    ]
+    return dataclasses.replace(three, scans=tuple(scans), images=tuple(shown))
+
+
+def test_a_drive_whose_clock_jumps_has_no_one_offset() -> None:
+    answer = Answer(gtsam.Pose3(), 0.0, 1e-8 * np.eye(7), ())
+    for milliseconds, check, status in (
+        (0.0, True, "ok"),
+        (30.0, False, "ok"),
+        (30.0, True, "not_converged"),
+    ):
+        config = CalibrationConfig(check_stamps=check)
+        result = result_of(answer, [long_drive(milliseconds)], Guess(None), config)
+        assert result.status == status
+    (reason,) = result.reasons
+    assert "image stamps jumped by +30 ms" in reason and "at frame 45" in reason
