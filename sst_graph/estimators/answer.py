@@ -16,7 +16,7 @@ from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.rhythm import jumps_of
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
-from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, weak_directions
+from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, inseparable_directions, weak_directions
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ class Answer:
         frames: that took part.
         doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: what else was missing, for the reader.
+        by_standing: (7, 7) covariance by objects that stand alone, no motion heard.
         drive_offsets: an offset for each drive, where one each was asked for.
         diagnostics: JSON-able numbers about the run.
     """
@@ -51,6 +52,7 @@ class Answer:
     frames: tuple[FrameId, ...]
     doubts: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    by_standing: FloatArray | None = None
     drive_offsets: tuple[DriveOffset, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
@@ -61,6 +63,8 @@ def result_of(
     """The result: unobservable where the covariance says so, not_converged where there are doubts."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = weak_directions(answer.covariance, answer.cTl, config.observability, advice)
+    if not weak and answer.by_standing is not None:
+        weak = inseparable_directions(answer.by_standing, answer.cTl, config.observability)
     doubts = (*answer.doubts, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if doubts else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)

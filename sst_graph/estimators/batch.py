@@ -41,6 +41,7 @@ from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
 from sst_graph.uncertainty.observability import weak_directions
+from sst_graph.uncertainty.standing import standing_covariance
 
 FloatArray = NDArray[np.float64]
 
@@ -158,7 +159,7 @@ def answer_joint(
     solution = finals[0]
     # 4. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
-    covariance = robust.matrix
+    covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
     heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
@@ -171,6 +172,7 @@ def answer_joint(
         covariance[:7, :7] + common_covariance(cTl, drives[0].camera, config.common_error),
         _frames_used(drives, solution),
         remarks=_remarks(drives),
+        by_standing=by_standing[:7, :7],
         doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={

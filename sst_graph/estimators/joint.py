@@ -24,7 +24,7 @@ from sst_graph.problem.graph import (
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import Unknowns, marginal_covariance
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
 _LOG = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from sst_graph.problem.drive import Drive, ImageFeatures, ScanFeatures
 from sst_graph.problem.state import EXTRINSIC, delay_key
 from sst_graph.result import FrameId
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import Unknowns, marginal_covariance
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")

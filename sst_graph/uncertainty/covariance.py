@@ -30,10 +30,11 @@ from numpy.typing import NDArray
 from factors.alignment import weighted_residuals
 from factors.robust import RobustKernel
 from sst_graph.association.silhouettes import SIDES
-from sst_graph.problem.graph import PairMatches, bias_groups, state_from, tracked_objects
+from sst_graph.problem.graph import PairMatches, bias_groups, state_from
 from sst_graph.problem.objects import ObjectId
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key, twist_key
+from sst_graph.problem.state import State, delay_key, twist_key
 from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance, twist_responses
 from sst_graph.uncertainty.object_spread import ObjectSpread, composed, step_without
 
 FloatArray = NDArray[np.float64]
@@ -74,33 +75,18 @@ class MatchTable:
     objects: IntArray
     views: float
 
+    def take(self, index: IntArray) -> MatchTable:
+        """Some of the matches, by position."""
+        sides, side_frames, objects = (
+            _numbered(labels[index]) for labels in (self.sides, self.side_frames, self.objects)
+        )
+        rest = self.root_weights[index], self.curvatures[index], self.r[index]
+        return MatchTable(self.J[index], *rest, sides, side_frames, objects, self.views)
+
     @property
     def flatness(self) -> float:
         """Mean robust weight over mean curvature: 1 for least squares, inf where the kernel bends over."""
         return flatness_of(float(self.root_weights @ self.root_weights), float(self.curvatures.sum()))
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """Columns of the unknowns that are not motion: the extrinsic, the clocks, the mask biases."""
-
-    keys: tuple[int, ...]
-
-    @classmethod
-    def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
-        delays = [delay_key(clock) for clock in range(len(state.offsets_s))]
-        biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
-        objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
-        return cls((EXTRINSIC, *delays, *sorted(biases), *sorted(objects)))
-
-    @property
-    def size(self) -> int:
-        return 6 + len(self.keys) - 1
-
-    def column(self, key: int) -> int:
-        """First column of a key."""
-        place = self.keys.index(key)
-        return 0 if place == 0 else 5 + place
 
 
 def match_table(
@@ -117,7 +103,7 @@ def match_table(
         state: that the matches were made at.
         tracks: of each drive's objects.
     """
-    motion = _Motion(values, _twist_responses(graph, values, unknowns))
+    motion = _Motion(values, twist_responses(graph, values, unknowns))
     state = state_from(values, state, pairs)
     blocks, weights, residuals, curvatures = [], [], [], []
     sides, frames, objects, moving = [], [], [], []
@@ -182,17 +168,6 @@ def _rows(
         roots[index] = root
         residuals[index] = unweighted(r, root)
     return block, roots, residuals
-
-
-def _twist_responses(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> dict[int, FloatArray]:
-    """(6, n) how the optimum of each twist follows the unknowns, by the twist's key."""
-    hessian, n = graph.linearize(values).hessian(_ordering(values, unknowns))[0], unknowns.size
-    return {
-        key: np.asarray(-np.linalg.solve(hessian[at : at + 6, at : at + 6], hessian[at : at + 6, :n]))
-        for at, key in zip(range(n, len(hessian), 6), _twists(values, unknowns), strict=True)
-    }
 
 
 def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
@@ -318,12 +293,14 @@ class RobustCovariance:
 
     Attributes:
         matrix: (n, n) covariance of [extrinsic 6, offsets, biases].
+        bread: (n, n) the same if all matches were independent.
         model: the error model behind it.
         unknowns: its columns.
         table: the matches.
     """
 
     matrix: FloatArray
+    bread: FloatArray
     model: ErrorModel
     unknowns: Unknowns
     table: MatchTable
@@ -341,12 +318,17 @@ def robust_covariance(
     bread = marginal_covariance(graph, values, unknowns)
     table = match_table(graph, values, pairs, state, tracks, unknowns)
     model = fit_error_model(table)
+    return RobustCovariance(covariance_of(bread, table, model), bread, model, unknowns, table)
+
+
+def covariance_of(bread: FloatArray, table: MatchTable, model: ErrorModel) -> FloatArray:
+    """(n, n) covariance under an error model of the matches; ``bread``: if all of them were independent."""
     surplus = score_variance(table, model) - table.J.T @ table.J
     covariance = bread + bread @ surplus @ bread
     steps = steps_without_objects(table, bread)
     weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
     covariance = composed(covariance, ObjectSpread.of(steps, weights), table.flatness)
-    return RobustCovariance(0.5 * (covariance + covariance.T), model, unknowns, table)
+    return np.asarray(0.5 * (covariance + covariance.T))
 
 
 def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
@@ -358,33 +340,3 @@ def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
     return np.stack(
         [step_without(root, J[own].T @ J[own], J[own].T @ r[own]) for own in np.split(order, bounds)]
     )
-
-
-def marginal_covariance(
-    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> FloatArray:
-    """(n, n) covariance of the unknowns with the motion marginalised out.
-
-    From the dense Hessian by a scaled Schur complement, for gtsam.Marginals gives up at condition
-    numbers near 1e9, which metres beside pixels reach without any direction being unobservable.
-    """
-    hessian = graph.linearize(values).hessian(_ordering(values, unknowns))[0]
-    n = unknowns.size
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    scaled = hessian * np.outer(scale, scale)
-    inverse = np.linalg.inv(scaled + 1e-14 * np.eye(len(scaled)))[:n, :n]
-    return np.asarray(inverse * np.outer(scale[:n], scale[:n]))
-
-
-def _ordering(values: gtsam.Values, unknowns: Unknowns) -> gtsam.Ordering:
-    ordering = gtsam.Ordering()
-    for key in unknowns.keys:
-        ordering.push_back(key)
-    for key in _twists(values, unknowns):
-        ordering.push_back(key)
-    return ordering
-
-
-def _twists(values: gtsam.Values, unknowns: Unknowns) -> list[int]:
-    """Keys of the motion: every other unknown of the graph."""
-    return sorted(set(values.keys()) - set(unknowns.keys))

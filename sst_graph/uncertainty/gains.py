@@ -19,8 +19,9 @@ from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import PairMatches
 from sst_graph.problem.state import State, delay_key, twist_key
 from sst_graph.result import FrameId
-from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, RobustCovariance, Unknowns
+from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, RobustCovariance
 from sst_graph.uncertainty.frame_information import FrameInformation, positive_part
+from sst_graph.uncertainty.marginal import Unknowns
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]

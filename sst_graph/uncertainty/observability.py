@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -12,15 +12,8 @@ from sst_graph.result import DIRECTION_SCALES, WeakDirection
 
 FloatArray = NDArray[np.float64]
 
-_NAMES = (
-    "rotation about x",
-    "rotation about y",
-    "rotation about z",
-    "x",
-    "y",
-    "z",
-    "time offset",
-)
+_TAKES_PART = 0.1
+"""Least part of a weak direction's unit vector that is worth a word."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +86,25 @@ def weak_directions(
     return tuple(found)
 
 
+def inseparable_directions(
+    covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
+) -> tuple[WeakDirection, ...]:
+    """Directions along which objects that stand cannot tell the time offset from the translation.
+
+    None unless the two are correlated as closely as at constant speed.
+
+    Args:
+        covariance: (7, 7) by what stands alone.
+    """
+    if _paired(covariance) < config.pair_correlation:
+        return ()
+    return tuple(
+        replace(direction, sentence=f"by what stands alone, {direction.sentence}")
+        for direction in weak_directions(covariance, cTl, config)
+        if min(abs(float(direction.vector[6])), float(np.linalg.norm(direction.vector[3:6]))) > _TAKES_PART
+    )
+
+
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
@@ -131,7 +143,7 @@ def _words(
     }
     translation_m = float(np.linalg.norm(c_translation))
     words = _axis_words(c_translation)
-    if parts["offset"] > 0.1 and parts["translation"] > 0.1:
+    if parts["offset"] > _TAKES_PART and parts["translation"] > _TAKES_PART:
         rate_ms = abs(offset_s) * 1e3 / translation_m if translation_m else 0.0
         sign = "later" if offset_s > 0 else "earlier"
         return (

@@ -16,14 +16,13 @@ from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
     ErrorModel,
-    Unknowns,
-    marginal_covariance,
     match_table,
     robust_covariance,
     score_variance,
 )
 from sst_graph.uncertainty.frame_information import FrameInformation
 from sst_graph.uncertainty.gains import frame_gains
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
 CONFIG = GraphConfig()
 

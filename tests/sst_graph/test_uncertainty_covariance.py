@@ -13,16 +13,15 @@ from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
     ErrorModel,
     MatchTable,
-    Unknowns,
     effective_views,
     fit_error_model,
     freedom_of_sides,
-    marginal_covariance,
     score_variance,
     spread_beyond,
     steps_without_objects,
     with_floors,
 )
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
 VEHICLE = SemanticClass.VEHICLE
 

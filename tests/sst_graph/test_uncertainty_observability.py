@@ -7,7 +7,11 @@ import numpy as np
 import pytest
 
 from sst_graph.result import DIRECTION_SCALES
-from sst_graph.uncertainty.observability import ObservabilityConfig, weak_directions
+from sst_graph.uncertainty.observability import (
+    ObservabilityConfig,
+    inseparable_directions,
+    weak_directions,
+)
 
 CTL = gtsam.Pose3(
     gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])), np.array([0.0, -0.1, -0.3])
@@ -48,6 +52,20 @@ def test_what_hardly_separates_must_be_known_better() -> None:
     (weak,) = weak_directions(sure + np.outer(tied, tied), CTL, CONFIG)
     assert "shifted forward" in weak.sentence and "4.0 cm, 5.0 ms" in weak.sentence
     assert weak_directions(sure + np.outer(0.5 * tied, 0.5 * tied), CTL, CONFIG) == ()
+
+
+def test_what_stands_alone_must_separate_offset_and_translation() -> None:
+    """Only what ties the two as closely as constant speed counts, and only past the limits."""
+    tied = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
+    (weak,) = inseparable_directions(with_direction(tied), CTL, CONFIG)
+    assert (
+        weak.sentence.startswith("by what stands alone, the LiDAR shifted forward") and "stop" in weak.advice
+    )
+    assert inseparable_directions(with_direction(0.3 * tied), CTL, CONFIG) == ()
+    loose = with_direction(tied) + np.diag([0.0] * 6 + [0.01**2])
+    assert weak_directions(loose, CTL, CONFIG) and inseparable_directions(loose, CTL, CONFIG) == ()
+    alone = np.array([np.radians(2.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert len(inseparable_directions(with_direction(tied) + np.outer(alone, alone), CTL, CONFIG)) == 1
 
 
 def test_the_other_sign_of_the_delay() -> None:

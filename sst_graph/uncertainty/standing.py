@@ -1,0 +1,48 @@
+"""What is known by objects that stand alone.
+
+An oncoming vehicle whose velocity is known may tell the time offset from the translation where nothing that
+stands does: on a straight road at one speed. Its velocity was estimated along the way, and what that alone
+tells is not called known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.problem.graph import PairMatches
+from sst_graph.uncertainty.covariance import RobustCovariance, covariance_of
+
+FloatArray = NDArray[np.float64]
+
+_ALL = 1.0 - 1e-6
+"""Largest share of what is known of a direction that is taken away."""
+
+
+def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) -> FloatArray:
+    """(n, n) covariance of the unknowns without the matches of objects that move with a known velocity.
+
+    Args:
+        robust: with all of them.
+        pairs: its matches.
+    """
+    moves = np.concatenate([_moves(pair) for pair in pairs])
+    if not moves.any() or moves.all():
+        return robust.matrix if not moves.any() else robust.matrix / (1.0 - _ALL)
+    J = robust.table.J[moves]
+    root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
+    shares, axes = np.linalg.eigh(root.T @ (J.T @ J) @ root)
+    wider = root @ (axes / np.sqrt(1.0 - np.minimum(shares, _ALL)))
+    return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
+
+
+def _moves(pair: PairMatches) -> NDArray[np.bool_]:
+    """(m,) whether the object of each match moves, class by class."""
+    found = []
+    for matches in pair.matches.values():
+        velocities = matches.alignment.l_velocities
+        none = np.zeros(len(matches), np.bool_)
+        found.append(none if velocities is None else np.asarray(velocities.any(axis=1), np.bool_))
+    return np.concatenate(found)
