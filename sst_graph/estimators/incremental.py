@@ -344,7 +344,9 @@ class Tracker:
         since = self.window.next_scan - scan
         if self.started:
             before = self.watch.before(scan) or self.point
-            return self._change(before, stamp_ns, since, jump.chi2, jump.sentence)
+            # Most likely the clock was set.
+            near = dataclasses.replace(before, offset_s=before.offset_s + jump.offset_s)
+            return self._change(near, stamp_ns, since, jump.chi2, jump.sentence)
         self.window.keep_scans(since)
         self.waited = len(self.window.scans)
         return self._answer(stamp_ns, jump.sentence)

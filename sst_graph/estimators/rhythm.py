@@ -52,6 +52,11 @@ class Jump:
     chi2: float
 
     @property
+    def offset_s(self) -> float:
+        """By how much the time offset changes where the clock was set [s]."""
+        return self.seconds if self.sensor == "scan" else -self.seconds
+
+    @property
     def sentence(self) -> str:
         return f"the {self.sensor} stamps jumped by {1e3 * self.seconds:+.0f} ms against their own rhythm"
 

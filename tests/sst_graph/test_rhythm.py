@@ -118,6 +118,8 @@ def test_a_jump_of_either_sensor_changes_the_offset(sensor: str) -> None:
     steps = {"image": 0.0, "scan": 0.0, sensor: -30.0}
     ((at, jump),) = together(*(later(steady(), 40, steps[name]) for name in ("image", "scan")))
     assert jump.sensor == sensor and jump.place[1] == 40 and at < 50
+    # Images stamped earlier show the world later than they say.
+    assert jump.offset_s == pytest.approx(0.03 if sensor == "image" else -0.03)
 
 
 @pytest.mark.parametrize("behind", [0, 1])
