@@ -142,7 +142,7 @@ class Tracker:
         except (DataError, FactorError, ValueError, RuntimeError) as error:
             return self._answer(scan.stamp_ns, str(error))
         try:
-            if jump is not None and self.config.alarm.stamps:
+            if jump is not None and self.config.alarm.enabled and self.config.alarm.stamps:
                 return self._jumped(jump, scan.stamp_ns)
             if self.smoother is None:
                 return self._start(scan.stamp_ns)

@@ -29,8 +29,10 @@ def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) 
         pairs: its matches.
     """
     moves = np.concatenate([_moves(pair) for pair in pairs])
-    if not moves.any() or moves.all():
-        return robust.matrix if not moves.any() else robust.matrix / (1.0 - _ALL)
+    if not moves.any():
+        return robust.matrix
+    if moves.all():
+        return np.asarray(robust.matrix / (1.0 - _ALL))
     J = robust.table.J[moves]
     root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
     shares, axes = np.linalg.eigh(root.T @ (J.T @ J) @ root)
