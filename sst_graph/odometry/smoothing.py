@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.odometry.standing import overlap
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
@@ -74,12 +75,11 @@ class MotionSmoother:
     def _going_on(self, motions: Sequence[RelativeMotion]) -> _Run:
         """The run of these motions: an earlier one that goes on with them, or a new one."""
         for run in self._runs:
-            place = next((i for i, motion in enumerate(run.motions) if motion is motions[0]), None)
-            if place is not None:
-                run.forget(place)
-                pairs = zip(run.motions, motions, strict=False)
-                run.cut(next((i for i, (a, b) in enumerate(pairs) if a is not b), len(motions)))
-                run.extend(motions[len(run.motions) :])
+            first, alike = overlap(run.motions, motions)
+            if alike:
+                run.forget(first)
+                run.cut(alike)
+                run.extend(motions[alike:])
                 return run
         run = _Run(motions[0])
         run.extend(motions)

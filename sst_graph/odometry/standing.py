@@ -81,21 +81,23 @@ class Rest:
         """As :func:`at_rest`; a motion that the call before had is known by being the same object."""
         # A motion's neighbours decide, as far as a stretch reaches, and a stop at the least.
         reach = self.config.longest_stretch + self.config.min_motions
-        known = self._known(motions)[: -reach or None]
+        first, alike = overlap(self._motions, motions)
+        known = self._told[first : first + max(0, alike - reach)]
         start = max(0, len(known) - reach)
         told = known + at_rest(motions[start:], self.config)[len(known) - start :]
         self._motions, self._told = list(motions), told
         return list(told)
 
-    def _known(self, motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
-        """What the call before told of the first of these motions."""
-        oldest = next(iter(motions), None)
-        first = next((i for i, motion in enumerate(self._motions) if motion is oldest), None)
-        if first is None:
-            return []
-        pairs = zip(self._motions[first:], motions, strict=False)
-        alike = next((i for i, (a, b) in enumerate(pairs) if a is not b), len(self._motions) - first)
-        return self._told[first : first + alike]
+
+def overlap(before: Sequence[RelativeMotion], now: Sequence[RelativeMotion]) -> tuple[int, int]:
+    """Where the first motion stood before, and how many from it on are the same objects; none: (0, 0)."""
+    oldest = next(iter(now), None)
+    first = next((i for i, motion in enumerate(before) if motion is oldest), None)
+    if first is None:
+        return 0, 0
+    pairs = zip(before[first:], now, strict=False)
+    ends = min(len(before) - first, len(now))
+    return first, next((i for i, (a, b) in enumerate(pairs) if a is not b), ends)
 
 
 def _at_rest(motions: Sequence[RelativeMotion], config: StandingConfig) -> NDArray[np.bool_]:
