@@ -72,7 +72,6 @@ class StepAlarm:
         self.recent: deque[PairScore] = deque(maxlen=config.frames)
         self.usual: deque[float] = deque(maxlen=config.baseline)
         self.raised = 0
-        self.quiet = 0
         self.compared: Comparison | None = None
 
     def restart(self) -> None:
@@ -80,7 +79,6 @@ class StepAlarm:
         self.recent.clear()
         self.compared = None
         self.raised = 0
-        self.quiet = 0
 
     def check(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float | None:
         """The statistic with new frames' scores, over its usual size; None while it can't be told."""
@@ -90,7 +88,6 @@ class StepAlarm:
         self.compared = self.compare(self.recent, joint, model)
         statistic = self.compared.chi2()
         value = statistic / self._scale(joint.core_size)
-        self.quiet += 1
         if value > self.config.chi2:
             self.raised += 1
         else:
@@ -114,8 +111,7 @@ class StepAlarm:
     @property
     def alarm(self) -> bool:
         """Past the threshold often enough in a row."""
-        config = self.config
-        return self.quiet > config.warm_up and self.raised >= config.confirmations
+        return self.raised >= self.config.confirmations
 
     def _scale(self, freedom: int) -> float:
         """How much larger than chi-square's the usual statistic is, at its 90th percentile; at least 1."""

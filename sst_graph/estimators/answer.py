@@ -16,7 +16,7 @@ from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.rhythm import jumps_of
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
-from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, inseparable_directions, weak_directions
+from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, open_directions
 
 FloatArray = NDArray[np.float64]
 
@@ -62,9 +62,7 @@ def result_of(
 ) -> CalibrationResult:
     """The result: unobservable where the covariance says so, not_converged where there are doubts."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
-    weak = weak_directions(answer.covariance, answer.cTl, config.observability, advice)
-    if not weak and answer.by_standing is not None:
-        weak = inseparable_directions(answer.by_standing, answer.cTl, config.observability)
+    weak = open_directions(answer.covariance, answer.by_standing, answer.cTl, config.observability, advice)
     doubts = (*answer.doubts, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if doubts else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)

@@ -61,7 +61,7 @@ class Change:
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
         self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
-        self.bent, self.undecided = smoother.bent, smoother.undecided
+        self.bent, self.alone, self.undecided = smoother.bent, smoother.alone, smoother.undecided
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
         self.sums = smoother.sums.copy()
@@ -99,6 +99,7 @@ class Change:
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
             self.past, self.bent = self.past.plus(entry.score.belief), self.bent.plus(entry.score.bent)
+            self.alone = self.alone.plus(entry.score.by_standing)
             if entry.other is not None:
                 self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
             columns, drift = self.past.point.columns(entry.score.belief.point.tracks), self._smoother.drift
@@ -117,7 +118,8 @@ class Change:
         if not new:
             return
         sigma_px = self._smoother.graph.object_bias_sigma_px
-        self.past, self.bent = (b.with_objects(new, sigma_px) for b in (self.past, self.bent))
+        beliefs = (self.past, self.bent, self.alone)
+        self.past, self.bent, self.alone = (b.with_objects(new, sigma_px) for b in beliefs)
         self.sums.grow(self.past.point.size)
         self.undecided = self.undecided.through(
             np.eye(self.past.point.size, len(self.bent.vector) - len(new))
@@ -136,6 +138,7 @@ class Change:
         if gone:
             self.past, T = self.past.without(gone)
             self.bent, bent_T = self.bent.without(gone)
+            self.alone, _ = self.alone.without(gone)
             self.sums.transform(T)
             self.undecided = self.undecided.through(bent_T)
 
@@ -223,14 +226,16 @@ class Change:
         self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model))
         self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.transform(self.past.transition(variances))
-        self.past, self.bent = self.past.drifted(variances), self.bent.drifted(variances)
+        beliefs = (self.past, self.bent, self.alone)
+        self.past, self.bent, self.alone = (b.drifted(variances) for b in beliefs)
         self._remove += new.links or ()
         self.epochs = (replace(new, links=None), *self.epochs[2:])
 
     def _replace_past(self) -> None:
         self._remove.append(self.past_id)
         before = self.bent.point
-        self.past, self.bent = self.past.at(self.point), self.bent.at(self.point)
+        beliefs = (self.past, self.bent, self.alone)
+        self.past, self.bent, self.alone = (b.at(self.point) for b in beliefs)
         self.undecided = self.undecided.moved(before.local(self.bent.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
         self._add(self.bent.factor(keys), "past", 0)

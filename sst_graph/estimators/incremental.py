@@ -16,10 +16,10 @@ from factors.errors import FactorError
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
-from sst_graph.estimators.alarm import Joint
 from sst_graph.estimators.arrivals import Arrivals
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History, HistoryEntry
+from sst_graph.estimators.known import Known
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.renewal import scans_to_match
 from sst_graph.estimators.rhythm import Clocks, Jump
@@ -28,6 +28,7 @@ from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
+from sst_graph.estimators.trial import Trial
 from sst_graph.estimators.undersides import without_undersides
 from sst_graph.estimators.watch import Watch
 from sst_graph.estimators.window import Window
@@ -36,14 +37,11 @@ from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
 from sst_graph.uncertainty.common_error import common_covariance
-from sst_graph.uncertainty.observability import weak_directions
+from sst_graph.uncertainty.observability import open_directions
 
 _LOG = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
-
-_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
-"""Of an estimate that does not exist yet [rad, m, s]."""
 
 
 class Tracker:
@@ -72,8 +70,7 @@ class Tracker:
         self.last_scan: Scan | None = None
         self.guess = Guess(initial, initial_offset_s, calibration.start.enabled)
         self.smoother: WindowSmoother | None = None
-        self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
-        self.joint = Joint(self.covariance, (), len(self.covariance))
+        self.known = Known.nothing()
         sigma_px = calibration.joint.graph.object_bias_sigma_px
         self.watch = Watch(self.matcher, self.config.alarm, sigma_px)
         self.clocks = Clocks(self.config.alarm.chi2)
@@ -86,7 +83,7 @@ class Tracker:
         self.alarmed = False
         self.attempts = 0
         self.waited = 0
-        self.inflation = 1.0
+        self.trial = Trial(self.config)
         self.doubt = ""
 
     @property
@@ -100,6 +97,11 @@ class Tracker:
         if self.smoother is not None:
             return self.smoother.point
         return Point.unbiased(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, self.classes)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(m, m) of extrinsic [rad, m], time offset [s] and mask biases [px]; wide before the start."""
+        return self.known.covariance
 
     @property
     def adopted(self) -> Point | None:
@@ -179,9 +181,8 @@ class Tracker:
 
     def _take_scan(self, scan: Scan) -> int:
         """Features and motion of a scan into the window; its number."""
-        calibration = self.config.calibration
-        prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
-        if calibration.undersides.use == "never":
+        prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
+        if self.config.calibration.undersides.use == "never":
             prepare = without_undersides(prepare)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
@@ -214,15 +215,17 @@ class Tracker:
                 # The last estimate leads nowhere: look all around it.
                 self.guess = Guess(self.guess.cTl, self.guess.offset_s)
             return self._answer(stamp_ns, f"no start yet: {error}")
-        calibration = config.calibration
+        graph = config.calibration.joint.graph
         self.matcher.look_below(point)
-        start_ns = drive.scans[0].stamp_ns
-        prior = prior_belief(point, self.guess, self.classes, calibration.joint.graph)
-        smoother = WindowSmoother(prior, start_ns, self.classes, calibration.joint.graph, config.drift)
+        prior = prior_belief(point, self.guess, self.classes, graph)
+        smoother = WindowSmoother(prior, drive.scans[0].stamp_ns, self.classes, graph, config.drift)
         found, _ = self.matcher.match(point, None, share=self._share)
         smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
-        self._take_covariance(smoother)
-        self.smoother, self.alarmed, self.attempts, self.waited = smoother, False, 0, 0
+        known = Known.of(smoother)
+        if why := self.trial.check(self.watch, smoother, known, self.window.restless()):
+            return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
+        self.known, self.smoother, self.alarmed, self.attempts, self.waited = known, smoother, False, 0, 0
+        self.trial.begin(self.window.next_scan)
         self.watch.begin()
         self.adoption.restart()
         self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
@@ -232,6 +235,14 @@ class Tracker:
         _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
         return self._answer(stamp_ns)
 
+    def _refuse_start(self, stamp_ns: int, keep: int, why: str) -> TrackUpdate:
+        """A start that does not hold: the calibration changed among its frames, or it was none."""
+        _LOG.info("tracker: %s", why)
+        self.trial.refused += 1
+        guess = self.guess if self.smoother is None else Guess(self.point.cTl, self.point.offset_s)
+        self._begin_anew(guess, keep)
+        return self._answer(stamp_ns, why)
+
     def _track(self, stamp_ns: int, number: int) -> TrackUpdate:
         """One frame of the running tracker."""
         smoother = self.smoother
@@ -239,13 +250,7 @@ class Tracker:
         before = smoother.point
         # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
         chosen = scans_to_match(
-            number,
-            self.matcher,
-            smoother,
-            self.entered,
-            self.covariance,
-            self.config,
-            self.settling,
+            number, self.matcher, smoother, self.entered, self.covariance, self.config, self.settling
         )
         sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
         found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
@@ -253,10 +258,13 @@ class Tracker:
         new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
         restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
-        chi2 = self.watch.take(sorted(waiting), matches, before, self.joint, smoother.model, restless)
+        chi2 = self.watch.take(sorted(waiting), matches, before, self.known.joint, smoother.model, restless)
         changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
         if changed is not None:
-            return self._change(changed, stamp_ns, self.watch.since, chi2, "the calibration has changed")
+            since = self.watch.since
+            if self.trial.over(number):
+                return self._change(changed, stamp_ns, since, chi2, "the calibration has changed")
+            return self._refuse_start(stamp_ns, since, "new frames contradict the start: it begins anew")
         if new:
             self.adoption.hear(partial(self.matcher.cost, chosen=new), before, self.guess.point(self.classes))
         # 3. The graph takes all in, or nothing.
@@ -266,27 +274,16 @@ class Tracker:
             self.window.judged_anew -= chosen
         self.entered.extend(new)
         self._begin_or_end_settling(number)
-        self._take_covariance(smoother)
+        self.known = Known.of(smoother)
         if new:
             self.arrivals.take(number, self._reported())
-        # 4. A candidate that shows itself is adopted.
+        # 4. Does a new start hold?
+        if why := self.trial.check_again(number, self.watch, smoother, self.known, restless):
+            return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
+        # 5. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
         return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not self.doubt)
-
-    def _take_covariance(self, smoother: WindowSmoother) -> None:
-        """Take over the covariance of a smoother's estimate.
-
-        Raises:
-            EstimationError: it is none.
-        """
-        joint, naive = smoother.covariance()
-        if not (np.isfinite(joint).all() and (np.diag(joint) > 0.0).all()):
-            raise EstimationError("a covariance that is not finite")
-        m = smoother.past.point.core_size
-        self.covariance, self.joint = joint[:m, :m], Joint(joint, smoother.past.point.tracks, m)
-        share = np.trace(np.linalg.solve(naive[:m, :m], self.covariance)) / m
-        self.inflation = max(1.0, float(share))
 
     def begin_settling(self) -> None:
         """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
@@ -324,7 +321,7 @@ class Tracker:
             rests = settle_window(
                 smoother, self.matcher, joint.kernel_px, most, joint.full_steps, alive, self._share
             )
-            self._take_covariance(smoother)
+            self.known = Known.of(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False
@@ -334,7 +331,7 @@ class Tracker:
     @property
     def _share(self) -> float:
         """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
-        return 1.0 / self.inflation if self.config.drift.enabled else 1.0
+        return 1.0 / self.known.inflation if self.config.drift.enabled else 1.0
 
     def _jumped(self, jump: Jump, stamp_ns: int) -> TrackUpdate:
         """A sensor's stamps have jumped: what came before says nothing of the time offset."""
@@ -352,22 +349,26 @@ class Tracker:
         return self._answer(stamp_ns, jump.sentence)
 
     def _change(self, near: Point, stamp_ns: int, since: int, chi2: float | None, why: str) -> TrackUpdate:
-        """The calibration has changed: begin again from the ``since`` latest scans, near an estimate before.
+        """The calibration has changed: begin anew from the ``since`` latest scans, near an estimate before.
 
         Where the labels have left what ought to be in view, it is looked for all around.
         """
         _LOG.warning("tracker: alarm at %d ns, chi-square %.0f: %s", stamp_ns, chi2 or 0.0, why)
-        self.guess = Guess(near.cTl, near.offset_s, search=self.watch.far)
+        self._begin_anew(Guess(near.cTl, near.offset_s, search=self.watch.far), since)
+        self.alarmed = True
+        return dataclasses.replace(self._answer(stamp_ns, why, chi2=chi2), alarm=True)
+
+    def _begin_anew(self, guess: Guess, keep: int) -> None:
+        """Give up the estimate and all scans but the last few."""
+        self.guess = guess
         self.stop_settling()
-        self.smoother, self.alarmed, self.doubt = None, True, ""
-        self.covariance = np.diag(np.square(_UNKNOWN_SIGMAS))
-        self.window.keep_scans(since)
+        self.smoother, self.doubt, self.known = None, "", Known.nothing()
+        self.window.keep_scans(keep)
         self.waited = len(self.window.scans)
         self.entered.clear()
         self.history_store.cut()
         self.watch.restart()
         self.adoption.restart()
-        return dataclasses.replace(self._answer(stamp_ns, why, chi2=chi2), alarm=True)
 
     def _answer(
         self, stamp_ns: int, reason: str = "", *, chi2: float | None = None, offer: bool = False
@@ -378,7 +379,7 @@ class Tracker:
         weak: tuple[WeakDirection, ...] = ()
         since = self.watch.confirmation
         if self.smoother is not None:
-            weak = weak_directions(covariance, point.cTl, config.observability)
+            weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
             late = since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
         return TrackUpdate(

@@ -20,6 +20,7 @@ from sst_graph.problem.state import underside_track
 from sst_graph.problem.trajectory import camera_twist
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import curvatures_of, unweighted
+from sst_graph.uncertainty.standing import moving_matches
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -71,6 +72,7 @@ class PairScore:
         places: place of its class's bias for each object with a bias, by its track.
         objects: the matches of each object alone.
         weight, curvature: sums of the matches' weights, and of the robust loss's second derivatives.
+        standing: the belief by objects that stand alone, where some move with a known velocity.
     """
 
     belief: Gaussian
@@ -83,6 +85,12 @@ class PairScore:
     objects: ObjectBeliefs | None = None
     weight: float = 1.0
     curvature: float = 1.0
+    standing: Gaussian | None = None
+
+    @property
+    def by_standing(self) -> Gaussian:
+        """The belief by objects that stand alone."""
+        return self.belief if self.standing is None else self.standing
 
 
 def object_places(
@@ -149,7 +157,17 @@ def score_pair(
         ObjectBeliefs.of(J, r, roots, track, point) if by_object else None,
         weight,
         bend,
+        _by_standing(pair, point, A, motion),
     )
+
+
+def _by_standing(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
+    """The information of matches of objects that stand; the vector is not of interest."""
+    moves = moving_matches(pair)
+    if not moves.any():
+        return None
+    stands = A[~moves]
+    return _without_twist(point, stands.T @ stands + motion, np.zeros(A.shape[1]))[0]
 
 
 def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian, FloatArray]:

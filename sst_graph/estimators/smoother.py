@@ -62,7 +62,7 @@ class WindowSmoother:
     ) -> None:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.prior = self.past = self.bent = prior
+        self.prior = self.past = self.bent = self.alone = prior
         self.undecided = Undecided.none(prior.point.size)
         self.sums = ScoreSums.empty(prior.point.size)
         self.entries: dict[int, Entry] = {}
@@ -128,7 +128,7 @@ class WindowSmoother:
     def _take(self, change: Change) -> None:
         self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
         self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
-        self.past, self.bent, self.sums = change.past, change.bent, change.sums
+        self.past, self.bent, self.alone, self.sums = change.past, change.bent, change.alone, change.sums
         self.undecided = change.undecided
         self.epoch_sums, self._point = change.epoch_sums, change.point
         self.retired += change.retired
@@ -234,12 +234,24 @@ class WindowSmoother:
 
     def _information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent."""
-        belief = self.past
+        return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
+
+    def information_of_standing(self) -> FloatArray | None:
+        """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
+        alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
+        moves = any(entry.score.standing is not None for entry in self.entries.values())
+        if not moves and np.array_equal(alone.information, self.past.information):
+            return None
+        return self._onwards(alone, beliefs)
+
+    def _onwards(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
+        """(n, n) information of a past and a window, by scan, on the last epoch."""
+        belief = past
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 walk = self.walk(self._seconds(i))
                 belief = belief.drifted(walk)
-            seen = [e.score.belief for e in self.entries.values() if e.epoch == epoch.number]
+            seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
             belief = replace(belief, information=belief.information_with(seen))
         return belief.information
 

@@ -98,7 +98,7 @@ def find_start(
         return [Candidate(guess, offset_s, 0.0)]
     frames, camera = _looked_at(drives, tracks, classes, offset_s, config)
     candidates = search_start(frames, camera, classes, guess, offset_s, config.search)
-    _LOG.info("start: %d frames, scores %s", len(frames), [round(c.score, 4) for c in candidates])
+    _LOG.info("start: %d frames, best scores %s", len(frames), [round(c.score, 4) for c in candidates[:5]])
     return candidates
 
 

@@ -60,7 +60,10 @@ class AlarmConfig:
             goes up and down, as of a camera whose exposure sets it.
         baseline: quiet frames over which the usual size of the statistic is learnt: real labels err more
             than any model says.
-        warm_up: frames after the start (or a restart) before anything is called an alarm.
+        start_chi2: a start is refused if the statistic of some of its own frames is larger: the calibration
+            changed among them, or it was none.
+        warm_up: frames after the start (or a restart) before a contradiction is called an alarm; until then
+            the start is given up.
     """
 
     enabled: bool = True
@@ -79,10 +82,13 @@ class AlarmConfig:
     confirm_mps: float = 3.0
     stamps: bool = True
     baseline: int = 300
+    start_chi2: float = 15.0
     warm_up: int = 15
 
     def __post_init__(self) -> None:
-        _require_positive(self, "kernel_px", "frames", "chi2", "confirmations", "lost", "baseline")
+        _require_positive(
+            self, "kernel_px", "frames", "chi2", "start_chi2", "confirmations", "lost", "baseline"
+        )
         _require_positive(self, "shown_deg", "shown_s", "confirm_s", "confirm_offset_s")
         if self.patience < max(self.frames, self.confirmations):
             raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")

@@ -125,6 +125,35 @@ class Watch:
             self._confirm(point, joint, model, restless)
         return value
 
+    def disagreement(
+        self,
+        scans: Sequence[int],
+        point: Point,
+        joint: Joint,
+        model: ErrorModel,
+        restless: Collection[int],
+    ) -> float:
+        """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
+
+        The parts are its first ones, its last ones, and any few in a row. They have all been heard, so the
+        statistic is well below chi-square's where they are of one calibration.
+
+        Args:
+            scans: in the order of time.
+        """
+        pairs = self.matcher.pairs_at(point, scans, self._kernel)
+        scores = [self.matcher.scores_of({scan: pairs[scan]}, point, restless) for scan in sorted(pairs)]
+        n, few = len(scores), self.config.frames
+        cuts = range(2, n - 1)
+        parts = {
+            *((0, k) for k in cuts),
+            *((k, n) for k in cuts),
+            *((k, k + few) for k in range(n - few + 1)),
+        }
+        found = [[score for own in scores[a:b] for score in own] for a, b in parts]
+        values = [self.alarm.value(self.alarm.compare(some, joint, model)) for some in found if some]
+        return max(values, default=0.0)
+
     def _confirm(self, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
         config, compared = self.config, self.alarm.compared

@@ -86,6 +86,25 @@ def weak_directions(
     return tuple(found)
 
 
+def open_directions(
+    covariance: FloatArray,
+    by_standing: FloatArray | None,
+    cTl: gtsam.Pose3,
+    config: ObservabilityConfig,
+    advice: Advice = SILHOUETTES,
+) -> tuple[WeakDirection, ...]:
+    """Directions that are not known: by the covariance or, where that is well, by what stands alone.
+
+    Args:
+        covariance: (7, 7) of the answer.
+        by_standing: (7, 7) by objects that stand alone, where that is asked, too.
+    """
+    weak = weak_directions(covariance, cTl, config, advice)
+    if weak or by_standing is None:
+        return weak
+    return inseparable_directions(by_standing, cTl, config)
+
+
 def inseparable_directions(
     covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
 ) -> tuple[WeakDirection, ...]:

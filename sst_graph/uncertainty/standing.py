@@ -28,7 +28,7 @@ def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) 
         robust: with all of them.
         pairs: its matches.
     """
-    moves = np.concatenate([_moves(pair) for pair in pairs])
+    moves = np.concatenate([moving_matches(pair) for pair in pairs])
     if not moves.any():
         return robust.matrix
     if moves.all():
@@ -40,8 +40,8 @@ def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) 
     return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
 
 
-def _moves(pair: PairMatches) -> NDArray[np.bool_]:
-    """(m,) whether the object of each match moves, class by class."""
+def moving_matches(pair: PairMatches) -> NDArray[np.bool_]:
+    """(m,) whether the object of each match moves with a known velocity, class by class."""
     found = []
     for matches in pair.matches.values():
         velocities = matches.alignment.l_velocities

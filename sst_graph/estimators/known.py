@@ -1,0 +1,65 @@
+"""How well a running estimate is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import EstimationError
+from sst_graph.estimators.alarm import Joint
+from sst_graph.estimators.gaussian import scaled_inverse
+from sst_graph.estimators.smoother import WindowSmoother
+
+FloatArray = NDArray[np.float64]
+
+_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""Of an estimate that does not exist yet [rad, m, s]."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """Covariance of an estimate, and what stands behind it.
+
+    Attributes:
+        joint: cluster-robust covariance of all unknowns.
+        inflation: how much larger it is than that of independent matches.
+        by_standing: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
+            object moves.
+    """
+
+    joint: Joint
+    inflation: float = 1.0
+    by_standing: FloatArray | None = None
+
+    @classmethod
+    def nothing(cls) -> Known:
+        """Before there is an estimate."""
+        return cls(Joint(np.diag(np.square(_UNKNOWN_SIGMAS)), (), len(_UNKNOWN_SIGMAS)))
+
+    @classmethod
+    def of(cls, smoother: WindowSmoother) -> Known:
+        """Of a smoother's estimate.
+
+        Raises:
+            EstimationError: it has no covariance.
+        """
+        matrix, naive = smoother.covariance()
+        if not (np.isfinite(matrix).all() and (np.diag(matrix) > 0.0).all()):
+            raise EstimationError("a covariance that is not finite")
+        m = smoother.past.point.core_size
+        share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
+        inflation = max(1.0, float(share))
+        by_standing = None
+        alone = smoother.information_of_standing()
+        if alone is not None:
+            wider = scaled_inverse(alone)[:7, :7] - naive[:7, :7]
+            by_standing = matrix[:7, :7] + inflation * wider
+        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_standing)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(m, m) covariance of extrinsic, offset and mask biases."""
+        m = self.joint.core_size
+        return self.joint.matrix[:m, :m]

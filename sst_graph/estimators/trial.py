@@ -1,0 +1,55 @@
+"""Whether a new start holds: against the frames it was made of, and the first that come after it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from sst_graph.estimators.known import Known
+from sst_graph.estimators.smoother import WindowSmoother
+from sst_graph.estimators.tracker_config import TrackerConfig
+from sst_graph.estimators.watch import Watch
+
+_MOST_REFUSED = 2
+"""Starts in a row that are refused because frames contradict them: labels may err as much."""
+
+
+class Trial:
+    """The first frames of a tracker's estimate.
+
+    Where the calibration changed among the frames of a start, or where the start was none, its estimate lies
+    between two or beside all, with a covariance that knows of neither.
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.alarm, self.after = config.alarm, config.start_scans // 2
+        self.first = 0
+        self.refused = 0
+
+    def begin(self, scan: int) -> None:
+        """An estimate begins; the scan of this number comes next."""
+        self.first = scan
+
+    def over(self, scan: int) -> bool:
+        """Whether a contradiction is a change of the calibration from this scan on, not a bad start."""
+        return scan - self.first >= self.alarm.warm_up or self.refused >= _MOST_REFUSED
+
+    def check(self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]) -> str:
+        """In what way frames contradict the estimate that was made of them; empty where they do not."""
+        if not self.alarm.enabled or self.refused >= _MOST_REFUSED:
+            return ""
+        scans = sorted(smoother.entries)
+        value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, restless)
+        if value <= self.alarm.start_chi2:
+            return ""
+        return f"frames of the start contradict each other (chi-square {value:.0f}): it begins anew"
+
+    def check_again(
+        self, scan: int, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+    ) -> str:
+        """The same once more when half as many frames again have come; a start that passes has held."""
+        if scan - self.first != self.after:
+            return ""
+        why = self.check(watch, smoother, known, restless)
+        if not why:
+            self.refused = 0
+        return why
