@@ -39,7 +39,7 @@ def _turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border:
     return dataclasses.replace(image, mask=mask)
 
 
-def _knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
+def knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
     """The image of a camera turned about its vertical axis."""
     return _turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)
 
@@ -55,7 +55,7 @@ def test_a_step_raises_the_alarm_and_is_learnt(
         image = frame.image
         assert image is not None
         if frame.index >= STEP and kind == "knock":
-            image = _knocked(image, street, 1.5)
+            image = knocked(image, street, 1.5)
         elif frame.index >= STEP:
             image = dataclasses.replace(image, stamp_ns=image.stamp_ns + 100_000_000)
         update = tracker.add(dataclasses.replace(frame, image=image))
@@ -226,7 +226,7 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
         if frame.index == STEP:
             monkeypatch.setattr(tracker.window, "restless", lambda: set(tracker.window.objects.live))
         if frame.index >= STEP:
-            image = _knocked(image, street, 1.5)
+            image = knocked(image, street, 1.5)
         update = tracker.add(dataclasses.replace(frame, image=image))
         ages.append(update.unconfirmed_s)
         assert not update.alarm and not (update.adopted and frame.index > STEP + 10)
@@ -298,7 +298,7 @@ def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -
         yaw_deg = 0.25e-9 * (frame.scan.stamp_ns - start_ns)
         for tracker in (follows, steady):
             assert not tracker.add(
-                dataclasses.replace(frame, image=_knocked(frame.image, street, yaw_deg))
+                dataclasses.replace(frame, image=knocked(frame.image, street, yaw_deg))
             ).alarm
     errors = [_yaw_error(street, entry, 0.25e-9 * (entry.stamp_ns - start_ns)) for entry in follows.history()]
     assert len(errors) >= 5
