@@ -41,7 +41,7 @@ class Answer:
         frames: that took part.
         doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: what else was missing, for the reader.
-        by_standing: (7, 7) covariance by objects that stand alone, no motion heard.
+        by_standing: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
         drive_offsets: an offset for each drive, where one each was asked for.
         diagnostics: JSON-able numbers about the run.
     """

@@ -165,6 +165,8 @@ def answer_joint(
         solution = heard.solution
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
+        if config.use_motion == "always":
+            by_standing = standing_covariance(robust, solution.pairs)
     model, cTl = robust.model, solution.state.cTl
     return Answer(
         cTl,

@@ -44,6 +44,8 @@ class AlarmConfig:
         confirmations: frames in a row past the threshold; then it must hold without any one object, too
             (the threshold grows with the frames since) ...
         others: ... and this share of the statistic must remain.
+        alone: a single object is believed once ``frames`` + ``confirmations`` frames say so, where the
+            statistic is this many times the threshold.
         patience: frames in a row past the threshold after which it is given up: they are learnt from by then.
         lost: frames in a row, but for one of them, in which next to nothing of what ought to be in view meets
             the image's labels: the step is larger than matches reach.
@@ -72,6 +74,7 @@ class AlarmConfig:
     chi2: float = 25.0
     confirmations: int = 3
     others: float = 0.2
+    alone: float = 4.0
     patience: int = 20
     lost: int = 8
     lost_share: float = 0.12
@@ -87,7 +90,7 @@ class AlarmConfig:
 
     def __post_init__(self) -> None:
         _require_positive(
-            self, "kernel_px", "frames", "chi2", "start_chi2", "confirmations", "lost", "baseline"
+            self, "kernel_px", "frames", "chi2", "start_chi2", "alone", "confirmations", "lost", "baseline"
         )
         _require_positive(self, "shown_deg", "shown_s", "confirm_s", "confirm_offset_s")
         if self.patience < max(self.frames, self.confirmations):

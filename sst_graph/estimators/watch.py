@@ -213,7 +213,8 @@ class Watch:
         """The estimate from before a doubt, if all frames since say that the calibration has changed.
 
         They must do so with any one object left out, too. Where a single object says so, its labels may
-        err for a while: with one in view, or one that tells far more than the others, none can decide that.
+        err for a while: with one in view, or one that tells far more than the others, it must say so for
+        longer and much more clearly.
         """
         if self.kept is None:
             return None
@@ -227,7 +228,9 @@ class Watch:
 
         # A step shows more clearly with every frame; labels whose errors last do not.
         more = len(scans) / (config.frames + config.confirmations)
-        whole = value()
-        least = max(config.chi2 * max(1.0, more), config.others * whole)
+        whole, threshold = value(), config.chi2 * max(1.0, more)
+        if more >= 1.0 and whole > config.alone * threshold:
+            return kept
+        least = max(threshold, config.others * whole)
         asked = self.matcher.objects_of(scans) - set(restless)
         return kept if whole > least and all(value(track) > least for track in asked) else None

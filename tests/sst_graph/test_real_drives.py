@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from sst_graph import CalibrationConfig, calibrate, open_source
+from sst_graph.config import with_overrides
 from sst_graph.metrics import calibration_errors
 
-STOP = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_2011_09_26_stop"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+STOP, PARKED = DATA / "kitti_2011_09_26_stop", DATA / "kitti_2011_09_26_parked"
 
 
 @pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
@@ -23,3 +25,22 @@ def test_a_slow_drive_with_a_stop(shift: int) -> None:
     assert result.status == "ok"
     assert errors.qad_deg < 0.2 and errors.atd_m < 0.02
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
+
+
+@pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
+@pytest.mark.parametrize(("use_motion", "status"), [("auto", "unobservable"), ("always", "ok")])
+def test_a_steady_drive(use_motion: str, status: str) -> None:
+    """At one speed the labels cannot tell forward from later; the pitching body can, where it is always heard."""
+    drive = open_source(PARKED, image_shift=1)
+    result = calibrate(
+        drive, drive.nominal, with_overrides(CalibrationConfig(), [f"use_motion={use_motion}"])
+    )
+    assert drive.truth is not None and drive.truth.time_offset_s is not None
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    assert result.status == status
+    assert errors.qad_deg < 0.2
+    if status == "ok":
+        assert errors.atd_m < 0.1
+        assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
+    else:
+        assert "1 m equals" in result.reasons[0]
