@@ -42,6 +42,7 @@ from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
 from sst_graph.uncertainty.observability import weak_directions
 from sst_graph.uncertainty.standing import standing_covariance
+from sst_graph.uncertainty.unknown_motion import unknown_motion_covariance
 
 FloatArray = NDArray[np.float64]
 
@@ -171,7 +172,7 @@ def answer_joint(
     return Answer(
         cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7] + common_covariance(cTl, drives[0].camera, config.common_error),
+        covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
         remarks=_remarks(drives),
         by_standing=by_standing[:7, :7],
@@ -288,13 +289,24 @@ def _doubts(
     return tuple(doubts)
 
 
+def _beside_matches(
+    drives: Sequence[Drive], solution: JointSolution, variance_s2: float, config: CalibrationConfig
+) -> FloatArray:
+    """(7, 7) covariance by what no match shows."""
+    common = common_covariance(solution.state.cTl, drives[0].camera, config.common_error)
+    return common + unknown_motion_covariance(
+        solution.pairs, solution.state, variance_s2, config.unknown_motion
+    )
+
+
 def _remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
     """What was taken for granted."""
     if all(drive.lidar_motions for drive in drives):
         return ()
     return (
         "a single scan tells no motion and was taken as standing: at 1 m/s every 100 ms between scan and "
-        "image would shift the translation by 10 cm; give its neighbours too",
+        "image would shift the translation by 10 cm; give its neighbours too, or, if it stood, say so "
+        "(unknown_motion.speed_mps and unknown_motion.turn_deg_per_s 0)",
     )
 
 

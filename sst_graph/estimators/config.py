@@ -16,6 +16,7 @@ from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.common_error import CommonErrorConfig
 from sst_graph.uncertainty.observability import ObservabilityConfig
+from sst_graph.uncertainty.unknown_motion import UnknownMotionConfig
 
 Method = Literal["joint", "paper", "static", "semalign", "motion"]
 UseMotion = Literal["auto", "always", "never"]
@@ -44,6 +45,7 @@ class CalibrationConfig:
         motion: hand-eye calibration.
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
         common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
+        unknown_motion: the same where a single scan tells no motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
             no one time offset; not for sensors whose rate goes up and down.
@@ -62,5 +64,6 @@ class CalibrationConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
     common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
+    unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
     check_stamps: bool = True
