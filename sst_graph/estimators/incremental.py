@@ -380,7 +380,7 @@ class Tracker:
         since = self.watch.confirmation
         if self.smoother is not None:
             weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
-            late = since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
+            late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
         return TrackUpdate(
             stamp_ns=stamp_ns,

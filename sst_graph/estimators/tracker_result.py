@@ -19,7 +19,7 @@ def tracker_result(
     if last.status == "unobservable":
         status = "unobservable"
     elif last.status == "unconfirmed":
-        reasons = _unconfirmed(last)
+        reasons = _unconfirmed(last, tracker.trial.on)
     elif last.status != "ok":
         reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
     entries = {} if tracker.smoother is None else tracker.smoother.entries
@@ -54,7 +54,9 @@ def tracker_result(
     )
 
 
-def _unconfirmed(last: TrackUpdate) -> tuple[str, ...]:
+def _unconfirmed(last: TrackUpdate, new: bool) -> tuple[str, ...]:
+    if new:
+        return ("the start has not been checked against frames that came after it",)
     return (
         "no frame would have shown a change: of where the camera looks for the last "
         f"{last.unconfirmed_s:.1f} s, of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"

@@ -18,16 +18,20 @@ class Trial:
 
     Where the calibration changed among the frames of a start, or where the start was none, its estimate lies
     between two or beside all, with a covariance that knows of neither.
+
+    Attributes:
+        on: the start has not been checked against frames that came after it.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
         self.alarm, self.after = config.alarm, config.start_scans // 2
         self.first = 0
         self.refused = 0
+        self.on = False
 
     def begin(self, scan: int) -> None:
         """An estimate begins; the scan of this number comes next."""
-        self.first = scan
+        self.first, self.on = scan, self.alarm.enabled
 
     def over(self, scan: int) -> bool:
         """Whether a contradiction is a change of the calibration from this scan on, not a bad start."""
@@ -47,9 +51,9 @@ class Trial:
         self, scan: int, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
     ) -> str:
         """The same once more when half as many frames again have come; a start that passes has held."""
-        if scan - self.first != self.after:
+        if not self.on or scan - self.first < self.after:
             return ""
         why = self.check(watch, smoother, known, restless)
         if not why:
-            self.refused = 0
+            self.refused, self.on = 0, False
         return why
