@@ -278,8 +278,7 @@ class Tracker:
         if new:
             self.arrivals.take(number, self._reported())
         # 4. Does a new start hold?
-        if why := self.trial.check_again(number, self.watch, smoother, self.known, restless):
-            return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
+        self.trial.look_again(number, self.watch, smoother, self.known, restless)
         # 5. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"

@@ -56,7 +56,7 @@ def tracker_result(
 
 def _unconfirmed(last: TrackUpdate, new: bool) -> tuple[str, ...]:
     if new:
-        return ("the start has not been checked against frames that came after it",)
+        return ("no frames that came after the start have been found to agree with those it was made of",)
     return (
         "no frame would have shown a change: of where the camera looks for the last "
         f"{last.unconfirmed_s:.1f} s, of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"

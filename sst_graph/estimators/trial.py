@@ -20,18 +20,18 @@ class Trial:
     between two or beside all, with a covariance that knows of neither.
 
     Attributes:
-        on: the start has not been checked against frames that came after it.
+        on: frames that came after the start have not been found to agree with those it was made of.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
-        self.alarm, self.after = config.alarm, config.start_scans // 2
-        self.first = 0
+        self.alarm, self.soon = config.alarm, config.start_scans // 2
+        self.first, self.after = 0, self.soon
         self.refused = 0
         self.on = False
 
     def begin(self, scan: int) -> None:
         """An estimate begins; the scan of this number comes next."""
-        self.first, self.on = scan, self.alarm.enabled
+        self.first, self.after, self.on = scan, self.soon, self.alarm.enabled
 
     def over(self, scan: int) -> bool:
         """Whether a contradiction is a change of the calibration from this scan on, not a bad start."""
@@ -41,19 +41,29 @@ class Trial:
         """In what way frames contradict the estimate that was made of them; empty where they do not."""
         if not self.alarm.enabled or self.refused >= _MOST_REFUSED:
             return ""
-        scans = sorted(smoother.entries)
-        value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, restless)
-        if value <= self.alarm.start_chi2:
+        value = self._contradiction(watch, smoother, known, restless)
+        if not value:
             return ""
         return f"frames of the start contradict each other (chi-square {value:.0f}): it begins anew"
 
-    def check_again(
+    def _contradiction(
+        self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+    ) -> float:
+        """The statistic of the frames in the graph, where it is past the limit; else 0."""
+        scans = sorted(smoother.entries)
+        value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, restless)
+        return value if value > self.alarm.start_chi2 else 0.0
+
+    def look_again(
         self, scan: int, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
-    ) -> str:
-        """The same once more when half as many frames again have come; a start that passes has held."""
+    ) -> None:
+        """The same when half as many frames again have come, and then each time after twice as many.
+
+        Labels that err for a while contradict a start as a step does, so it is not given up any more; but
+        until its frames agree it is not called ok.
+        """
         if not self.on or scan - self.first < self.after:
-            return ""
-        why = self.check(watch, smoother, known, restless)
-        if not why:
+            return
+        self.after *= 2
+        if not self._contradiction(watch, smoother, known, restless):
             self.refused, self.on = 0, False
-        return why
