@@ -22,7 +22,7 @@ class DataError(SstGraphError):
         super().__init__(f"{self.place}: found {found}, expected {expected}")
 
 
-class ConfigError(SstGraphError):
+class ConfigError(SstGraphError, ValueError):
     """A configuration or command-line value that is unknown or out of its range."""
 
 
