@@ -223,8 +223,10 @@ class _Seen:
     def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _Seen:
         outlines = {}
         for c in MOVABLE_CLASSES:
-            if (points := scan.boundaries.get(c)) is not None and len(points):
-                points = points.take(np.flatnonzero(points.edges == Edge.SIDE))
+            if (points := scan.boundaries.get(c)) is None:
+                continue
+            points = points.take(np.flatnonzero(points.edges == Edge.SIDE))
+            if len(points):
                 wPs = points.lPs @ wTl.rotation().matrix()[:2].T + wTl.translation()[:2]
                 order = np.argsort(points.objects, kind="stable")
                 numbers, starts = np.unique(points.objects[order], return_index=True)
