@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sst_graph.config import Settings
 from sst_graph.estimators.challenge import ChallengeConfig
 from sst_graph.estimators.joint import JointConfig
 from sst_graph.estimators.motion import MotionConfig
@@ -23,7 +24,7 @@ UseMotion = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
-class CalibrationConfig:
+class CalibrationConfig(Settings):
     """What to do and how; one part a stage, written beside every result.
 
     Attributes:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -24,7 +25,7 @@ UNTRACKED_CLASSES = (
 
 
 @dataclass(frozen=True)
-class FeatureConfig:
+class FeatureConfig(Settings):
     """Which corners are tracked, and when a track counts.
 
     Attributes:
@@ -37,13 +38,13 @@ class FeatureConfig:
         max_round_trip_px: largest distance between a corner and its track there and back [px].
     """
 
-    threshold: int = 12
-    cell_px: int = 32
-    per_cell: int = 2
-    mask_margin_px: int = 5
-    window_px: int = 17
-    levels: int = 4
-    max_round_trip_px: float = 0.5
+    threshold: int = setting(12, at_least=1, at_most=255)
+    cell_px: int = setting(32, at_least=4, at_most=1000)
+    per_cell: int = setting(2, at_least=1, at_most=1000)
+    mask_margin_px: int = setting(5, at_least=0, at_most=100)
+    window_px: int = setting(17, at_least=3, at_most=101)
+    levels: int = setting(4, at_least=0, at_most=10)
+    max_round_trip_px: float = setting(0.5, at_least=0.01, at_most=100.0)
 
 
 @dataclass(frozen=True)

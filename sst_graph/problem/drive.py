@@ -13,6 +13,7 @@ from factors.camera import PinholeCamera
 from sst_graph.association.boundary import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.association.contour import ContourMap
 from sst_graph.association.picture_edges import PictureConfig
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -27,7 +28,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class PrepareConfig:
+class PrepareConfig(Settings):
     """What is taken from every frame.
 
     Attributes:
@@ -44,7 +45,7 @@ class PrepareConfig:
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
     use_visual_odometry: bool = True
-    sample_points: int = 3000
+    sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
 
 
 @dataclass(frozen=True)

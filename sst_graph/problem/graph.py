@@ -21,6 +21,8 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
+from sst_graph.config import Settings, setting
+from sst_graph.errors import ConfigError
 from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.objects import Mover, ObjectId, moving_objects, numbers_in, of_each, standing_share
 from sst_graph.problem.state import (
@@ -43,7 +45,7 @@ _Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray | None]
 
 
 @dataclass(frozen=True)
-class GraphConfig:
+class GraphConfig(Settings):
     """Priors and limits of the joint graph.
 
     Attributes:
@@ -66,15 +68,21 @@ class GraphConfig:
 
     match: MatchConfig = field(default_factory=MatchConfig)
     undersides: tuple[SemanticClass, ...] = ()
-    max_interval_periods: float = 1.0
-    bias_sigma_px: float = 3.0
-    object_bias_sigma_px: float = 0.5
-    underside_bias_sigma_px: float = 2.0
-    delay_sigma_s: float = 0.3
-    rest_sigma_rad: float = 1.0
-    rest_sigma_m: float = 0.5
-    mover_reach_m: float = 0.003
-    still_sigma: tuple[float, float] = (0.05, 0.5)
+    max_interval_periods: float = setting(1.0, at_least=0.01, at_most=20.0)
+    bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
+    object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
+    underside_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
+    delay_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
+    rest_sigma_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
+    rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
+    mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
+    still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        if 0.0 < self.object_bias_sigma_px < 0.001:
+            raise ConfigError(
+                f"object_bias_sigma_px: found {self.object_bias_sigma_px:g}, expected 0 or at least 0.001 px"
+            )
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.result import DIRECTION_SCALES, WeakDirection
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +49,7 @@ MOTION = Advice(
 
 
 @dataclass(frozen=True)
-class ObservabilityConfig:
+class ObservabilityConfig(Settings):
     """Largest standard deviations of an answer that may be called ok.
 
     Attributes:
@@ -60,11 +61,11 @@ class ObservabilityConfig:
         pair_share: ... and must tell them to this share of the limits.
     """
 
-    rotation_deg: float = 0.5
-    translation_m: float = 0.05
-    offset_s: float = 0.01
-    pair_correlation: float = 0.98
-    pair_share: float = 0.5
+    rotation_deg: float = setting(0.5, at_least=1e-6, at_most=180.0)
+    translation_m: float = setting(0.05, at_least=1e-6, at_most=1000.0)
+    offset_s: float = setting(0.01, at_least=1e-9, at_most=1000.0)
+    pair_correlation: float = setting(0.98, at_least=0.0, at_most=2.0)
+    pair_share: float = setting(0.5, at_least=0.001, at_most=1.0)
 
 
 def weak_directions(
