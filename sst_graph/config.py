@@ -9,15 +9,14 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import enum
-import json
 import math
-import tomllib
 import types
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.input_files import SETTINGS, parse_json, read_json, read_toml
 
 T = TypeVar("T")
 
@@ -57,13 +56,7 @@ def read_config(cls: type[T], path: Path) -> T:
     """
     if path.suffix not in (".json", ".toml"):
         raise DataError(path, f"suffix '{path.suffix}'", ".json or .toml")
-    try:
-        text = path.read_text(encoding="utf-8")
-        data = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except FileNotFoundError:
-        raise DataError(path, "no such file", "a configuration file") from None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError(path, str(error).splitlines()[0], f"readable {path.suffix[1:].upper()}") from error
+    data = read_json(path, SETTINGS) if path.suffix == ".json" else read_toml(path, SETTINGS)
     if not isinstance(data, dict):
         raise DataError(path, type(data).__name__, "a table of settings")
     try:
@@ -109,8 +102,8 @@ def _replaced(config: T, path: Sequence[str], value: Any, where: str) -> T:
 def _parsed(text: str) -> Any:
     """``text`` as JSON where it is JSON, else as it stands."""
     try:
-        return json.loads(text)
-    except json.JSONDecodeError:
+        return parse_json(text, "value")
+    except DataError:
         return text
 
 

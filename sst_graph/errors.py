@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from factors.errors import SstGraphError, printable
+from factors.exceptions import SstGraphError, printable
 
 __all__ = [
     "ConfigError",

@@ -68,7 +68,7 @@ def read_file(path: str | Path, kind: FileKind) -> bytes:
             _require_regular(os.fstat(descriptor), path, kind)
             data = stream.read(kind.max_bytes + 1)
     except FileNotFoundError:
-        raise DataError(path, "no file", kind.name) from None
+        raise DataError(path, "no such file", kind.name) from None
     except OSError as error:
         raise DataError(path, f"an unreadable file ({error.strerror or error})", kind.name) from None
     except ValueError as error:  # a NUL or a lone surrogate in the name
