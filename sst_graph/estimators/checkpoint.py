@@ -6,6 +6,7 @@ can answer; a file that passes none of it is refused as a whole.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import io
@@ -25,6 +26,7 @@ from sst_graph.estimators.incremental import Tracker
 from sst_graph.files import atomic_write_bytes
 from sst_graph.input_files import FileKind, parse_json, read_file
 from sst_graph.storage import class_name, restored, stored
+from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
 VERSION = 15
@@ -100,7 +102,7 @@ def _tracker(node: Any, data: memoryview, path: str | Path) -> Tracker:
 
 
 def _rehearse(tracker: Tracker, path: str | Path) -> None:
-    """Require a tracker that answers: its parts go with each other.
+    """Require a tracker that answers and takes its last frame once more: its parts go with each other.
 
     Raises:
         CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
@@ -109,11 +111,25 @@ def _rehearse(tracker: Tracker, path: str | Path) -> None:
         checked_camera(tracker.camera, "camera")
         tracker.current().to_dict()
         tracker.consolidate()
+        _again(tracker)
         tracker.current().to_dict()
         stored(tracker)
     except Exception as error:
         found = f"a tracker that does not answer ({type(error).__name__}: {error})"
         raise CheckpointError(path, found, "all of a tracker") from error
+
+
+def _again(tracker: Tracker) -> None:
+    """The last frame once more, a second later."""
+    scan, images = tracker.last_scan, tracker.window.images
+    stamps = [one.stamp_ns for one in (scan, *images) if one is not None]
+    if not stamps:
+        return
+    later = max(stamps) + 1_000_000_000
+    if images:
+        tracker.add_image(CameraImage(later, images[-1].mask, NO_PICTURE))
+    if scan is not None:
+        tracker.add_scan(dataclasses.replace(scan, stamp_ns=later))
 
 
 @cache
@@ -143,13 +159,14 @@ def _members(archive: bytes, path: str | Path) -> tuple[str, memoryview]:
             if file.namelist() != names:
                 raise ValueError(f"members {file.namelist()!r:.100}")
             head, data, digest = (_bytes_of(file, name, len(archive)) for name in names)
+            text = bytes(head).decode("ascii")
     except (zipfile.BadZipFile, zlib.error, ArithmeticError, LookupError, OSError, RuntimeError) as error:
         raise _unreadable(path, error) from error
     except (EOFError, MemoryError, NotImplementedError, SyntaxError, TypeError, ValueError) as error:
         raise _unreadable(path, error) from error
     if _digest(head, data) != bytes(digest):
         raise CheckpointError(path, "no readable checkpoint (another checksum)", "one as it was written")
-    return bytes(head).decode("ascii"), data
+    return text, data
 
 
 def _bytes_of(file: zipfile.ZipFile, name: str, most: int) -> memoryview:
