@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from factors.errors import SstGraphError, printable
+from factors.exceptions import SstGraphError, printable
 
 __all__ = [
+    "CheckpointError",
     "ConfigError",
     "DataError",
     "EstimationError",
@@ -33,6 +34,10 @@ class DataError(SstGraphError):
 
     def __reduce__(self) -> tuple[type[DataError], tuple[str, str, str]]:
         return type(self), (self.place, self.found, self.expected)
+
+
+class CheckpointError(DataError):
+    """A checkpoint that cannot be read back: damaged, changed, or of another version."""
 
 
 class ConfigError(SstGraphError, ValueError):

@@ -53,6 +53,7 @@ class Scan:
         offsets_s: (n,) float32, time of each point minus ``stamp_ns`` [s], or None where all
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
+        left_out: number of points that the data held beside these, and that were NaN or inf.
     """
 
     stamp_ns: int
@@ -61,6 +62,16 @@ class Scan:
     instances: NDArray[np.uint16] | None = None
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+    left_out: int = 0
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether any point is known to be of some class."""
+        return bool((self.classes != SemanticClass.IGNORE).any())
+
+
+NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
+"""Pixels of an image whose picture is missing."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +80,8 @@ class CameraImage:
 
     Attributes:
         stamp_ns: camera-clock stamp [ns].
-        mask: (h, w) uint8 of :class:`SemanticClass`.
-        pixels: (h, w, 3) uint8 BGR picture.
+        mask: (h, w) uint8 of :class:`SemanticClass`; all IGNORE where there is no mask.
+        pixels: (h, w, 3) uint8 BGR picture, or :data:`NO_PICTURE`.
         instances: (h, w) uint16 instance number (0: none), or None.
     """
 
@@ -78,6 +89,15 @@ class CameraImage:
     mask: NDArray[np.uint8]
     pixels: NDArray[np.uint8]
     instances: NDArray[np.uint16] | None = None
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether any pixel is known to be of some class."""
+        return bool((self.mask != SemanticClass.IGNORE).any())
+
+    @property
+    def has_picture(self) -> bool:
+        return self.pixels.size > 0
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,7 +40,7 @@ def open_drives(args: argparse.Namespace) -> list[Source]:
     Raises:
         ConfigError: a drive is named twice.
     """
-    paths = [path.resolve() for path in args.data]
+    paths = [os.path.realpath(path) for path in args.data]
     if len(set(paths)) != len(paths):
         raise ConfigError("the same DATA is given twice: each drive counts once")
     return [open_drive(args, path) for path in args.data]

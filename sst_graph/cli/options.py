@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
 
@@ -27,7 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
         epilog="Exit codes: 0 done; 2 bad input or usage; 3 finished, but the result is not to be trusted "
         "(the reason is on stderr, the files are written).",
     )
-    parser.add_argument("--version", action="version", version=f"sst-graph {version('sst-graph')}")
+    parser.add_argument("--version", action="version", version=f"sst-graph {_version()}")
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
     )
@@ -45,6 +45,14 @@ def build_parser() -> argparse.ArgumentParser:
         command = add(commands)
         command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
     return parser
+
+
+def _version() -> str:
+    """Of the installed distribution; a checkout on the path has none."""
+    try:
+        return version("sst-graph")
+    except PackageNotFoundError:
+        return "(not installed)"
 
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

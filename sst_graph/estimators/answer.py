@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, open_direct
 
 FloatArray = NDArray[np.float64]
 
-PACKAGES = ("sst-graph", "gtsam", "numpy", "opencv-python-headless", "scipy", "small_gicp")
+PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
 
 
 @dataclass(frozen=True)
@@ -120,4 +121,13 @@ def no_answer(
 
 
 def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    """Of what took part; OpenCV's by the module, for four distributions bring it."""
+    return {**{name: _version(name) for name in PACKAGES}, "opencv": str(cv2.__version__)}
+
+
+def _version(name: str) -> str:
+    """A distribution's version; a package that was put on the path by hand has none."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"

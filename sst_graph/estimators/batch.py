@@ -115,8 +115,11 @@ def calibrate_prepared(
         result = result_of(answer, drives, guess, config)
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
-    timing = {"estimate": time.perf_counter() - began}
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
+    left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
+    if left_out:
+        diagnostics["left_out"] = left_out
+    return dataclasses.replace(result, diagnostics=diagnostics)
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:

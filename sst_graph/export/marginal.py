@@ -21,12 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.result import CalibrationResult, checked_pose
+from sst_graph.input_files import MARGINAL, parse_json, read_text
+from sst_graph.json_table import JsonTable, json_table
+from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
 
 FORMAT = "sst-graph/marginal"
 VERSION = 1
+
+MAX_INFORMATION = 1e24
+"""Of a sigma of 1e-12 rad, m or s."""
 
 EXTRINSIC = int(gtsam.symbol("E", 0))
 """Default key of the extrinsic cTl (Pose3)."""
@@ -114,22 +119,44 @@ class CalibrationMarginal:
         Raises:
             DataError: no such file's text.
         """
-        try:
-            document = json.loads(text)
-            found = (document["format"], document["version"])
-            if found != (FORMAT, VERSION):
-                raise DataError(place, f"{found[0]!r} version {found[1]!r}", f"{FORMAT!r} version {VERSION}")
-            point = document["linearization_point"]
-            pose = checked_pose(_array(point["T_camera_lidar"], (4, 4)), f"{place}: T_camera_lidar")
-            return CalibrationMarginal(
-                pose,
-                float(point["time_offset_s"]),
-                _array(document["information"], (7, 7)),
-                _array(document["vector"], (7,)),
-                float(document["constant"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(place, f"no marginal ({error!r})", f"JSON of format {FORMAT!r}") from error
+        table = json_table(parse_json(text, place, MARGINAL.name), place, FORMAT, VERSION)
+        point = table.table("linearization_point")
+        return CalibrationMarginal(
+            point.pose("T_camera_lidar"),
+            point.offset_s("time_offset_s"),
+            _information(table),
+            table.matrix("vector", (7,)),
+            table.number("constant"),
+        )
+
+
+def read_marginal(path: str | Path) -> CalibrationMarginal:
+    """The marginal in a file.
+
+    Raises:
+        DataError: missing, unreadable or no such file.
+    """
+    return CalibrationMarginal.from_json(read_text(path, MARGINAL), path)
+
+
+def _information(table: JsonTable) -> FloatArray:
+    """(7, 7) symmetric, positive semi-definite but for rounding."""
+    place = f"{table.place}: information"
+    L = table.matrix("information", (7, 7))
+    if np.abs(L).max() > MAX_INFORMATION:
+        raise DataError(place, f"{np.abs(L).max():.3g}", f"entries of at most {MAX_INFORMATION:g}")
+    diagonal = np.diag(L)
+    if (diagonal < 0.0).any():
+        raise DataError(place, f"{diagonal.min():.3g} on the diagonal", "at least 0")
+    # Of a direction that nothing tells there is no information: rounding is measured by the largest entry.
+    scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
+    unit = L / scale[:, None] / scale
+    if (np.abs(unit - unit.T) > 1e-6).any():
+        raise DataError(place, "a matrix that is not symmetric", "an information matrix")
+    least = float(np.linalg.eigvalsh(unit)[0])
+    if least < -1e-6:
+        raise DataError(place, f"the eigenvalue {least:.3g} (scaled)", "a positive semi-definite matrix")
+    return L
 
 
 def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
@@ -330,10 +357,3 @@ def _dump(document: dict[str, Any]) -> str:
             text = f"[\n  {rows}\n ]"
         lines.append(f" {json.dumps(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"an array of shape {array.shape}, expected {shape}, all finite")
-    return array
