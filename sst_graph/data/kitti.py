@@ -7,6 +7,7 @@ Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -193,10 +194,12 @@ def _encoding(files: KittiFiles, options: SourceOptions) -> MaskEncoding:
 
 
 def _name(folder: Path) -> str:
+    """Data set and sequence; bytes of a folder's name that are not UTF-8 are escaped."""
     folder = folder.resolve()
+    name = folder.name
     if folder.parent.name == "sequences":
-        return f"{folder.parent.parent.name}/{folder.name}"
-    return folder.name
+        name = f"{folder.parent.parent.name}/{name}"
+    return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 
 KITTI_LOADER = Loader(recognizes=is_kitti, open=open_kitti, layout=LAYOUT)

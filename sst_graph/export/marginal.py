@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.result import CalibrationResult, checked_pose
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -36,8 +37,8 @@ DELAY = int(gtsam.symbol("D", 0))
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
 
 
-@dataclass(frozen=True)
-class CalibrationMarginal:
+@dataclass(frozen=True, eq=False)
+class CalibrationMarginal(ByValue):
     """A quadratic cost on extrinsic and time offset; the equation is the module's.
 
     Attributes:
