@@ -37,14 +37,7 @@ def run(argv: Sequence[str]) -> int:
 
 
 def _run(argv: Sequence[str]) -> int:
-    try:
-        args = build_parser().parse_args(argv)
-    except SystemExit as done:
-        # --help and --version have been printed.
-        flush()
-        raise SystemExit(done.code) from None
-    except OSError as error:
-        raise StreamError(error) from None
+    args = build_parser().parse_args(argv)
     _set_up_logging(args.verbose)
     command = importlib.import_module(f"sst_graph.cli.{args.command}")
     code: int = command.run(args)

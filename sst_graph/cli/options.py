@@ -5,9 +5,13 @@ from __future__ import annotations
 import argparse
 from importlib.metadata import version
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
+from sst_graph.cli.messages import say
 from sst_graph.errors import ConfigError
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -17,6 +21,10 @@ class _Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see '{self.prog} --help')")
+
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
+        # Help and version are printed nowhere else; argparse's own passes over a stdout that fails.
+        say(message, end="")
 
 
 def build_parser() -> argparse.ArgumentParser:
