@@ -10,7 +10,7 @@ from sst_graph.cli.outputs import check_apart
 from sst_graph.data.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text
-from sst_graph.files import TEXT, check_file_target, output_file
+from sst_graph.files import output_file
 
 
 def run(args: argparse.Namespace) -> int:
@@ -18,8 +18,17 @@ def run(args: argparse.Namespace) -> int:
     if args.calib is not None and args.to != "kitti":
         raise ConfigError(f"--calib goes with --to kitti, found --to {args.to}")
     check_apart({"RESULT": result_file(args.result), "--calib": args.calib}, {"--out": args.out})
-    if args.out is not None:
-        check_file_target(args.out, args.overwrite, TEXT)
+    if args.out is None:
+        say(_text(args), end="")
+        return 0
+    with output_file(args.out, args.overwrite) as out:
+        out.write_text(_text(args))
+    mention(f"wrote {args.out}")
+    return 0
+
+
+def _text(args: argparse.Namespace) -> str:
+    """The result in its new format."""
     result = result_at(args.result)
     if result.status != "ok":
         if not args.force:
@@ -28,11 +37,4 @@ def run(args: argparse.Namespace) -> int:
         complain(f"warning: {result.status}, exported all the same: {reasons}")
     calibration = None if args.calib is None else read_calibration(args.calib)
     options = ExportOptions(args.camera_frame, args.lidar_frame, calibration)
-    text = export_text(result, args.to, options)
-    if args.out is None:
-        say(text, end="")
-    else:
-        with output_file(args.out, args.overwrite) as out:
-            out.write_text(text)
-        mention(f"wrote {args.out}")
-    return 0
+    return export_text(result, args.to, options)

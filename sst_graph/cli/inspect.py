@@ -11,7 +11,7 @@ from sst_graph.cli.messages import say
 from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.reading import reading_words
 from sst_graph.errors import ConfigError
-from sst_graph.files import OutputKind, atomic_directory, check_folder_target
+from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.uncertainty.inspection import InspectConfig, Inspection, inspect_result, to_dict
 from sst_graph.uncertainty.inspection_words import inspection_text
 from sst_graph.viz.inspection import inspection_plots
@@ -25,12 +25,15 @@ MOST_NEXT = 100_000
 def run(args: argparse.Namespace) -> int:
     """Print the inspection of ``args.result``; draw it where ``--plots`` asks for it."""
     if not 1 <= args.next <= MOST_NEXT:
-        raise ConfigError(f"--next {args.next:.6g}: expected 1 or more, at most {MOST_NEXT}")
+        raise ConfigError(f"--next {str(args.next)[:12]}: expected 1 or more, at most {MOST_NEXT}")
     check_apart({"RESULT": result_file(args.result)}, {"--plots": args.plots})
-    if args.plots is not None:
-        check_folder_target(args.plots, args.overwrite, PLOTS)
-    inspection = inspect_result(result_at(args.result), InspectConfig(next_frames=args.next))
-    names = [] if args.plots is None else _write_plots(inspection, args.plots, args.overwrite)
+    config, names = InspectConfig(next_frames=args.next), []
+    if args.plots is None:
+        inspection = inspect_result(result_at(args.result), config)
+    else:
+        with atomic_directory(args.plots, args.overwrite, PLOTS) as folder:
+            inspection = inspect_result(result_at(args.result), config)
+            names = _write_plots(inspection, folder)
     read_as = inspection.result.read_as
     if args.json:
         say(json.dumps({**to_dict(inspection), "read_as": dict(read_as)}, allow_nan=False))
@@ -44,10 +47,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write_plots(inspection: Inspection, folder: Path, overwrite: bool) -> list[str]:
-    """Draw everything before the folder appears; the names of the plots."""
+def _write_plots(inspection: Inspection, folder: Path) -> list[str]:
+    """Draw everything; the names of the plots."""
     plots = inspection_plots(inspection)
-    with atomic_directory(folder, overwrite, PLOTS) as partial:
-        for name, plot in plots.items():
-            plot.savefig(partial / name, format="png", dpi=110)
+    for name, plot in plots.items():
+        plot.savefig(folder / name, format="png", dpi=110)
     return list(plots)

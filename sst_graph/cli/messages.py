@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from contextlib import suppress
+from typing import TextIO
 
 
 class StreamError(Exception):
@@ -27,7 +28,7 @@ def say(text: str, end: str = "\n") -> None:
         StreamError: it could not be written, so the command has failed.
     """
     try:
-        sys.stdout.write(text + end)
+        sys.stdout.write(_shown(text + end, sys.stdout))
         sys.stdout.flush()
     except OSError as error:
         raise StreamError(error) from None
@@ -43,6 +44,12 @@ def mention(text: str) -> None:
             complain(f"warning: {error}: the outputs are complete, but could not be listed")
 
 
+def _shown(text: str, stream: TextIO) -> str:
+    """The text with what the stream's encoding has not escaped."""
+    encoding = stream.encoding or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 def _discard_stdout() -> None:
     """Let what cannot be written to stdout, and all that follows, vanish."""
     with suppress(OSError, ValueError):
@@ -54,7 +61,8 @@ def complain(text: str) -> None:
     """One line on stderr, whatever the text holds."""
     # Where nobody can be told, the exit code still tells.
     with suppress(OSError, ValueError):
-        print("sst-graph: " + " ".join(text.split()), file=sys.stderr, flush=True)
+        sys.stderr.write(_shown("sst-graph: " + " ".join(text.split()) + "\n", sys.stderr))
+        sys.stderr.flush()
 
 
 def flush() -> None:
