@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # as typing has it, whose import takes milliseconds of every command's start
 if TYPE_CHECKING:
+    from typing import Any
+
     from sst_graph.data import open_source
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.problem.align import align_frame

@@ -2,15 +2,13 @@
 
 The file's contract: ``{"format": "sst-graph/calibration", "version": 1, "T_camera_lidar": 4x4,
 "time_offset_s", "covariance": 7x7, "status", "reasons", "weak_directions", "camera", "frames_used",
-"drive_offsets", "config", "method", "initial", "diagnostics", "versions"}``; strict JSON, no NaN.
+"drive_offsets", "config", "method", "initial", "read_as", "diagnostics", "versions"}``; strict JSON, no NaN.
+The same data and settings give the same bytes: what a clock on the wall showed is left out.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import enum
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +23,8 @@ from sst_graph.checked import check_covariance, check_finite, checked_camera, ch
 from sst_graph.errors import DataError
 from sst_graph.input_files import CALIBRATION, parse_json, read_text
 from sst_graph.json_table import JsonTable, json_table
+from sst_graph.strict_json import strict_json
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 Status = Literal["ok", "unobservable", "not_converged"]
@@ -35,12 +35,15 @@ UNNAMED_CAMERA = "camera"
 FORMAT = "sst-graph/calibration"
 VERSION = 1
 
+WALL_CLOCK = "seconds"
+"""Entry of the diagnostics that tells how long each stage took [s]; it is not written."""
+
 DIRECTION_SCALES: FloatArray = np.array([np.radians(0.1)] * 3 + [0.01] * 3 + [0.001])
 """(7,) one scaled unit of a weak direction: 0.1 deg [rad], 1 cm [m], 1 ms [s]."""
 
 
-@dataclass(frozen=True)
-class WeakDirection:
+@dataclass(frozen=True, eq=False)
+class WeakDirection(ByValue):
     """A combination of the unknowns that the data hardly tells.
 
     Attributes:
@@ -82,9 +85,11 @@ class Sigmas:
     time_offset_ms: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """An estimated extrinsic and time offset, and how far to trust them. Signs: :mod:`factors`.
+
+    Two results are equal if :meth:`to_json` writes the same of them.
 
     Attributes:
         T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
@@ -102,6 +107,7 @@ class CalibrationResult:
         config: its settings, as a JSON-able dictionary.
         initial: where the estimation started, or None without a guess.
         initial_offset_s: time offset at the start [s].
+        read_as: how the drives were read, by option: what pairs of scans and images the result holds for.
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
     """
@@ -120,6 +126,7 @@ class CalibrationResult:
     config: Mapping[str, Any] = field(default_factory=dict)
     initial: gtsam.Pose3 | None = None
     initial_offset_s: float = 0.0
+    read_as: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
@@ -133,6 +140,14 @@ class CalibrationResult:
             check_finite("weak_directions.vector", np.asarray(weak.vector), (7,))
             check_finite("weak_directions.sigma", np.asarray(weak.sigma), ())
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, CalibrationResult):
+            return NotImplemented
+        return self.to_json() == other.to_json()
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
+
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""
         sigma = np.sqrt(np.diag(self.covariance))
@@ -141,7 +156,11 @@ class CalibrationResult:
         return Sigmas((rx, ry, rz), (x, y, z), 1e3 * float(sigma[6]))
 
     def to_json(self) -> str:
-        """The text of ``calibration.json``; what is not finite in the diagnostics becomes null."""
+        """The text of ``calibration.json``; what is not finite in the diagnostics becomes null.
+
+        Text that is not Unicode (a lone surrogate) is escaped, so that the file is UTF-8.
+        """
+        diagnostics = {name: value for name, value in self.diagnostics.items() if name != WALL_CLOCK}
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -157,10 +176,11 @@ class CalibrationResult:
             "method": self.method,
             "config": self.config,
             "initial": self._initial_document(),
-            "diagnostics": self.diagnostics,
+            "read_as": self.read_as,
+            "diagnostics": diagnostics,
             "versions": self.versions,
         }
-        return _dump(json_able(document)) + "\n"
+        return strict_json(document) + "\n"
 
     def _initial_document(self) -> dict[str, Any] | None:
         if self.initial is None:
@@ -199,6 +219,7 @@ class CalibrationResult:
                 config=reader.mapping("config"),
                 initial=None if initial is None else initial.pose("T_camera_lidar"),
                 initial_offset_s=0.0 if initial is None else initial.offset_s("time_offset_s"),
+                read_as=reader.mapping("read_as"),
                 diagnostics=reader.mapping("diagnostics"),
                 versions=_versions(reader),
             )
@@ -206,25 +227,6 @@ class CalibrationResult:
             if error.place.startswith(str(place)):
                 raise
             raise DataError(f"{place}: {error.place}", error.found, error.expected) from error
-
-
-def json_able(value: Any) -> Any:
-    """``value`` with arrays and tuples as lists, enums as names, and None for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): json_able(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_able(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [json_able(item) for item in value]
-    if isinstance(value, enum.Enum):
-        return value.name.lower()
-    if isinstance(value, np.generic):
-        return json_able(value.item())
-    if isinstance(value, Path):
-        return str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return json_able({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_result(path: Path) -> CalibrationResult:
@@ -239,19 +241,6 @@ def read_result(path: Path) -> CalibrationResult:
 def _check_status(status: str) -> None:
     if status not in get_args(Status):
         raise DataError("status", f"{status!r:.60}", "one of " + ", ".join(get_args(Status)))
-
-
-def _dump(document: dict[str, Any]) -> str:
-    """Strict JSON, one key a line, matrices one row a line."""
-    entries = []
-    for key, value in document.items():
-        rows = isinstance(value, list) and value and isinstance(value[0], (list, dict))
-        if rows:
-            body = ",\n".join("    " + json.dumps(row, allow_nan=False, ensure_ascii=False) for row in value)
-            entries.append(f"  {json.dumps(key)}: [\n{body}\n  ]")
-        else:
-            entries.append(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False, ensure_ascii=False)}")
-    return "{\n" + ",\n".join(entries) + "\n}"
 
 
 def _camera(table: JsonTable) -> PinholeCamera:

@@ -5,11 +5,12 @@ Conventions (frames, signs, units) are stated in :mod:`factors`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -18,6 +19,40 @@ from numpy.typing import NDArray
 from factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
+
+
+class ByValue:
+    """Equality and hash of a frozen dataclass with arrays, poses or tables in it: by value, bit by bit.
+
+    The dataclass is declared with ``eq=False``. NaN equals NaN, and 0.0 equals -0.0 not.
+    """
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return _value(self) == _value(other)
+
+    def __hash__(self) -> int:
+        return hash(_value(self))
+
+
+def _value(item: Any) -> Hashable:
+    """``item`` as a hashable value that is equal for equal content."""
+    if isinstance(item, np.ndarray):
+        return item.dtype.str, item.shape, item.tobytes()
+    if isinstance(item, gtsam.Pose3):
+        return "Pose3", item.matrix().tobytes()
+    if isinstance(item, Mapping):
+        return frozenset((key, _value(one)) for key, one in item.items())
+    if isinstance(item, list | tuple):
+        return tuple(_value(one) for one in item)
+    if isinstance(item, float):
+        return "float", float(item).hex()
+    if dataclasses.is_dataclass(item) and not isinstance(item, type):
+        values = (_value(getattr(item, f.name)) for f in dataclasses.fields(item) if f.compare)
+        return (type(item).__qualname__, *values)
+    hash(item)
+    return item  # type: ignore[no-any-return]
 
 
 class SemanticClass(IntEnum):
@@ -41,8 +76,8 @@ class SemanticClass(IntEnum):
     IGNORE = 255
 
 
-@dataclass(frozen=True)
-class Scan:
+@dataclass(frozen=True, eq=False)
+class Scan(ByValue):
     """One LiDAR sweep.
 
     Attributes:
@@ -74,8 +109,8 @@ NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 """Pixels of an image whose picture is missing."""
 
 
-@dataclass(frozen=True)
-class CameraImage:
+@dataclass(frozen=True, eq=False)
+class CameraImage(ByValue):
     """One camera image with its semantic mask.
 
     Attributes:
@@ -100,8 +135,8 @@ class CameraImage:
         return self.pixels.size > 0
 
 
-@dataclass(frozen=True)
-class Frame:
+@dataclass(frozen=True, eq=False)
+class Frame(ByValue):
     """Scan ``index`` of a drive and the image that carries the same stamp; one may be missing."""
 
     index: int
@@ -109,8 +144,8 @@ class Frame:
     image: CameraImage | None
 
 
-@dataclass(frozen=True)
-class GroundTruth:
+@dataclass(frozen=True, eq=False)
+class GroundTruth(ByValue):
     """What is known to be true of a drive (simulated, or a published reference).
 
     Attributes:
@@ -146,8 +181,8 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
 
-@dataclass(frozen=True)
-class RelativeMotion:
+@dataclass(frozen=True, eq=False)
+class RelativeMotion(ByValue):
     """Motion of one sensor between two of its stamps.
 
     Attributes:

@@ -24,6 +24,7 @@ from sst_graph.errors import DataError, EstimationError
 from sst_graph.input_files import MARGINAL, parse_json, read_text
 from sst_graph.json_table import JsonTable, json_table
 from sst_graph.result import CalibrationResult
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
@@ -41,8 +42,8 @@ DELAY = int(gtsam.symbol("D", 0))
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
 
 
-@dataclass(frozen=True)
-class CalibrationMarginal:
+@dataclass(frozen=True, eq=False)
+class CalibrationMarginal(ByValue):
     """A quadratic cost on extrinsic and time offset; the equation is the module's.
 
     Attributes:
