@@ -49,8 +49,9 @@ from .alignment import (
 from .camera import MIN_DEPTH_M, PinholeCamera
 from .camera_motion import Between, camera_motion_factor
 from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
+from .cloning import GncConfig, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
 from .condensed import condense
-from .custom import custom_factor
+from .custom import FactorRecipe, custom_factor, recipe_of
 from .delay import delay_drift, delay_prior, extrinsic_drift
 from .errors import FactorError
 from .hand_eye import hand_eye_factor, rotation_hand_eye
@@ -74,12 +75,16 @@ __all__ = [
     "Alignment",
     "Between",
     "FactorError",
+    "FactorRecipe",
+    "GncConfig",
+    "GncSolution",
     "GroupedBias",
     "JacobianBlock",
     "JacobianReport",
     "KernelKind",
     "Kind",
     "MotionModel",
+    "PackedGraph",
     "PinholeCamera",
     "PointwiseMoved",
     "RigidlyMoved",
@@ -90,18 +95,23 @@ __all__ = [
     "camera_motion_factor",
     "check_gradient",
     "check_jacobians",
+    "clone_factor",
+    "clone_graph",
     "condense",
     "custom_factor",
     "delay_drift",
     "delay_prior",
     "extrinsic_drift",
     "frame_factor",
+    "gnc",
     "hand_eye_factor",
     "mean_velocity_factor",
     "move_points",
     "pixel_to_point_factor",
     "point_to_pixel_factor",
     "pose_alignment_factor",
+    "recipe_of",
+    "rekeyed",
     "residuals",
     "rotation_hand_eye",
     "silhouette_factor",

@@ -124,6 +124,7 @@ class IncrementalTerms:
     def _renew(self, rounds: int) -> IncrementalUpdate:
         rematched, settled, estimate = 0, False, self._solver.calculateEstimate()
         first_warnings: list[TermWarning] = []
+        alone = None if self._matches() else self._marginal()
         covariance = np.zeros((7, 7))
         for _ in range(rounds):
             self._retire(estimate)
@@ -132,10 +133,9 @@ class IncrementalTerms:
                 break
             rematched += swapped
             before, estimate = estimate, self._solver.calculateEstimate()
-            if not first_warnings:
-                first_warnings = wide_uncertainty(
-                    self._matches(), before, self._marginal(), self._config.rematch
-                )
+            if alone is not None:
+                first_warnings = wide_uncertainty(self._matches(), before, alone, self._config.rematch)
+                alone = None
             covariance, settled = self._anneal(estimate)
             if settled:
                 break

@@ -41,7 +41,8 @@ class RematchConfig:
         narrowing: from one scale to the next, below 1.
         settled: the kernel is narrowed when a round has moved the matched points by less than this share of
             it (RMS).
-        step_px: at the last scale, a round that moves them by less ends the loop (RMS) [px].
+        step_px: at the last scale, a round that moves them by less ends the loop (RMS) [px]; matches that
+            come and go in turn move them by a few hundredths for ever.
         most_rounds: rounds of matching, at most.
         inner_iterations: Levenberg-Marquardt iterations on frozen matches, at most.
         side_sigma_px: error that a side of an object keeps over all images that show it [px].
@@ -51,7 +52,7 @@ class RematchConfig:
     last_px: float = 4.0
     narrowing: float = 0.7
     settled: float = 0.1
-    step_px: float = 0.03
+    step_px: float = 0.1
     most_rounds: int = 60
     inner_iterations: int = 4
     side_sigma_px: float = 1.0
@@ -173,10 +174,9 @@ def match_all(
     """
     matches = [term.matched(values, kernel_px, information) for term in terms]
     if all(each.factor is None for each in matches):
-        states = ", ".join(sorted({str(each) for each in matches}))
-        raise EstimationError(
-            f"alignment terms: found no match in {len(terms)} ({states}), expected one or more"
-        )
+        states = ", ".join(sorted({each.state.value for each in matches}))
+        found = f"no factor in {len(terms)} terms ({states})"
+        raise EstimationError(f"alignment: found {found}, expected one or more")
     return matches
 
 
