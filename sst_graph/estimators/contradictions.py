@@ -243,11 +243,11 @@ def _step_sentence(parts: Parts, step: Step) -> str:
 
 def _advice(kinds: Sequence[str]) -> str:
     causes = {
-        "rotation": "the mount was moved or the masks slide",
-        "translation": "the mount was moved",
-        "offset": "an image or a scan was lost or a clock was set",
+        "rotation": ("the mount was moved", "the masks slide"),
+        "translation": ("the mount was moved",),
+        "offset": ("an image or a scan was lost", "a clock was set"),
     }
-    likely = " or ".join(dict.fromkeys(causes[kind] for kind in kinds))
+    likely = " or ".join(dict.fromkeys(cause for kind in kinds for cause in causes[kind]))
     return f"check whether {likely}, and calibrate the frames before and after apart"
 
 
@@ -269,6 +269,6 @@ def _difference_document(difference: Difference) -> dict[str, Any]:
     return {
         "step": difference.step.tolist(),
         "chi2": difference.chi2,
-        "clusters": difference.clusters,
+        "degrees_of_freedom": difference.freedom,
         "p_value": difference.p_value,
     }

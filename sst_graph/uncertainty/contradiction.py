@@ -57,23 +57,32 @@ class Difference:
     Attributes:
         step: (n,) from the first to the second; 7 numbers, 6 where each part has a time offset of its own.
         covariance: (n, n) of it.
-        clusters: that the covariance rests on.
+        freedom: degrees of freedom of the covariance; infinite where it is known.
     """
 
     step: FloatArray
     covariance: FloatArray
-    clusters: float = np.inf
+    freedom: float = np.inf
 
     @classmethod
     def of(cls, one: PartAnswer, other: PartAnswer, own_offsets: bool = False) -> Difference:
         """From one part to another that is independent of it.
 
+        The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
+        (Nel and van der Merwe, A solution to the multivariate Behrens-Fisher problem, 1986).
+
         Args:
             own_offsets: each part has a time offset of its own: only the extrinsics are compared.
         """
         n = 6 if own_offsets else 7
-        step, covariance = other.step - one.step, one.covariance + other.covariance
-        return cls(step[:n], covariance[:n, :n], one.clusters + other.clusters)
+        step, covariance = (other.step - one.step)[:n], (one.covariance + other.covariance)[:n, :n]
+        along = np.linalg.solve(covariance, step)
+        total = max(float(along @ covariance @ along), 1e-300)
+        freedom = sum(
+            (float(along @ part.covariance[:n, :n] @ along) / total) ** 2 / max(part.clusters - 1.0, 1.0)
+            for part in (one, other)
+        )
+        return cls(step, covariance, max(1.0 / freedom, _LEAST_FREEDOM) if freedom > 0.0 else np.inf)
 
     @property
     def chi2(self) -> float:
@@ -83,10 +92,10 @@ class Difference:
     @property
     def p_value(self) -> float:
         """Probability of such a length or a larger one where the parts agree."""
-        n, freedom = len(self.step), max(self.clusters - 2.0, _LEAST_FREEDOM)
-        if not np.isfinite(freedom):
+        n = len(self.step)
+        if not np.isfinite(self.freedom):
             return float(chdtrc(n, self.chi2))
-        return float(fdtrc(n, freedom, self.chi2 / n))
+        return float(fdtrc(n, self.freedom, self.chi2 / n))
 
 
 def combined(parts: Sequence[PartAnswer]) -> PartAnswer:
