@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -30,7 +31,7 @@ from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
 from sst_graph.estimators.parts import Parts
-from sst_graph.estimators.undersides import with_undersides, without_undersides
+from sst_graph.estimators.undersides import WithUndersides, with_undersides, without_undersides
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -38,7 +39,7 @@ from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
 from sst_graph.uncertainty.common_error import common_covariance
-from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.covariance import RobustCovariance, robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
@@ -174,9 +175,8 @@ def answer_joint(
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
-    model, cTl = robust.model, solution.state.cTl
     return Answer(
-        cTl,
+        solution.state.cTl,
         solution.state.offsets_s[0],
         covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
@@ -190,23 +190,32 @@ def answer_joint(
         drive_offsets=_drive_offsets(drives, solution, covariance),
         by_drive=_by_drive(drives, solution, covariance, by_standing, config),
         diagnostics={
-            "outer_iterations": solution.outer_iterations,
-            "matches": sum(len(pair) for pair in solution.pairs),
-            "pairs": len(solution.pairs),
-            "start_score": contest.score,
             **evidence,
-            "mask_bias_px": {
-                f"{drives[d].name}:{c.name.lower()}": bias
-                for (d, c), bias in solution.state.biases_px.items()
-            },
-            "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
-            "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+            "start_score": contest.score,
             "motion": heard.diagnostics,
             "contradictions": contradictions.diagnostics,
-            "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+            **_numbers(drives, solution, below, robust),
         },
     )
+
+
+def _numbers(
+    drives: Sequence[Drive], solution: JointSolution, below: WithUndersides, robust: RobustCovariance
+) -> dict[str, Any]:
+    """JSON-able numbers about a joint solution."""
+    model = robust.model
+    return {
+        "outer_iterations": solution.outer_iterations,
+        "matches": sum(len(pair) for pair in solution.pairs),
+        "pairs": len(solution.pairs),
+        "mask_bias_px": {
+            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
+        },
+        "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
+        "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+        "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+        FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+    }
 
 
 def _frozen(

@@ -137,7 +137,7 @@ def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
     def price(subset: tuple[str, ...]) -> float:
         step, _ = _restricted(difference.step, information, subset)
         rest = difference.step - step
-        worth = sum(max(_WORTH * len(_columns([kind])), least) for kind in subset)
+        worth = _WORTH * len(_columns(subset)) + least * len(subset)
         return float(rest @ information @ rest) + worth
 
     best = min(subsets, key=price)
