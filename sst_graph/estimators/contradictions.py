@@ -121,7 +121,7 @@ def _within(parts: Parts, stretches: Sequence[SolvedPart], hint: float, false_al
     # 1. The run of stretches that differs most from the rest, as if all stretches were independent.
     runs = _runs(len(stretches))
     differences = {run: _of_run(stretches, run) for run in runs}
-    run = min(runs, key=lambda run: differences[run].p_value)
+    run = min(runs, key=lambda run: differences[run].rank)
     if differences[run].p_value * len(runs) > hint:
         return None
     # 2. Where exactly it begins and ends, and both sides by themselves.

@@ -122,7 +122,7 @@ def _worst_stretch(
 ) -> tuple[SolvedPart, Difference] | None:
     """The stretch whose labels contradict the motion most; None without stretches."""
     compared = [(stretch, Difference.of(stretch.answer, motion)) for stretch in stretches]
-    return min(compared, key=lambda pair: pair[1].p_value, default=None)
+    return min(compared, key=lambda pair: pair[1].rank, default=None)
 
 
 def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], state: State) -> str:

@@ -49,7 +49,7 @@ def check_agreement(
     against = [
         Difference.of(combined([*answers[:k], *answers[k + 1 :]]), part) for k, part in enumerate(answers)
     ]
-    worst = int(np.argmin([difference.p_value for difference in against]))
+    worst = int(np.argmax([difference.chi2 for difference in against]))
     p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
     if 2.0 * p_value < significance:
         name = repr(names[worst]) if names else f"number {worst}"

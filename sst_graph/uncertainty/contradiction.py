@@ -97,6 +97,11 @@ class Difference:
             return float(chdtrc(n, self.chi2))
         return float(fdtrc(n, self.freedom, self.chi2 / n))
 
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Sorts the least likely first, also where the probability is too small for a float."""
+        return self.p_value, -self.chi2
+
 
 def combined(parts: Sequence[PartAnswer]) -> PartAnswer:
     """The answer of several independent parts together, weighted by their information."""
