@@ -220,9 +220,12 @@ def _between(parts: Parts, stretches: Sequence[Sequence[SolvedPart]]) -> dict[in
         if answer is not None:
             solved[number] = answer.answer
     own_offsets = len(parts.reference.offsets_s) > 1
+    judged = {2: [*solved][1:]}.get(len(solved), [*solved])  # of two, either contradicts the other
     return {
-        number: Difference.of(combined([solved[k] for k in solved if k != number]), answer, own_offsets)
-        for number, answer in solved.items()
+        number: Difference.of(
+            combined([solved[k] for k in solved if k != number]), solved[number], own_offsets
+        )
+        for number in judged
         if len(solved) > 1
     }
 
@@ -253,8 +256,9 @@ def _advice(kinds: Sequence[str]) -> str:
 
 def _drive_sentence(parts: Parts, number: int, difference: Difference) -> str:
     named = name_step(difference, parts.reference.cTl)
+    others = f"drive {parts.drives[0].name!r}" if len(parts.drives) == 2 else "the others"
     return (
-        f"drive {parts.drives[number].name!r} contradicts the others: it differs in {named.sentence}; "
+        f"drive {parts.drives[number].name!r} contradicts {others}: it differs in {named.sentence}; "
         "calibrate the drives apart, or check whether the mount was moved or a clock was set between them"
     )
 
