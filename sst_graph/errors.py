@@ -48,5 +48,9 @@ class EstimationError(SstGraphError):
     """An estimation step that could not be carried out (no match, indeterminate system)."""
 
 
+class ContradictionError(EstimationError):
+    """Estimates that are to be fused contradict one another beyond what their covariances allow."""
+
+
 class MissingDependencyError(SstGraphError):
     """An optional dependency is not installed; the message names the extra to install."""

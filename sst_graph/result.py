@@ -47,7 +47,8 @@ class WeakDirection(ByValue):
     """A combination of the unknowns that the data hardly tells.
 
     Attributes:
-        vector: (7,) unit vector in scaled units (:data:`DIRECTION_SCALES`), order of the covariance.
+        vector: (7,) unit vector in scaled units (:data:`DIRECTION_SCALES`), order of the covariance; where
+            drives have a time offset each, the last is that of the drive which the sentence begins with.
         sigma: standard deviation along it, in scaled units; large but finite.
         sentence: what cannot be told, in words and numbers.
         advice: what to record to tell it.

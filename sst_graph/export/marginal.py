@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
 from sst_graph.input_files import MARGINAL, parse_json, read_text
 from sst_graph.json_table import JsonTable, json_table
 from sst_graph.result import CalibrationResult
@@ -248,6 +249,7 @@ def fuse_graphs(
     *,
     tolerance_sigmas: float = 1e-4,
     max_rounds: int = 20,
+    significance: float = SIGNIFICANCE,
 ) -> tuple[CalibrationMarginal, list[CalibrationMarginal]]:
     """Drives fused through their marginals until that equals one graph of all of them.
 
@@ -261,49 +263,78 @@ def fuse_graphs(
         E_key, D_key: keys of extrinsic and time offset, the same in all.
         tolerance_sigmas: the fused estimate stands still when it moves by less [sigma].
         max_rounds: most rounds.
+        significance: as in :func:`fuse_marginals`. It holds for graphs whose noise models hold: one that
+            takes matches which err together for independent contradicts others too easily.
 
     Returns:
         The fused marginal, and those of the drives about the fused estimate.
 
     Raises:
+        ContradictionError: the drives contradict one another.
         EstimationError: a direction that no drive tells, or no standstill.
     """
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
-    fused = fuse_marginals(parts)
+    fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
         point = fused.cTl, fused.offset_s
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
-        fused = fuse_marginals(parts)
+        fused = fuse_marginals(parts, significance=significance)
         step = np.append(fused.cTl.localCoordinates(point[0]), fused.offset_s - point[1])
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
     raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
 
 
-def fuse_marginals(marginals: Sequence[CalibrationMarginal]) -> CalibrationMarginal:
+def fuse_marginals(
+    marginals: Sequence[CalibrationMarginal],
+    *,
+    names: Sequence[str] = (),
+    significance: float = SIGNIFICANCE,
+) -> CalibrationMarginal:
     """What several calibrations of the same pair of sensors know together; linearized at the optimum.
 
     Exact where all marginals share their linearization point. Otherwise each is carried to the common
     point by its first derivative, which holds while the points differ by little (a degree, a decimetre).
+    By how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
+    chi-squared, and so is what each differs from the others by: both are tested.
+
+    Args:
+        names: of the marginals, for the error; numbers from 0 where none are given.
+        significance: probability of an error where the marginals agree and their covariances hold; 0 fuses
+            whatever is given.
 
     Raises:
-        EstimationError: none given, or a direction that none of them tells.
+        ContradictionError: they contradict one another; the message names the worst and its step.
+        EstimationError: none given, a direction that none of them tells, or no optimum.
     """
     if not marginals:
         raise EstimationError("no marginal to fuse")
+    if names and len(names) != len(marginals):
+        raise EstimationError(f"found {len(names)} names, expected {len(marginals)}, one a marginal")
     fused = marginals[0]
-    for _ in range(3):  # the point moves towards the optimum; the second round already stands still
+    for _ in range(_MAX_ROUNDS):
         parts = [_carried(marginal, fused.cTl, fused.offset_s) for marginal in marginals]
-        fused = CalibrationMarginal(
+        total = CalibrationMarginal(
             fused.cTl,
             fused.offset_s,
             sum((part.information for part in parts), np.zeros((7, 7))),
             sum((part.vector for part in parts), np.zeros(7)),
             sum(part.constant for part in parts),
         )
-        cTl, offset_s = fused.best()
-        fused = _carried(fused, cTl, offset_s)
+        step = total.covariance() @ total.vector
+        fused = _carried(total, *total.best())
+        if np.sqrt(max(float(step @ total.vector), 0.0)) < _STANDSTILL_SIGMAS:
+            break
+    else:
+        raise EstimationError(
+            f"fusion of {len(marginals)} marginals: still moving after {_MAX_ROUNDS} rounds"
+        )
+    check_agreement([(part.information, part.vector) for part in parts], fused.cTl, names, significance)
     return fused
+
+
+_MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6
+"""Most rounds of a fusion, which ends when its optimum moves by less than so many sigmas."""
 
 
 def _carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> CalibrationMarginal:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -169,6 +169,10 @@ class Drive:
         """Median interval between images [s]; 0.1 for a single one."""
         stamps = self.image_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def part(self, scans: Sequence[int]) -> Drive:
+        """The drive with some of its scans only, by position, rising; all images and motions stay."""
+        return replace(self, scans=tuple(self.scans[position] for position in scans))
 
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
         """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.

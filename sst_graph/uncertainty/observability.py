@@ -125,6 +125,11 @@ def inseparable_directions(
     )
 
 
+def involves_offset(direction: WeakDirection) -> bool:
+    """Whether the time offset takes part in a weak direction."""
+    return abs(float(direction.vector[6])) > _TAKES_PART
+
+
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
