@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
+from sst_graph.estimators.causes import with_causes
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import (
     REACH,
@@ -115,6 +116,8 @@ def calibrate_prepared(
         result = result_of(answer, drives, guess, config)
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
+    # What is probably wrong with the data comes first.
+    result = with_causes(result, drives, guess, config)
     timing = {"estimate": time.perf_counter() - began}
     return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 

@@ -49,6 +49,8 @@ class CalibrationConfig:
         observability: when a direction counts as unobservable.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
             no one time offset; not for sensors whose rate goes up and down.
+        find_causes: where a result of method joint is doubted or missing, try changes of the data that would
+            make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
     """
 
     method: Method = "joint"
@@ -67,3 +69,4 @@ class CalibrationConfig:
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
     check_stamps: bool = True
+    find_causes: bool = True

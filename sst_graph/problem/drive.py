@@ -18,6 +18,7 @@ from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
 
@@ -105,6 +106,7 @@ class Drive:
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
+        survey: what the raw frames show, for the search for causes; None where nobody looked.
     """
 
     name: str
@@ -113,6 +115,7 @@ class Drive:
     images: tuple[ImageFeatures, ...]
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
+    survey: Survey | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -153,7 +156,9 @@ def prepare_drive(
     tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
+    surveyor = Surveyor(source.name, source.camera, total)
     for position, frame in enumerate(source):
+        surveyor.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
@@ -171,7 +176,15 @@ def prepare_drive(
     if not scans or not images:
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
-    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs))
+    return Drive(
+        source.name,
+        source.camera,
+        tuple(scans),
+        tuple(images),
+        tuple(motions),
+        tuple(pairs),
+        surveyor.survey(),
+    )
 
 
 def scan_features(
