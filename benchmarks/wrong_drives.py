@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass, Source
 
 FloatArray = NDArray[np.float64]
@@ -209,3 +210,45 @@ LIES: dict[str, Lie] = {
     "masks shifted 3 px": lambda d, o: shifted_masks(d, 3, 0),
     "masks shifted 6 px": lambda d, o: shifted_masks(d, 6, 0),
 }
+
+
+def right_camera(street: SimulatedDrive) -> HeldDrive:
+    """A street as the right-hand camera of a stereo pair sees it, with the left one's nominal pose."""
+    beside = gtsam.Pose3(gtsam.Rot3(), np.array([-BASELINE_M, 0.0, 0.0])) * street.truth.cTl
+    return HeldDrive.of(replace(street, truth=replace(street.truth, cTl=beside)))
+
+
+NAMED: dict[str, str] = {
+    "half-size images": "the pictures are half the size",
+    "half-size masks": "a mask of",
+    "stamps in ms": "the stamps are in milliseconds",
+    "stamps in us": "the stamps are in microseconds",
+    "stamps in ns": "the stamps are in nanoseconds",
+    "clouds in mm": "the clouds are in millimetres",
+    "clouds in cm": "the clouds are in centimetres",
+    "clouds in feet": "the clouds are in feet",
+    "clouds in camera axes": "the clouds are in the camera's axes",
+    "Tr inverted": "the start (Tr) is inverted",
+    "Tr in mm": "the translation of the start (Tr) is in millimetres",
+    "degrees as radians": "degrees that were taken as radians",
+    "x flipped": "x axis is flipped",
+    "y flipped": "mirrored",
+    "turned by 180 deg": "the clouds are turned by 180 deg",
+    "upside down": "the clouds are upside down",
+    "masks of another drive": "the masks are not those of these pictures",
+    "images of another drive": "hardly show the same scene",
+    "masks shuffled": "the masks are not those of these pictures",
+    "images mirrored": "mirrored",
+    "labels permuted": "the class numbers of the points are mixed up",
+    "stamps a tenth": "the stamps run too slowly",
+    "scans repeated": "one scan is repeated",
+    "images repeated": "one picture is repeated",
+    "half the focal length": "the focal length is half",
+    "twice the focal length": "the focal length is twice",
+    "images 15 frames late": "numbers or stamps are off",
+    "only background": "no point is labelled vehicle",
+    "masks shifted 3 px": "the masks are shifted right",
+    "masks shifted 6 px": "the masks are shifted right",
+    "right camera": "the pictures are those of another camera",
+}
+"""Words of the sentence that names each lie rightly. That stamps are tenfold no data tell."""

@@ -28,6 +28,8 @@ _LEAST_PIXELS = 60
 _MOST_PIXELS = 400
 _COLUMNS = 8
 """Objects in one such part of the image's width form a cluster: over a drive they are the same ones."""
+_APART_PX = 4.0
+"""Shifts farther apart than this see different edges [px]."""
 _LEAST_OBJECTS, _LEAST_CLUSTERS = 8, 3
 
 
@@ -55,7 +57,9 @@ class MaskShift:
         right_px, down_px: where the masks lie, seen from the pictures' edges [px].
         sigma_px: standard deviations of the two, (2,) [px].
         contrast: how far the mean strength at the best shift stands out, in standard deviations of an
-            object's strength over the shifts; masks of other pictures reach some tenths.
+            object's strength over the shifts.
+        rival: the most at a shift elsewhere, as a share of that at the best one: the picture of another mask
+            has edges here and there.
         objects: that took part.
     """
 
@@ -63,7 +67,13 @@ class MaskShift:
     down_px: float
     sigma_px: FloatArray
     contrast: float
+    rival: float
     objects: int
+
+    @property
+    def within_reach(self) -> bool:
+        """Whether the best shift is one: at the end of what is tried there may be better ones beyond."""
+        return max(abs(self.right_px), abs(self.down_px)) < REACH_PX - 1.5
 
     @property
     def length_px(self) -> float:
@@ -120,7 +130,15 @@ def mask_shift(profiles: Sequence[ContourProfile]) -> MaskShift | None:
     # The picture's edge lies at +shift of the contour: the mask at -shift of the edge.
     sigma = np.sqrt(variance + 0.1**2)
     right, down = -best
-    return MaskShift(float(right), float(down), sigma, contrast / float(weights.sum()), len(profiles))
+    at_best = contrast / float(weights.sum())
+    return MaskShift(float(right), float(down), sigma, at_best, _rival(whole, best), len(profiles))
+
+
+def _rival(total: FloatArray, best: FloatArray) -> float:
+    """The highest strength farther than :data:`_APART_PX` from the best, as a share of the highest."""
+    down, right = np.mgrid[-REACH_PX : REACH_PX + 1, -REACH_PX : REACH_PX + 1]
+    elsewhere = np.hypot(right - best[0], down - best[1]) > _APART_PX
+    return float(total[elsewhere].max() / total.max())
 
 
 def sum_of(profiles: Sequence[ContourProfile]) -> FloatArray:

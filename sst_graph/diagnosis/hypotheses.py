@@ -6,7 +6,7 @@ each time, and how well the labels agree is compared with what they say of the d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -14,34 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.fit import LEAST_GAIN, LEAST_QUALITY, WELL, Fit, Fitter
+from sst_graph.diagnosis.poses import start_finding
 from sst_graph.problem.drive import Drive, ScanFeatures
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Fit:
-    """How well the labels of both sensors agree after a search and a short solution.
-
-    Attributes:
-        cTl, offset_s: where it ended.
-        explained: share of the boundary points in view that meet a contour.
-        concentration: share of the matches that are close.
-    """
-
-    cTl: gtsam.Pose3
-    offset_s: float
-    explained: float
-    concentration: float
-
-    @property
-    def quality(self) -> float:
-        """0 to 1."""
-        return self.explained * self.concentration
-
-
-Fitter = Callable[[Drive, gtsam.Pose3 | None, float], Fit | None]
-"""Searches around a guess (None: anywhere) and a time offset [s]; None where nothing is found."""
 
 
 @dataclass(frozen=True)
@@ -53,21 +30,16 @@ class Hypothesis:
         drive: with the change.
         guess: to search around; None for anywhere.
         offset_s: to search around [s].
+        start: as it was given, where it is what was changed.
     """
 
     finding: Finding
     drive: Drive
     guess: gtsam.Pose3 | None
     offset_s: float
+    start: gtsam.Pose3 | None = None
 
 
-WELL = 0.4
-"""Quality above which nothing else is tried: right data have 0.2 (hand-drawn labels of a few kinds of vehicles
-in a crowded street) to 0.6, wrong ones 0.03 to 0.14, seldom 0.3."""
-LEAST_QUALITY = 0.17
-"""Of a change that is believed ..."""
-LEAST_GAIN = 1.6
-"""... if it has so many times the quality of the data as given."""
 _MOST_SHIFTS = 4
 """Windows of time offsets that are searched before and after the first."""
 _WINDOW_S = 0.9
@@ -100,7 +72,10 @@ def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Findin
             evidence = (
                 f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
             )
-            best = found.quality, replace(hypothesis.finding, evidence=evidence)
+            finding = replace(hypothesis.finding, evidence=evidence)
+            if hypothesis.start is not None:
+                finding = start_finding(hypothesis.start, found, finding)
+            best = found.quality, finding
         if found.quality > WELL:
             break
     return None if best is None else best[1]
@@ -132,7 +107,7 @@ def mirrored(
 def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
     """What often goes wrong, undone."""
     for name, check, start in _starts(guess):
-        yield Hypothesis(Finding(name, "", check), drive, start, offset_s)
+        yield Hypothesis(Finding(name, "", check), drive, start, offset_s, guess)
     yield from _mirrorings(drive, guess, offset_s)
     for factor, name in ((0.5, "half"), (2.0, "twice")):
         camera = drive.camera

@@ -15,7 +15,9 @@ _LEAST_SHIFT_PX = 1.5
 """Contours follow the picture's edges over a pixel or two by themselves [px]."""
 _SIGMAS = 4.0
 _LEAST_CONTRAST = 1.3
-"""Of masks over their own pictures: 1.6 and more on streets and real drives; over others 0.3 to 1.1."""
+"""Of masks over their own pictures: 1.6 and more on streets and real drives; over others 0.3 to 1.1 ..."""
+_MOST_RIVAL = 0.75
+"""... and there the second best shift has this share of the best one or more; over their own up to 0.7."""
 _ABOVE = 0.1
 """Ground whose mean row is higher than the vehicles' or the sky's by this share of the image is no ground."""
 
@@ -75,7 +77,7 @@ def shift(drives: Iterable[Drive]) -> MaskShift | None:
 
 def shifted_masks(found: MaskShift | None) -> Finding | None:
     """Masks beside their pictures' edges."""
-    if found is None or found.contrast < _LEAST_CONTRAST:
+    if found is None or _are_foreign(found) or not found.within_reach:
         return None
     if found.length_px - _SIGMAS * found.sigma_along_px < _LEAST_SHIFT_PX:
         return None
@@ -91,14 +93,17 @@ def shifted_masks(found: MaskShift | None) -> Finding | None:
 
 def foreign_masks(found: MaskShift | None) -> Finding | None:
     """Masks along whose contours their pictures show no edges."""
-    if found is None or found.contrast >= _LEAST_CONTRAST:
+    if found is None or not _are_foreign(found):
         return None
     return Finding(
         "the masks are not those of these pictures (another drive, another order or numbering)",
-        f"the pictures show no edges along the contours of {found.objects} objects: "
-        f"contrast {found.contrast:.1f}, usually above {_LEAST_CONTRAST:g}",
+        f"the pictures show no more edges along the contours of {found.objects} objects than beside them",
         "lay a mask over the picture of the same number",
     )
+
+
+def _are_foreign(found: MaskShift) -> bool:
+    return found.contrast < _LEAST_CONTRAST or found.rival > _MOST_RIVAL
 
 
 _OVER_GROUND = (SemanticClass.SKY, SemanticClass.VEHICLE)

@@ -19,7 +19,7 @@ from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult
 
 _AGREED = 0.3
-"""Share of the outlines that meet, times that of close matches, above which nobody asks for a mirror: mirrored
+"""Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
 streets have 0.1 to 0.2."""
 _SCANS, _CONTENDERS = 6, 160
 """Scans and candidates of the search in a comparison: one that agrees need not be exact."""
