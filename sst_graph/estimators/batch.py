@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
+from sst_graph.estimators.causes import with_causes
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import (
     REACH,
@@ -118,6 +119,8 @@ def calibrate_prepared(
         result = result_of(answer, drives, guess, config)
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
+    # What is probably wrong with the data comes first.
+    result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:

@@ -52,6 +52,8 @@ class CalibrationConfig(Settings):
         contradictions: when method joint finds that drives, or parts of one, contradict each other.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
             no one time offset; not for sensors whose rate goes up and down.
+        find_causes: where a result of method joint is doubted or missing, try changes of the data that would
+            make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
     """
 
     method: Method = "joint"
@@ -71,3 +73,4 @@ class CalibrationConfig(Settings):
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
     contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
     check_stamps: bool = True
+    find_causes: bool = True

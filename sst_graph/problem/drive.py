@@ -20,6 +20,7 @@ from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
 
@@ -146,6 +147,7 @@ class Drive:
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
         left_out: what the data lacked.
+        survey: what the raw frames show, for the search for causes; None where nobody looked.
     """
 
     name: str
@@ -155,6 +157,7 @@ class Drive:
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
     left_out: LeftOut = field(default_factory=LeftOut)
+    survey: Survey | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -199,9 +202,10 @@ def prepare_drive(
     tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out = LeftOut()
+    left_out, surveyor = LeftOut(), Surveyor(source.name, source.camera, total)
     for position, frame in enumerate(source):
         left_out.add(frame)
+        surveyor.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
@@ -222,7 +226,14 @@ def prepare_drive(
     if left_out.counts():
         _LOG.warning("%s: left out: %s", source.name, left_out)
     return Drive(
-        source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs), left_out
+        source.name,
+        source.camera,
+        tuple(scans),
+        tuple(images),
+        tuple(motions),
+        tuple(pairs),
+        left_out,
+        surveyor.survey(),
     )
 
 
