@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from .exceptions import SstGraphError
 
 FloatArray = NDArray[np.float64]
 
 
-class FactorError(ValueError):
+class FactorError(SstGraphError, ValueError):
     """A value that a factor cannot use: what it is, what was found, what was expected."""
 
     def __init__(self, what: str, found: str, expected: str) -> None:
@@ -23,12 +27,15 @@ class FactorError(ValueError):
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only float64 copy of ``value`` with the given shape (None: any length), all finite."""
-    array = np.array(value, dtype=np.float64)
+    wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FactorError(what, described(value), f"numbers of shape {wanted}") from None
     matches = array.ndim == len(shape) and all(
         n is None or n == m for n, m in zip(shape, array.shape, strict=True)
     )
     if not matches:
-        wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
         raise FactorError(what, f"shape {array.shape}", f"shape {wanted}")
     if not np.isfinite(array).all():
         raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
@@ -53,6 +60,17 @@ def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
 
 def checked_positive(what: str, value: float) -> float:
     """A finite number above zero."""
-    if not (np.isfinite(value) and value > 0.0):
-        raise FactorError(what, f"{value}", "a finite number above 0")
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and np.isfinite(value) and value > 0.0):
+        raise FactorError(what, f"{value}" if number else described(value), "a finite number above 0")
     return float(value)
+
+
+def described(value: Any) -> str:
+    """A short word on a value of any type, for messages."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if value is None or isinstance(value, bool | int | float | np.number):
+        return repr(value)
+    name = type(value).__name__
+    return f"a {name} of {len(value)}" if isinstance(value, list | tuple) else f"a {name}"

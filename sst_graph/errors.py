@@ -4,22 +4,40 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from factors.exceptions import SstGraphError, printable
 
-class SstGraphError(Exception):
-    """Root of every error that sst_graph raises on purpose."""
+__all__ = [
+    "CheckpointError",
+    "ConfigError",
+    "DataError",
+    "EstimationError",
+    "MissingDependencyError",
+    "SstGraphError",
+    "printable",
+]
+
+_MAX_PART = 390
+"""Characters of the place, of what was found and of what was expected: together they fit into a message."""
 
 
 class DataError(SstGraphError):
     """Input data that cannot be used: a file, an array or a value.
 
-    The message is one line: place, what was found, what was expected.
+    The message is one line: place, what was found, what was expected, each made :func:`printable`.
     """
 
     def __init__(self, place: str | Path, found: str, expected: str) -> None:
-        self.place = str(place)
-        self.found = found
-        self.expected = expected
-        super().__init__(f"{self.place}: found {found}, expected {expected}")
+        self.place = printable(place, _MAX_PART)
+        self.found = printable(found, _MAX_PART)
+        self.expected = printable(expected, _MAX_PART)
+        super().__init__(f"{self.place}: found {self.found}, expected {self.expected}")
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, str]]:
+        return type(self), (self.place, self.found, self.expected)
+
+
+class CheckpointError(DataError):
+    """A checkpoint that cannot be read back: damaged, changed, or of another version."""
 
 
 class ConfigError(SstGraphError, ValueError):
@@ -28,6 +46,10 @@ class ConfigError(SstGraphError, ValueError):
 
 class EstimationError(SstGraphError):
     """An estimation step that could not be carried out (no match, indeterminate system)."""
+
+
+class ContradictionError(EstimationError):
+    """Estimates that are to be fused contradict one another beyond what their covariances allow."""
 
 
 class MissingDependencyError(SstGraphError):

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, EstimationError
-from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
+from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import (
@@ -23,12 +24,14 @@ from sst_graph.estimators.contest import (
     rivals,
     solve_all,
 )
+from sst_graph.estimators.contradictions import find_contradictions
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
-from sst_graph.estimators.motion_joint import WithMotion, with_motion
-from sst_graph.estimators.undersides import with_undersides, without_undersides
+from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
+from sst_graph.estimators.parts import Parts
+from sst_graph.estimators.undersides import WithUndersides, with_undersides, without_undersides
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -36,7 +39,7 @@ from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
 from sst_graph.uncertainty.common_error import common_covariance
-from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.covariance import RobustCovariance, robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
@@ -115,8 +118,11 @@ def calibrate_prepared(
         result = result_of(answer, drives, guess, config)
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
-    timing = {"estimate": time.perf_counter() - began}
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
+    left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
+    if left_out:
+        diagnostics["left_out"] = left_out
+    return dataclasses.replace(result, diagnostics=diagnostics)
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -158,43 +164,61 @@ def answer_joint(
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
     config, finals = dataclasses.replace(config, joint=below.joint), below.solutions
     solution = finals[0]
-    # 4. How sure; where the labels tell everything, the motion is heard too.
+    # 4. Do the drives agree, and the stretches of each?
+    parts = Parts(drives, tracks, objects, solution.state, config.joint, config.common_error)
+    contradictions = find_contradictions(parts, config.contradictions)
+    # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
     covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
-    heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
+    labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
+    heard = _hear_motion(drives, tracks, labels, guess, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
-    model, cTl = robust.model, solution.state.cTl
     return Answer(
-        cTl,
+        solution.state.cTl,
         solution.state.offsets_s[0],
         covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
-        remarks=_remarks(drives),
+        remarks=(*_remarks(drives), *heard.remarks),
         by_standing=by_standing[:7, :7],
-        doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),
+        doubts=(
+            *_doubts(solution, finals, covariance, evidence, guess, config),
+            *contradictions.sentences,
+            *heard.doubts,
+        ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
+        by_drive=_by_drive(drives, solution, covariance, by_standing, config),
         diagnostics={
-            "outer_iterations": solution.outer_iterations,
-            "matches": sum(len(pair) for pair in solution.pairs),
-            "pairs": len(solution.pairs),
-            "start_score": contest.score,
             **evidence,
-            "mask_bias_px": {
-                f"{drives[d].name}:{c.name.lower()}": bias
-                for (d, c), bias in solution.state.biases_px.items()
-            },
-            "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
-            "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+            "start_score": contest.score,
             "motion": heard.diagnostics,
-            "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+            "contradictions": contradictions.diagnostics,
+            **_numbers(drives, solution, below, robust),
         },
     )
+
+
+def _numbers(
+    drives: Sequence[Drive], solution: JointSolution, below: WithUndersides, robust: RobustCovariance
+) -> dict[str, Any]:
+    """JSON-able numbers about a joint solution."""
+    model = robust.model
+    return {
+        "outer_iterations": solution.outer_iterations,
+        "matches": sum(len(pair) for pair in solution.pairs),
+        "pairs": len(solution.pairs),
+        "mask_bias_px": {
+            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
+        },
+        "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
+        "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+        "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+        FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+    }
 
 
 def _frozen(
@@ -207,23 +231,23 @@ def _frozen(
 def _hear_motion(
     drives: Sequence[Drive],
     tracks: Tracks,
-    solution: JointSolution,
-    covariance: FloatArray,
+    labels: Labels,
     guess: Guess,
     config: CalibrationConfig,
     progress: Progress | None,
 ) -> WithMotion:
     """The solution with the motion in its graph, where it is asked for and there is any."""
+    solution = labels.solution
     if not _may_hear_motion(config):
         return WithMotion(solution)
     if config.use_motion == "auto":
-        weak = weak_directions(covariance[:7, :7], solution.state.cTl, config.observability)
+        weak = weak_directions(labels.covariance, solution.state.cTl, config.observability)
         rolling = any(scan.offsets_s.any() for drive in drives for scan in drive.scans)
         if weak or rolling:
             why = "the labels alone leave directions open" if weak else "the scans take their time"
             return WithMotion(solution, diagnostics={"left_out": why})
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
-    return with_motion(drives, tracks, solution, covariance[:7, :7], centre, config, progress)
+    return with_motion(drives, tracks, labels, centre, config, progress)
 
 
 def _finals(
@@ -327,6 +351,23 @@ def _drive_offsets(
         DriveOffset(drive.name, solution.state.offset_s(i), float(sigmas[6 + i]))
         for i, drive in enumerate(drives)
     )
+
+
+def _by_drive(
+    drives: Sequence[Drive],
+    solution: JointSolution,
+    covariance: FloatArray,
+    by_standing: FloatArray,
+    config: CalibrationConfig,
+) -> tuple[DriveKnowledge, ...]:
+    """What is known of the extrinsic and each drive's own offset, where drives have one each."""
+    found = []
+    for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
+        own = [*range(6), 6 + number]
+        block, standing = covariance[np.ix_(own, own)], by_standing[np.ix_(own, own)]
+        block = block + _beside_matches(drives, solution, float(block[6, 6]), config)
+        found.append(DriveKnowledge(drives[number].name, block, standing))
+    return tuple(found)
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], Answer]

@@ -7,6 +7,7 @@ from typing import Literal
 
 from sst_graph.config import Settings
 from sst_graph.estimators.challenge import ChallengeConfig
+from sst_graph.estimators.contradictions import ContradictionConfig
 from sst_graph.estimators.joint import JointConfig
 from sst_graph.estimators.motion import MotionConfig
 from sst_graph.estimators.paper import PaperConfig
@@ -48,6 +49,7 @@ class CalibrationConfig(Settings):
         common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
         unknown_motion: the same where a single scan tells no motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
+        contradictions: when method joint finds that drives, or parts of one, contradict each other.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
             no one time offset; not for sensors whose rate goes up and down.
     """
@@ -67,4 +69,5 @@ class CalibrationConfig(Settings):
     common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
+    contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
     check_stamps: bool = True

@@ -73,7 +73,7 @@ class FeatureTracker:
         self._last: tuple[CameraImage, NDArray[np.uint8]] | None = None
 
     def add(self, image: CameraImage) -> Tracks | None:
-        """Tracks from the image before to this one; None for the first.
+        """Tracks from the image before to this one; None for the first, none where a picture is missing.
 
         Raises:
             DataError: the image is not later than the one before, or of another size.
@@ -85,13 +85,17 @@ class FeatureTracker:
         image_a, gray_a = last
         if image.stamp_ns <= image_a.stamp_ns:
             raise DataError("visual odometry", f"stamp {image.stamp_ns}", f"one after {image_a.stamp_ns} ns")
+        if not (image.has_picture and image_a.has_picture):
+            return Tracks(image_a.stamp_ns, image.stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)))
         if gray.shape != gray_a.shape:
             raise DataError("visual odometry", f"image {gray.shape}", f"the size before, {gray_a.shape}")
         corners = detect_corners(gray_a, _trackable(image_a, self.config), self.config)
         uv_a, uv_b = _track(gray_a, gray, corners, self.config)
         # A corner that slid on to something that may move is no landmark.
         column, row = np.rint(uv_b).astype(np.intp).T
-        still = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
+        still = np.full(len(uv_b), True)
+        if image.has_mask:
+            still = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
         return Tracks(image_a.stamp_ns, image.stamp_ns, uv_a[still], uv_b[still])
 
 
@@ -133,7 +137,9 @@ def detect_corners(
 
 
 def _trackable(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
-    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin."""
+    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask."""
+    if not image.has_mask:
+        return np.full(image.mask.shape, 255, np.uint8)
     table = np.zeros(256, np.uint8)
     table[list(UNTRACKED_CLASSES)] = 255
     width = 2 * config.mask_margin_px + 1
@@ -142,7 +148,9 @@ def _trackable(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
 
 
 def _gray(image: CameraImage) -> NDArray[np.uint8]:
-    """(h, w) grey picture."""
+    """(h, w) grey picture; empty without one."""
+    if not image.has_picture:
+        return np.zeros((0, 0), np.uint8)
     return np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 

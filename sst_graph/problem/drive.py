@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,9 @@ from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
-from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
+
+_LOG = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -96,6 +99,42 @@ class ImageFeatures:
             object.__setattr__(self, name, value)
 
 
+@dataclass
+class LeftOut:
+    """What a drive lacked, counted while it was read; the rest of it was used.
+
+    Attributes:
+        points: that were NaN or inf.
+        scans_with_such_points: scans that held some.
+        scans_without_labels: these show motion only.
+        images_without_mask: nothing is associated with these.
+        images_without_picture: these have no image features, and contours that follow the mask alone.
+    """
+
+    points: int = 0
+    scans_with_such_points: int = 0
+    scans_without_labels: int = 0
+    images_without_mask: int = 0
+    images_without_picture: int = 0
+
+    def add(self, frame: Frame) -> None:
+        """Count what a frame lacks; a scan without points lacks nothing."""
+        if frame.scan is not None:
+            self.points += frame.scan.left_out
+            self.scans_with_such_points += frame.scan.left_out > 0
+            self.scans_without_labels += len(frame.scan.points) > 0 and not frame.scan.has_labels
+        if frame.image is not None:
+            self.images_without_mask += not frame.image.has_mask
+            self.images_without_picture += not frame.image.has_picture
+
+    def counts(self) -> dict[str, int]:
+        """What was found missing at least once, by name."""
+        return {name: int(count) for name, count in vars(self).items() if count}
+
+    def __str__(self) -> str:
+        return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items())
+
+
 @dataclass(frozen=True)
 class Drive:
     """A drive, reduced to what calibration needs.
@@ -106,6 +145,7 @@ class Drive:
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
+        left_out: what the data lacked.
     """
 
     name: str
@@ -114,6 +154,7 @@ class Drive:
     images: tuple[ImageFeatures, ...]
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
+    left_out: LeftOut = field(default_factory=LeftOut)
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -128,6 +169,10 @@ class Drive:
         """Median interval between images [s]; 0.1 for a single one."""
         stamps = self.image_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def part(self, scans: Sequence[int]) -> Drive:
+        """The drive with some of its scans only, by position, rising; all images and motions stay."""
+        return replace(self, scans=tuple(self.scans[position] for position in scans))
 
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
         """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
@@ -154,7 +199,9 @@ def prepare_drive(
     tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
+    left_out = LeftOut()
     for position, frame in enumerate(source):
+        left_out.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
@@ -172,7 +219,11 @@ def prepare_drive(
     if not scans or not images:
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
-    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs))
+    if left_out.counts():
+        _LOG.warning("%s: left out: %s", source.name, left_out)
+    return Drive(
+        source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs), left_out
+    )
 
 
 def scan_features(

@@ -24,7 +24,15 @@ from sst_graph.association.silhouettes import (
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError
 from sst_graph.problem.drive import Drive, outlines
-from sst_graph.problem.objects import Mover, ObjectId, moving_objects, numbers_in, of_each, standing_share
+from sst_graph.problem.objects import (
+    Mover,
+    ObjectId,
+    moving_objects,
+    numbers_in,
+    of_each,
+    standing_share,
+    tracks_of_scans,
+)
 from sst_graph.problem.state import (
     EXTRINSIC,
     State,
@@ -143,6 +151,16 @@ class Tracks:
         """The same twists of one drive, with other object tracks and moving objects."""
         other = Tracks([])
         other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
+        return other
+
+    def part(self, drive: int, scans: Sequence[int]) -> Tracks:
+        """Of :meth:`Drive.part <sst_graph.problem.drive.Drive.part>` of one drive, which becomes drive 0."""
+        other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
+        other._tracks = [self._tracks[drive]]
+        if self.objects is not None:
+            other.objects = [tracks_of_scans(self.objects[drive], scans)]
+            moving = self._movers[drive]
+            other._movers = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
     def movers(self, drive: int, scan: int) -> Movers:

@@ -125,6 +125,11 @@ def inseparable_directions(
     )
 
 
+def involves_offset(direction: WeakDirection) -> bool:
+    """Whether the time offset takes part in a weak direction."""
+    return abs(float(direction.vector[6])) > _TAKES_PART
+
+
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
@@ -135,8 +140,12 @@ def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> F
 
 def _paired(covariance: FloatArray) -> float:
     """Multiple correlation of the time offset with the translation, 0 to 1."""
-    cross = covariance[3:6, 6]
-    explained = float(cross @ np.linalg.solve(covariance[3:6, 3:6], cross)) / float(covariance[6, 6])
+    sigmas = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
+    if not (sigmas > 0.0).all():
+        return 0.0
+    correlation = covariance[3:, 3:] / np.outer(sigmas, sigmas)
+    cross = correlation[:3, 3]
+    explained = float(cross @ np.linalg.lstsq(correlation[:3, :3], cross)[0])
     return float(np.sqrt(min(max(explained, 0.0), 1.0)))
 
 

@@ -103,7 +103,7 @@ def test_a_killed_run_leaves_nothing_under_the_name(tmp_path: Path) -> None:
     process = subprocess.Popen([sys.executable, "-m", "sst_graph.cli", *arguments], stderr=subprocess.DEVNULL)
     try:
         deadline = time.monotonic() + 60
-        while not list(tmp_path.glob(".drive.*/sequences/00/velodyne/000001.bin")):
+        while not list(tmp_path.glob(".drive.sst-graph-partial/new/sequences/00/velodyne/000001.bin")):
             assert process.poll() is None and time.monotonic() < deadline
             time.sleep(0.02)
     finally:
@@ -122,7 +122,7 @@ def test_an_interrupted_run_leaves_nothing_at_all(tmp_path: Path) -> None:
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob(".drive.*/sequences/00/velodyne/000001.bin")):
+    while not list(tmp_path.glob(".drive.sst-graph-partial/new/sequences/00/velodyne/000001.bin")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
