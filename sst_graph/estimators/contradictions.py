@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.estimators.parts import Part, Parts, SolvedPart
 from sst_graph.problem.state import State
 from sst_graph.uncertainty.contradiction import Difference, combined, name_step
@@ -23,7 +24,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ContradictionConfig:
+class ContradictionConfig(Settings):
     """When parts of the data contradict one another.
 
     Attributes:
@@ -36,10 +37,10 @@ class ContradictionConfig:
     """
 
     check: bool = True
-    false_alarm: float = 1e-3
-    hint: float = 1e-2
-    most_stretches: int = 8
-    least_scans: int = 4
+    false_alarm: float = setting(1e-3, at_least=1e-12, at_most=0.5)
+    hint: float = setting(1e-2, at_least=1e-12, at_most=0.5)
+    most_stretches: int = setting(8, at_least=1, at_most=100)
+    least_scans: int = setting(4, at_least=1, at_most=100_000)
 
 
 @dataclass(frozen=True)

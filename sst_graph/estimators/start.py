@@ -79,6 +79,10 @@ class StartConfig(Settings):
     min_concentration: float = setting(0.6, at_least=0.0, at_most=1.0)
     min_class_points: int = setting(30, at_least=1, at_most=1_000_000)
 
+    def __post_init__(self) -> None:
+        # A rival is one of the finalists.
+        self.expect_at_least("rival_ratio", self.finalist_ratio, "finalist_ratio")
+
 
 def find_start(
     drives: Sequence[Drive],

@@ -24,6 +24,7 @@ from factors.robust import KernelKind, RobustKernel
 from factors.slam import pose_alignment_factor
 from factors.variables import checked_key, number_or_key, pose_or_key
 from sst_graph.association.silhouettes import MatchConfig
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.problem.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
 from sst_graph.problem.drive import ImageFeatures, ScanFeatures
@@ -185,7 +186,7 @@ def number(values: gtsam.Values, key_or_value: int | float) -> float:
 
 
 @dataclass(frozen=True)
-class TermConfig:
+class TermConfig(Settings):
     """How a term matches.
 
     Attributes:
@@ -198,7 +199,7 @@ class TermConfig:
     classes: tuple[SemanticClass, ...] = VEHICLES
     match: MatchConfig = SLAM_MATCHES
     kernel: KernelKind = "geman_mcclure"
-    min_matches: int = 10
+    min_matches: int = setting(10, at_least=1, at_most=1_000_000)
 
 
 class TermState(Enum):

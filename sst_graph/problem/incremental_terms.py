@@ -16,6 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, TermMatches, TermState
 from sst_graph.problem.object_sides import ObjectSides
 from sst_graph.problem.rematching import (
@@ -36,7 +37,7 @@ Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
 
 
 @dataclass(frozen=True)
-class IncrementalConfig:
+class IncrementalConfig(Settings):
     """Beside the schedule of :class:`RematchConfig`.
 
     Attributes:
@@ -49,10 +50,10 @@ class IncrementalConfig:
     """
 
     rematch: RematchConfig = field(default_factory=RematchConfig)
-    stale_px: float = 0.3
-    rounds: int = 2
-    known: float = 0.5
-    rescale: float = 0.2
+    stale_px: float = setting(0.3, at_least=0.0, at_most=1000.0)
+    rounds: int = setting(2, at_least=1, at_most=1000)
+    known: float = setting(0.5, at_least=0.001, at_most=1000.0)
+    rescale: float = setting(0.2, at_least=0.0, at_most=100.0)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.delay import delay_prior
+from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, TermMatches
 from sst_graph.problem.object_sides import ObjectSides
@@ -32,7 +33,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RematchConfig:
+class RematchConfig(Settings):
     """When to match again, under which kernel, and how sure to be.
 
     Attributes:
@@ -48,14 +49,17 @@ class RematchConfig:
         side_sigma_px: error that a side of an object keeps over all images that show it [px].
     """
 
-    first_px: float = 40.0
-    last_px: float = 4.0
-    narrowing: float = 0.7
-    settled: float = 0.1
-    step_px: float = 0.1
-    most_rounds: int = 60
-    inner_iterations: int = 4
-    side_sigma_px: float = 1.0
+    first_px: float = setting(40.0, at_least=0.1, at_most=1000.0)
+    last_px: float = setting(4.0, at_least=0.1, at_most=1000.0)
+    narrowing: float = setting(0.7, at_least=0.01, at_most=0.99)
+    settled: float = setting(0.1, at_least=0.0, at_most=10.0)
+    step_px: float = setting(0.1, at_least=0.0, at_most=100.0)
+    most_rounds: int = setting(60, at_least=1, at_most=10_000)
+    inner_iterations: int = setting(4, at_least=1, at_most=1000)
+    side_sigma_px: float = setting(1.0, at_least=0.0, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("last_px", self.first_px, "first_px")
 
     def narrower(self, kernel_px: float) -> float:
         return max(self.last_px, self.narrowing * kernel_px)

@@ -191,13 +191,11 @@ def pixel_sigma(result: CalibrationResult, range_m: float) -> PixelSigma:
 
 def weakest_direction(result: CalibrationResult, limits: ObservabilityConfig) -> WeakDirection:
     """The direction known worst, each unknown measured in its limit; also where it is within the limits."""
-    least = 1e-9
-    tiny = dataclasses.replace(
-        limits,
-        rotation_deg=least * limits.rotation_deg,
-        translation_m=least * limits.translation_m,
-        offset_s=least * limits.offset_s,
-    )
+    least = {
+        name: max(1e-9 * getattr(limits, name), 1e-30)
+        for name in ("rotation_deg", "translation_m", "offset_s")
+    }
+    tiny = dataclasses.replace(limits, **least)
     return weak_directions(result.covariance, result.T_camera_lidar, tiny)[0]
 
 

@@ -61,9 +61,9 @@ class ObservabilityConfig(Settings):
         pair_share: ... and must tell them to this share of the limits.
     """
 
-    rotation_deg: float = setting(0.5, at_least=1e-6, at_most=180.0)
-    translation_m: float = setting(0.05, at_least=1e-6, at_most=1000.0)
-    offset_s: float = setting(0.01, at_least=1e-9, at_most=1000.0)
+    rotation_deg: float = setting(0.5, at_least=1e-30, at_most=180.0)
+    translation_m: float = setting(0.05, at_least=1e-30, at_most=1000.0)
+    offset_s: float = setting(0.01, at_least=1e-30, at_most=1000.0)
     pair_correlation: float = setting(0.98, at_least=0.0, at_most=2.0)
     pair_share: float = setting(0.5, at_least=0.001, at_most=1.0)
 

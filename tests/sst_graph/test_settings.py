@@ -11,15 +11,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 
 import sst_graph
+from benchmarks.settings_walk import Worker, cases
 from sst_graph.config import Range, Settings, from_dict, read_config, to_dict, walk_settings, with_overrides
 from sst_graph.data.simulator import SimulationConfig
 from sst_graph.errors import ConfigError, SstGraphError
 from sst_graph.estimators import CalibrationConfig
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.experiments.registry import EXPERIMENTS
+from sst_graph.result import Status
 
 ROOTS: dict[str, Any] = {
     "calibrate": CalibrationConfig(),
@@ -162,6 +165,7 @@ def test_the_bounds_themselves_are_taken(command: str) -> None:
         *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "delay_s"),
         *("patience", "window", "confirmations", "start_scans", "restart_scans", "lost", "kept"),
         *("box_deg", "box_step_deg", "max_offset_s", "step_s", "search_m", "search_step_m"),
+        *("rival_ratio", "finalist_ratio", "first_px", "last_px"),
         *("min_voxel_m", "max_voxel_m", "near_m", "far_m", "min_points", "max_points"),
     }
 
@@ -185,7 +189,8 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
             path.write_text(json.dumps(tree(name, "VALUE")).replace('"VALUE"', text))
             with pytest.raises(SstGraphError) as caught:
                 read_config(type(ROOTS[command]), path)
-            assert str(caught.value).startswith(f"{path}: ") and name in str(caught.value)
+            found = str(caught.value)
+            assert found.startswith(f"{path}: ") and (name in found or "found no JSON" in found)
 
 
 @pytest.mark.parametrize(
@@ -215,6 +220,7 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
             "calibration.paper.static_weights=[1.0]",
             "static_weights: found 1 of them, expected 3, one for each",
         ),
+        ("calibration.start.rival_ratio=0.5", r"expected at least 0.7 \(finalist_ratio\)"),
         ("alarm.patience=2", r"alarm.patience: found 2, expected at least 4 \(frames and confirmations\)"),
         ("window=5", r"^window: found 5, expected at least 12 \(start_scans and restart_scans\)"),
     ],
@@ -225,3 +231,37 @@ def test_rules_between_settings(settings: str, message: str) -> None:
         return
     with pytest.raises(ConfigError, match=message):
         with_overrides(TrackerConfig(), [settings])
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("joint.max_outer=0", "joint.max_outer: found 0, expected at least 1 and at most 1000"),
+        ("joint.kernel_px=[]", r"joint.kernel_px: found \[\], expected a list of 1 to 100 values"),
+        ("joint.kernel_px=[0]", r"joint.kernel_px\[0\]: found 0, expected at least 0.1 and at most 1000 px"),
+        ("start.contenders=0", "start.contenders: found 0, expected at least 1"),
+        ("start.leads=0", "start.leads: found 0, expected at least 1"),
+        ("prepare.sample_points=0", "prepare.sample_points: found 0, expected at least 1"),
+        ("prepare.lidar_odometry.neighbours=0", "neighbours: found 0, expected at least 5 and at most 100"),
+        ("motion.kernel.scale=0", "motion.kernel.scale: found 0, expected at least 0.01"),
+        ("motion.kernel.kind=square", "motion.kernel.kind: found 'square', expected one of none, huber"),
+        ("foo=1", "unknown setting 'foo'; no setting has a name like it; known at the top: challenge, "),
+        ("max_outer=3", "unknown setting 'max_outer'; did you mean 'joint.max_outer' or 'motion.max_outer'?"),
+    ],
+)
+def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, message: str) -> None:
+    with pytest.raises(ConfigError, match="^.*" + message.replace("?", r"\?")):
+        with_overrides(CalibrationConfig(), [setting])
+
+
+def test_the_bounds_of_some_settings_end_in_a_result_or_a_typed_error() -> None:
+    """A sample of what ``benchmarks/settings_walk.py`` goes through."""
+    quick = [case for case in cases() if not case.settings[-1].startswith(("start.", "semalign.starts"))]
+    chosen = np.random.default_rng(8).choice(len(quick), 10, replace=False)
+    worker = Worker(seconds=60.0, memory_gb=4.0)
+    try:
+        ends = {quick[i].settings[-1]: worker.run(quick[i]) for i in chosen}
+    finally:
+        worker.stop()
+    assert {name: end for name, (well, end) in ends.items() if not well} == {}
+    assert any(end in get_args(Status) for _, end in ends.values())
