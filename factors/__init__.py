@@ -39,6 +39,7 @@ Arrays
 from .alignment import (
     Alignment,
     GroupedBias,
+    LinearTerm,
     alignment_cost,
     frame_factor,
     pixel_to_point_factor,
@@ -77,6 +78,7 @@ __all__ = [
     "JacobianBlock",
     "JacobianReport",
     "KernelKind",
+    "LinearTerm",
     "MotionModel",
     "PinholeCamera",
     "PointwiseMoved",

@@ -28,6 +28,7 @@ from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, 
 __all__ = [
     "Alignment",
     "GroupedBias",
+    "LinearTerm",
     "alignment_cost",
     "frame_factor",
     "pixel_to_point_factor",
@@ -52,6 +53,23 @@ class GroupedBias:
 
     biases: tuple[int | float, ...]
     groups: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearTerm:
+    """A scalar that all silhouettes of one alignment depend on: r_i += coefficients_i (theta - at).
+
+    For parameters whose column is known in closed form: a focal length, a distortion, a range bias.
+
+    Attributes:
+        key: of theta (``Vector(1)``).
+        coefficients: (n,) derivative of each match's residual by theta [px per unit].
+        at: value of theta at which the matches were made.
+    """
+
+    key: int
+    coefficients: FloatArray
+    at: float = 0.0
 
 
 def point_to_pixel_factor(
@@ -99,6 +117,7 @@ def frame_factor(
     c_twist: int | FloatArray | None = None,
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | None = None,
     *,
+    terms: Sequence[Sequence[LinearTerm]] | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """All alignments of one image as one factor.
@@ -111,6 +130,7 @@ def frame_factor(
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel; a
             :class:`GroupedBias` where the objects of one alignment have a bias each).
+        terms: of each alignment, scalars that its silhouettes depend on besides; None for none.
         condensed: False gives two rows a match and one more; for tests and for looking at residuals.
 
     Returns:
@@ -119,7 +139,7 @@ def frame_factor(
     Raises:
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
-    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
+    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px, terms)
     bounds = list(pairwise(accumulate(frame.dims, initial=0)))
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
@@ -152,6 +172,7 @@ class _Part:
         groups: (n,) the bias of each match, or None where all share one.
         columns: columns of the alignment's [J r] that belong to variables, the residual last.
         targets: the same columns in the factor's [J r].
+        terms: scalars that the residuals depend on besides, and where their values come from.
     """
 
     alignment: Alignment
@@ -159,6 +180,18 @@ class _Part:
     groups: NDArray[np.intp] | None
     columns: list[int]
     targets: list[int]
+    terms: tuple[tuple[LinearTerm, _Source], ...] = ()
+
+    def evaluated(
+        self, values: Sequence[Any], state: tuple[gtsam.Pose3, float, FloatArray], jacobians: bool
+    ) -> Evaluated:
+        """Residuals, and derivatives with a column for each term where ``jacobians`` is true."""
+        found = evaluate(self.alignment, *state, self.bias_px(values), jacobians)
+        if not self.terms:
+            return found
+        coefficients = np.stack([term.coefficients for term, _ in self.terms])
+        steps = np.array([_scalar(source.value(values)) - term.at for term, source in self.terms])
+        return found.with_terms(coefficients, steps, jacobians)
 
     def bias_px(self, values: Sequence[Any]) -> float | FloatArray | None:
         if not self.biases:
@@ -194,13 +227,13 @@ class FrameResidual:
 
     def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[Evaluated, float]:
         """Weighted [J r] of one alignment and its constant."""
-        return part.weighted(evaluate(part.alignment, *self._state(values), part.bias_px(values), True))
+        return part.weighted(part.evaluated(values, self._state(values), True))
 
     def cost(self, values: Sequence[Any]) -> float:
         total = 0.0
         for part in self.parts:
             state = self._state(values)
-            total += cost(part.alignment, evaluate(part.alignment, *state, part.bias_px(values), False))
+            total += cost(part.alignment, part.evaluated(values, state, False))
         return total
 
     def gram(self, values: Sequence[Any]) -> tuple[FloatArray, float]:
@@ -241,14 +274,19 @@ class FrameResidual:
         """The error of :meth:`stacked`, without the work for its Jacobian."""
         blocks, constant = [], 0.0
         for part in self.parts:
-            evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), False)
+            evaluated = part.evaluated(values, self._state(values), False)
             constant += weigh(part.alignment, evaluated)
             blocks.append(evaluated.rows[-1].reshape(-1))
         return np.concatenate([*blocks, [np.sqrt(constant)]])
 
 
 def frame_residual(
-    alignments: Sequence[Alignment], cTl: Any, offset_s: Any, c_twist: Any, biases_px: Any
+    alignments: Sequence[Alignment],
+    cTl: Any,
+    offset_s: Any,
+    c_twist: Any,
+    biases_px: Any,
+    terms: Sequence[Sequence[LinearTerm]] | None = None,
 ) -> FrameResidual:
     if not alignments:
         raise FactorError("alignments of a frame", "none", "one or more")
@@ -259,20 +297,26 @@ def frame_residual(
         c_twist, 6, lambda v: checked_array("c_twist", np.zeros(6) if v is None else v, (6,))
     )
     biases = [_bias_sources(bias, variables) for bias in _bias_of_each(alignments, biases_px)]
+    scalars = [
+        tuple((term, variables.source(term.key, 1, _scalar)) for term in of_one)
+        for of_one in _terms_of_each(alignments, terms)
+    ]
     if not variables.keys:
         raise FactorError("keys of a frame's factor", "constants only", "the key of one variable or more")
     cols = sum(variables.dims)
     parts = []
-    for alignment, (sources, groups) in zip(alignments, biases, strict=True):
+    for alignment, (sources, groups), own_terms in zip(alignments, biases, scalars, strict=True):
         columns, targets = [], []
         named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["offset_s"]), (twist, _COLUMNS["c_twist"])]
-        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(sources)]
+        singles = [*(source for _, source in own_terms), *sources]
+        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(singles)]
         for source, own in named:
             if source.slot is not None:
                 columns += list(own)
                 start = sum(variables.dims[: source.slot])
                 targets += list(range(start, start + len(own)))
-        parts.append(_Part(alignment, sources, groups, [*columns, 13 + len(sources)], [*targets, cols]))
+        columns, targets = [*columns, 13 + len(singles)], [*targets, cols]
+        parts.append(_Part(alignment, sources, groups, columns, targets, own_terms))
     return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
 
 
@@ -309,6 +353,22 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
                 f"({len(alignment)},), positions in {len(bias.biases)} biases",
             )
     return biases
+
+
+def _terms_of_each(
+    alignments: Sequence[Alignment], terms: Sequence[Sequence[LinearTerm]] | None
+) -> list[Sequence[LinearTerm]]:
+    """The terms of each alignment, their shapes checked."""
+    if terms is None:
+        return [()] * len(alignments)
+    if len(terms) != len(alignments):
+        raise FactorError("terms", f"{len(terms)} entries", f"{len(alignments)}, one an alignment")
+    for alignment, own in zip(alignments, terms, strict=True):
+        if own and alignment.normals is None:
+            raise FactorError("terms", "one for point-to-pixel matches", "none: only silhouettes have them")
+        for term in own:
+            checked_array("coefficients of a linear term", term.coefficients, (len(alignment),))
+    return list(terms)
 
 
 class _Variables:

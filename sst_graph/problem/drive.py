@@ -128,6 +128,12 @@ class Drive:
         stamps = self.image_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
+    @property
+    def scan_period_s(self) -> float:
+        """Median interval between scans [s]; 0.1 for a single one."""
+        stamps = self.scan_stamps_ns
+        return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
         """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
 
