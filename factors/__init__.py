@@ -27,8 +27,8 @@ Pixels
     The centre of the top-left pixel is (0, 0), as in OpenCV.
 Variables
     extrinsic E ``Pose3``, offset D ``Vector(1)``, twist V ``Vector(6)``, mask bias B ``Vector(1)``
-    (a ``double`` in gtsam's Values cannot be serialized). A factor takes their keys, which are ints; a
-    float or an array in place of a key fixes the quantity.
+    or ``double`` for D and B (which gtsam's Values cannot serialize). A factor takes their keys, ints or
+    ``gtsam.Symbol``; a float or an array in place of a key fixes the quantity.
 Units
     SI inside; a suffix at boundaries (``_s _ns _px _deg``). Degrees are for people only.
 Arrays
@@ -61,6 +61,7 @@ from .robust import KernelKind, RobustKernel
 from .silhouette import silhouette_factor
 from .slam import pose_alignment_factor
 from .twist_transfer import twist_transfer_factor
+from .variables import Kind, Vector
 from .velocity import (
     mean_velocity_factor,
     twist_jerk_factor,
@@ -78,12 +79,14 @@ __all__ = [
     "JacobianBlock",
     "JacobianReport",
     "KernelKind",
+    "Kind",
     "LinearTerm",
     "MotionModel",
     "PinholeCamera",
     "PointwiseMoved",
     "RigidlyMoved",
     "RobustKernel",
+    "Vector",
     "alignment_cost",
     "beta_regularizer",
     "camera_motion_factor",

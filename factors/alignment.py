@@ -5,13 +5,14 @@ w_i of each match. Condensed (the default) it has cols + 2 rows however many mat
 cost, gradient and Gauss-Newton Hessian of the stacked factor.
 
 Variables are given by their key; a constant in place of a key fixes the quantity: ``offset_s=0.1`` or
-``c_twist=np.zeros(6)``. Keys: extrinsic Pose3, offset ``Vector(1)``, twist ``Vector(6)``, bias ``Vector(1)``.
+``c_twist=np.zeros(6)``. Extrinsic Pose3, offset and bias ``Vector(1)`` or ``double``, twist ``Vector(6)``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -21,9 +22,10 @@ from numpy.typing import NDArray
 
 from .condensed import condense, condense_root, cost_rows
 from .custom import custom_factor
-from .errors import FactorError, checked_array
+from .errors import FactorError, checked_array, described
 from .matches import Alignment
 from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
+from .variables import Kind, Vector, checked_key, dimension, is_key, key_name, number_or_key, pose_or_key
 
 __all__ = [
     "Alignment",
@@ -40,6 +42,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 _COLUMNS = {"cTl": range(0, 6), "offset_s": range(6, 7), "c_twist": range(7, 13)}
 """Where each quantity stands among the Jacobian's columns; biases follow, the residual is last."""
+_NAME = "frame_factor"
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +128,7 @@ def frame_factor(
     Args:
         alignments: one or more, over the same image (one twist).
         cTl: key of the extrinsic, or a fixed pose.
-        offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key).
+        offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key, and 0 is refused).
         c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for zero.
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel; a
@@ -140,16 +143,27 @@ def frame_factor(
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
     frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px, terms)
-    bounds = list(pairwise(accumulate(frame.dims, initial=0)))
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
+    function = _FrameError(frame, condensed, rows)
+    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.named, function, frame.kinds, rows, _NAME)
 
-    def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+
+@dataclass(frozen=True)
+class _FrameError:
+    """The error of a frame's factor; a plain object, so that it copies and pickles."""
+
+    frame: FrameResidual
+    condensed: bool
+    rows: int
+
+    def __call__(self, *values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        frame = self.frame
         if not jacobians:
-            return cost_rows(frame.cost(values), rows) if condensed else frame.stacked_error(values), None
-        error, J = frame.condensed(values) if condensed else frame.stacked(values)
-        return error, [J[:, start:end] for start, end in bounds]
-
-    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
+            return cost_rows(frame.cost(values), self.rows) if self.condensed else frame.stacked_error(
+                values
+            ), None
+        error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
+        return error, [J[:, start:end] for start, end in frame.bounds]
 
 
 @dataclass(frozen=True)
@@ -216,7 +230,22 @@ class FrameResidual:
     offset_s: _Source
     c_twist: _Source
     keys: tuple[int, ...]
-    dims: tuple[int, ...]
+    kinds: tuple[Kind, ...]
+    names: tuple[str, ...]
+
+    @cached_property
+    def dims(self) -> tuple[int, ...]:
+        return tuple(dimension(kind) for kind in self.kinds)
+
+    @cached_property
+    def bounds(self) -> list[tuple[int, int]]:
+        """Where each variable's columns begin and end."""
+        return list(pairwise(accumulate(self.dims, initial=0)))
+
+    @property
+    def named(self) -> dict[str, int]:
+        """Keys by the argument that each came as."""
+        return dict(zip(self.names, self.keys, strict=True))
 
     @property
     def cols(self) -> int:
@@ -287,22 +316,28 @@ def frame_residual(
     c_twist: Any,
     biases_px: Any,
     terms: Sequence[Sequence[LinearTerm]] | None = None,
+    name: str = _NAME,
 ) -> FrameResidual:
+    """The residual behind :func:`frame_factor`, whose arguments these are; ``name`` is for errors."""
     if not alignments:
-        raise FactorError("alignments of a frame", "none", "one or more")
-    variables = _Variables()
-    pose = variables.source(cTl, 6, lambda value: value)
-    offset = variables.source(offset_s, 1, _scalar)
-    twist = variables.source(
-        c_twist, 6, lambda v: checked_array("c_twist", np.zeros(6) if v is None else v, (6,))
-    )
+        raise FactorError(f"alignments of {name}", "none", "one or more")
+    for alignment in alignments:
+        if not isinstance(alignment, Alignment):
+            raise FactorError(f"alignments of {name}", described(alignment), "factors.Alignment")
+    variables = _Variables(name)
+    pose = variables.source("cTl", pose_or_key(name, "cTl", cTl), gtsam.Pose3)
+    offset = variables.source("offset_s", number_or_key(name, "offset_s", offset_s), Vector(1))
+    twist = variables.source("c_twist", _twist_or_key(name, c_twist), Vector(6))
     biases = [_bias_sources(bias, variables) for bias in _bias_of_each(alignments, biases_px)]
     scalars = [
-        tuple((term, variables.source(term.key, 1, _scalar)) for term in of_one)
+        tuple(
+            (term, variables.source("term", checked_key(name, "terms", term.key), Vector(1)))
+            for term in of_one
+        )
         for of_one in _terms_of_each(alignments, terms)
     ]
     if not variables.keys:
-        raise FactorError("keys of a frame's factor", "constants only", "the key of one variable or more")
+        raise FactorError(f"keys of {name}", "constants only", "the key of one variable or more")
     cols = sum(variables.dims)
     parts = []
     for alignment, (sources, groups), own_terms in zip(alignments, biases, scalars, strict=True):
@@ -317,15 +352,25 @@ def frame_residual(
                 targets += list(range(start, start + len(own)))
         columns, targets = [*columns, 13 + len(singles)], [*targets, cols]
         parts.append(_Part(alignment, sources, groups, columns, targets, own_terms))
-    return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), tuple(variables.dims))
+    kinds, names = tuple(variables.kinds), tuple(variables.names)
+    return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), kinds, names)
+
+
+def _twist_or_key(name: str, c_twist: Any) -> int | FloatArray:
+    if is_key(c_twist):
+        return checked_key(name, "c_twist", c_twist)
+    return checked_array(f"c_twist of {name}", np.zeros(6) if c_twist is None else c_twist, (6,))
 
 
 def _bias_sources(
     bias: int | float | GroupedBias | None, variables: _Variables
 ) -> tuple[list[_Source], NDArray[np.intp] | None]:
+    def source(each: int | float) -> _Source:
+        return variables.source("bias", number_or_key(variables.factor, "biases_px", each), Vector(1))
+
     if isinstance(bias, GroupedBias):
-        return [variables.source(each, 1, _scalar) for each in bias.biases], bias.groups
-    return ([] if bias is None else [variables.source(bias, 1, _scalar)]), None
+        return [source(each) for each in bias.biases], bias.groups
+    return ([] if bias is None else [source(bias)]), None
 
 
 def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | GroupedBias | None]:
@@ -371,20 +416,38 @@ def _terms_of_each(
     return list(terms)
 
 
+_SEVERAL = ("bias", "term")
+"""Arguments that a factor may have more than one of."""
+
+
 class _Variables:
-    """Collects the keys of a factor and their dimensions."""
+    """Collects the keys of a factor, their kinds, and the arguments that they came as."""
 
-    def __init__(self) -> None:
+    def __init__(self, factor: str) -> None:
+        self.factor = factor
         self.keys: list[int] = []
-        self.dims: list[int] = []
+        self.kinds: list[Kind] = []
+        self.names: list[str] = []
 
-    def source(self, key_or_value: Any, dim: int, constant: Any) -> _Source:
-        if not isinstance(key_or_value, int | np.integer):
-            return _Source(None, constant(key_or_value))
-        key = int(key_or_value)
-        if key not in self.keys:
+    @property
+    def dims(self) -> list[int]:
+        return [dimension(kind) for kind in self.kinds]
+
+    def source(self, name: str, key_or_value: Any, kind: Kind) -> _Source:
+        """Of a key or constant that has been checked; biases may share a key, and terms, others may not."""
+        if not isinstance(key_or_value, int):
+            return _Source(None, key_or_value)
+        key = key_or_value
+        if key in self.keys:
+            before = self.names[self.keys.index(key)]
+            if name not in _SEVERAL or not before.startswith(name):
+                both = f"{key_name(key)} for {before} and {name}"
+                raise FactorError(f"keys of {self.factor}", both, "distinct keys")
+        else:
+            count = sum(each.startswith(name) for each in self.names)
             self.keys.append(key)
-            self.dims.append(dim)
+            self.kinds.append(kind)
+            self.names.append(f"{name} {count + 1}" if name in _SEVERAL else name)
         return _Source(self.keys.index(key))
 
 

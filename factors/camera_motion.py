@@ -11,6 +11,7 @@ trajectory the calibration: a hand-eye constraint (:mod:`factors.hand_eye`) with
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -18,10 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .custom import custom_factor
-from .errors import FactorError, checked_positive
-from .hand_eye import camera_motion_error
+from .errors import FactorError, checked_positive, described
+from .hand_eye import MotionError, camera_motion_error
+from .variables import Kind, Vector, checked_key, key_name, number_or_key, pose_or_key
 
 FloatArray = NDArray[np.float64]
+_NAME = "camera_motion_factor"
 
 
 @dataclass(frozen=True)
@@ -41,8 +44,10 @@ class Between:
     image_after_a_s: float
 
     def __post_init__(self) -> None:
+        for name in ("X_a", "X_b"):
+            object.__setattr__(self, name, checked_key("Between", name, getattr(self, name)))
         if self.X_a == self.X_b:
-            raise FactorError("poses around an image", "one key for both", "two distinct keys")
+            raise FactorError("keys of Between", f"{key_name(self.X_a)} for X_a and X_b", "distinct keys")
         checked_positive("seconds between the poses", self.seconds)
 
 
@@ -77,22 +82,32 @@ def camera_motion_factor(
         FactorError: one key for two variables, or a covariance that is none.
     """
     error_of, noise = camera_motion_error(c1Tc2, covariance, scale_known)
-    poses = list(dict.fromkeys((first.X_a, first.X_b, second.X_a, second.X_b)))
-    E = None if isinstance(cTl, gtsam.Pose3) else int(cTl)
-    D = int(offset_s) if isinstance(offset_s, int | np.integer) else None
-    keys = poses + [key for key in (E, D) if key is not None]
-    dims = [6] * len(poses) + [6] * (E is not None) + [1] * (D is not None)
-    if len(set(keys)) != len(keys):
-        raise FactorError("keys of a camera motion", "one key for two variables", "distinct keys")
-    chain = _Chain(first, second, cTl, offset_s, gtsam.Pose3() if bTl is None else bTl.inverse())
+    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
+    if bTl is not None and not isinstance(bTl, gtsam.Pose3):
+        raise FactorError(f"bTl of {_NAME}", described(bTl), "a gtsam.Pose3, or None")
+    variables: dict[int, tuple[str, Kind]] = {}
+    for name, where in (("first", first), ("second", second)):
+        for end, key in (("X_a", where.X_a), ("X_b", where.X_b)):
+            variables.setdefault(key, (f"{end} of the {name}", gtsam.Pose3))
+    own: list[tuple[str, Any, Kind]] = [("cTl", E, gtsam.Pose3), ("offset_s", D, Vector(1))]
+    for name, key, kind in own:
+        if isinstance(key, int):
+            if key in variables:
+                both = f"{key_name(key)} for {variables[key][0]} and {name}"
+                raise FactorError(f"keys of {_NAME}", both, "distinct keys")
+            variables[key] = (name, kind)
+    chain = _Chain(first, second, E, D, gtsam.Pose3() if bTl is None else bTl.inverse())
+    named = {name: key for key, (name, _) in variables.items()}
+    kinds = [kind for _, kind in variables.values()]
+    return custom_factor(noise, named, partial(_error, tuple(variables), chain, error_of), kinds, 6, _NAME)
 
-    def function(*values: Any, jacobians: bool) -> Any:
-        named = dict(zip(keys, values, strict=True))
-        predicted, P_H = chain.motion(named, jacobians)
-        error, error_H_P = error_of(predicted)
-        return error, [error_H_P @ P_H[key] for key in keys] if jacobians else None
 
-    return custom_factor(noise, keys, function, dims, 6)
+def _error(
+    keys: tuple[int, ...], chain: _Chain, error_of: MotionError, *values: Any, jacobians: bool
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    predicted, P_H = chain.motion(dict(zip(keys, values, strict=True)), jacobians)
+    error, error_H_P = error_of(predicted)
+    return error, [error_H_P @ P_H[key] for key in keys] if jacobians else None
 
 
 @dataclass(frozen=True)

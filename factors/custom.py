@@ -10,77 +10,140 @@ makes a cycle through C++ that is never freed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextvars import ContextVar
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FactorError
+from .errors import FactorError, described
+from .variables import Kind, Reader, checked_keys, dimension, key_name
 
 FloatArray = NDArray[np.float64]
 Jacobians = Sequence[FloatArray] | None
 ResidualFunction = Callable[..., tuple[FloatArray, Jacobians]]
 """``function(*values, jacobians: bool) -> (error (rows,), [H (rows, dim), ...] or None)``."""
 
-_READERS: dict[int, tuple[str, ...]] = {
-    1: ("atVector", "atDouble"),
-    2: ("atVector", "atPoint2"),
-    3: ("atVector", "atPoint3", "atRot3", "atPose2"),
-    6: ("atPose3", "atVector"),
-}
+
+@dataclass(frozen=True, eq=False)
+class FactorRecipe:
+    """All that a factor of this package is made of; :func:`custom_factor` has the attributes' meanings.
+
+    ``copy.deepcopy`` and ``pickle`` take it where they take noise and function.
+
+    Attributes:
+        keys: with the name of the argument that each came as ('' where it has none).
+    """
+
+    noise: gtsam.noiseModel.Base
+    keys: dict[int, str]
+    function: ResidualFunction
+    dims: tuple[Kind, ...]
+    rows: int
+    name: str
+
+    def build(self) -> gtsam.CustomFactor:
+        """A new factor."""
+        readers = [
+            Reader(key, kind, self.name, argument)
+            for (key, argument), kind in zip(self.keys.items(), self.dims, strict=True)
+        ]
+        shapes = [(self.rows, dimension(kind)) for kind in self.dims]
+        keys, rows, function, name = list(self.keys), self.rows, self.function, self.name
+
+        def callback(
+            this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None
+        ) -> FloatArray:
+            asked = _ASKED.get()
+            if asked is not None:
+                asked.append(self)
+                return np.zeros(rows)
+            arguments = [reader.read(values) for reader in readers]
+            error, jacobians = function(*arguments, jacobians=H is not None)
+            error = _checked(f"error of {name} on", keys, error, (rows,))
+            if H is not None:
+                if jacobians is None or len(jacobians) != len(keys):
+                    found = "None" if jacobians is None else f"{len(jacobians)}"
+                    raise FactorError(f"Jacobians of {name}", found, f"{len(keys)}, one for each key")
+                for i, (key, shape) in enumerate(zip(keys, shapes, strict=True)):
+                    H[i] = _checked(f"Jacobian of {name} by", [key], jacobians[i], shape, fortran=True)
+            return error
+
+        return gtsam.CustomFactor(self.noise, keys, callback)
+
+
+_ASKED: ContextVar[list[FactorRecipe] | None] = ContextVar("recipe asked for", default=None)
+"""Where a factor's callback leaves its recipe instead of doing its work; see :func:`recipe_of`."""
+
+
+def recipe_of(factor: gtsam.NonlinearFactor) -> FactorRecipe | None:
+    """What a factor was made of; None for one that :func:`custom_factor` did not make.
+
+    gtsam gives the callback of a ``CustomFactor`` back to nobody, but it calls it: the callback is asked for
+    its recipe. A ``CustomFactor`` of somebody else is called on empty values, and may raise or not.
+    """
+    if not isinstance(factor, gtsam.CustomFactor):
+        return None
+    asked: list[FactorRecipe] = []
+    token = _ASKED.set(asked)
+    try:
+        factor.unwhitenedError(gtsam.Values())
+    except Exception:  # another's callback, which knows nothing of this question
+        return None
+    finally:
+        _ASKED.reset(token)
+    return asked[0] if asked else None
 
 
 def custom_factor(
     noise: gtsam.noiseModel.Base,
-    keys: Sequence[int],
+    keys: Sequence[int] | Mapping[str, int],
     function: ResidualFunction,
-    dims: Sequence[int],
+    dims: Sequence[Kind],
     rows: int,
+    name: str = "a factor",
 ) -> gtsam.CustomFactor:
     """error = function(*values, jacobians=...), checked at every call.
 
     Args:
         noise: noise model of dimension ``rows``.
-        keys: distinct keys of the variables.
-        function: given the variables' values in the order of the keys (Pose3 or vector) and the
-            keyword ``jacobians``; returns the unwhitened error (rows,) and, where ``jacobians`` is
-            true, one Jacobian (rows, dim) for each variable (tangent space as gtsam has it).
-        dims: tangent dimension of each variable.
+        keys: distinct keys of the variables (int or ``gtsam.Symbol``); as a mapping with a name for each,
+            which errors then tell.
+        function: given the variables' values in the order of the keys and the keyword ``jacobians``;
+            returns the unwhitened error (rows,) and, where ``jacobians`` is true, one Jacobian (rows, dim)
+            for each variable (tangent space as gtsam has it). A value is what ``gtsam.Values`` holds: an
+            object of gtsam (Pose3, NavState, ConstantBias, Unit3, Cal3_S2, ...) or an array; a ``double``
+            comes as a ``Vector(1)`` does, (1,).
+        dims: of each variable its tangent dimension, or a class of gtsam or :class:`factors.Vector` where
+            nothing else will do.
         rows: length of the error.
+        name: of the factor, for errors.
 
     Raises:
-        FactorError: here for arguments that disagree; inside an optimisation for a wrong shape, a
-            missing Jacobian, NaN or inf (ISAM2 cannot go on after that: linearize first).
+        FactorError: here for arguments that disagree; inside an optimisation for a variable of another
+            kind, a wrong shape, a missing Jacobian, NaN or inf (ISAM2 cannot go on after that: linearize
+            first).
     """
-    keys, dims = [int(key) for key in keys], [int(dim) for dim in dims]
-    if not keys or len(set(keys)) != len(keys):
-        raise FactorError("keys of a factor", _names(keys), "one or more distinct keys")
-    if len(dims) != len(keys):
-        raise FactorError("dims of a factor", f"{len(dims)} dims", f"{len(keys)}, one for each key")
+    named = checked_keys(name, keys)
+    if len(dims) != len(named):
+        raise FactorError(f"dims of {name}", f"{len(dims)} dims", f"{len(named)}, one for each key")
+    if not isinstance(noise, gtsam.noiseModel.Base):
+        raise FactorError(f"noise of {name}", described(noise), "a gtsam.noiseModel")
     if noise.dim() != rows:
-        raise FactorError("noise of a factor", f"dimension {noise.dim()}", f"dimension {rows} (rows)")
-
-    def callback(this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None) -> FloatArray:
-        arguments = [_read(values, key, dim) for key, dim in zip(keys, dims, strict=True)]
-        error, jacobians = function(*arguments, jacobians=H is not None)
-        error = _checked("error of the factor on", keys, error, (rows,))
-        if H is not None:
-            if jacobians is None or len(jacobians) != len(keys):
-                found = "None" if jacobians is None else f"{len(jacobians)}"
-                raise FactorError("Jacobians of a factor", found, f"{len(keys)}, one for each key")
-            for i, (key, dim) in enumerate(zip(keys, dims, strict=True)):
-                H[i] = _checked("Jacobian by", [key], jacobians[i], (rows, dim), fortran=True)
-        return error
-
-    return gtsam.CustomFactor(noise, keys, callback)
+        raise FactorError(f"noise of {name}", f"dimension {noise.dim()}", f"dimension {rows} (rows)")
+    return FactorRecipe(noise, named, function, tuple(dims), int(rows), name).build()
 
 
 def _checked(
     what: str, keys: Sequence[int], value: Any, shape: tuple[int, ...], fortran: bool = False
 ) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64, order="F" if fortran else None)
+    try:
+        array = np.asarray(value, dtype=np.float64, order="F" if fortran else None)
+    except (TypeError, ValueError):
+        raise FactorError(f"{what} {_names(keys)}", described(value), f"shape {shape}") from None
     if array.shape != shape:
         raise FactorError(f"{what} {_names(keys)}", f"shape {array.shape}", f"shape {shape}")
     if not np.isfinite(array).all():
@@ -89,20 +152,5 @@ def _checked(
     return array
 
 
-def _read(values: gtsam.Values, key: int, dim: int) -> Any:
-    """The value of a variable, of whichever type with that tangent dimension it has."""
-    if not values.exists(key):
-        raise FactorError("values", f"no variable {_names([key])}", "every key of the factor")
-    for reader in _READERS.get(dim, ("atVector",)):
-        try:
-            value = getattr(values, reader)(key)
-        except RuntimeError:  # stored as another type
-            continue
-        if isinstance(value, np.ndarray) and value.shape != (dim,):
-            raise FactorError(f"variable {_names([key])}", f"shape {value.shape}", f"shape ({dim},)")
-        return value
-    raise FactorError(f"variable {_names([key])}", "another type", f"a type of tangent dimension {dim}")
-
-
 def _names(keys: Sequence[int]) -> str:
-    return "[" + ", ".join(gtsam.DefaultKeyFormatter(key) for key in keys) + "]"
+    return "[" + ", ".join(key_name(key) for key in keys) + "]"

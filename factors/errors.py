@@ -1,6 +1,8 @@
-"""The exception of the package, and the shape checks that raise it."""
+"""The root of all exceptions raised on purpose, that of the factors, and the shape checks that raise it."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,7 +10,44 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 
-class FactorError(ValueError):
+MAX_MESSAGE = 1200
+"""Characters of a message; what is longer loses its middle."""
+
+
+def printable(text: object, limit: int = MAX_MESSAGE) -> str:
+    """``text`` as it may stand in a message: no control character, and at most ``limit`` characters.
+
+    Line breaks, escape sequences, direction marks and lone surrogates appear as in a Python literal
+    (``\\n``, ``\\x1b``), so that no file's content reaches a terminal as anything but text. What is too
+    long loses its middle.
+    """
+    shown = _shortened(str(text), limit)
+    if not shown.isprintable():
+        escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in shown)
+        shown = "".join(escaped)
+    return _shortened(shown, limit)
+
+
+def _shortened(text: str, limit: int) -> str:
+    if len(text) <= limit:
+        return text
+    gap = " ... "
+    tail = (limit - len(gap)) // 3
+    return text[: limit - len(gap) - tail] + gap + text[-tail:]
+
+
+class SstGraphError(Exception):
+    """Root of every error that sst_graph and factors raise on purpose.
+
+    The message is one line without control characters; line breaks in it become spaces.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        text = _shortened(str(message), 4 * MAX_MESSAGE)
+        super().__init__(printable(" ".join(text.split())))
+
+
+class FactorError(SstGraphError, ValueError):
     """A value that a factor cannot use: what it is, what was found, what was expected."""
 
     def __init__(self, what: str, found: str, expected: str) -> None:
@@ -23,12 +62,15 @@ class FactorError(ValueError):
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only float64 copy of ``value`` with the given shape (None: any length), all finite."""
-    array = np.array(value, dtype=np.float64)
+    wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise FactorError(what, described(value), f"numbers of shape {wanted}") from None
     matches = array.ndim == len(shape) and all(
         n is None or n == m for n, m in zip(shape, array.shape, strict=True)
     )
     if not matches:
-        wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
         raise FactorError(what, f"shape {array.shape}", f"shape {wanted}")
     if not np.isfinite(array).all():
         raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
@@ -53,6 +95,17 @@ def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
 
 def checked_positive(what: str, value: float) -> float:
     """A finite number above zero."""
-    if not (np.isfinite(value) and value > 0.0):
-        raise FactorError(what, f"{value}", "a finite number above 0")
+    number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    if not (number and np.isfinite(value) and value > 0.0):
+        raise FactorError(what, f"{value}" if number else described(value), "a finite number above 0")
     return float(value)
+
+
+def described(value: Any) -> str:
+    """A short word on a value of any type, for messages."""
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if value is None or isinstance(value, bool | int | float | np.number):
+        return repr(value)
+    name = type(value).__name__
+    return f"a {name} of {len(value)}" if isinstance(value, list | tuple) else f"a {name}"

@@ -13,6 +13,7 @@ camera-LiDAR calibration, 2020.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .custom import ResidualFunction, custom_factor
 from .errors import FactorError, checked_array, checked_covariance
+from .variables import Kind, Vector
 
 FloatArray = NDArray[np.float64]
 
@@ -61,13 +63,15 @@ def hand_eye_factor(
     """
     motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, offset_0)
     motion_error, noise = camera_motion_error(c1Tc2, covariance, scale_known)
+    return _factor("hand_eye_factor", E, D, partial(_hand_eye, motion, motion_error), noise, 6)
 
-    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
-        predicted, P_H = motion.in_camera(cTl, offset)
-        error, error_H_P = motion_error(predicted)
-        return error, [error_H_P @ H for H in P_H] if jacobians else None
 
-    return _factor(E, D, function, noise, 6)
+def _hand_eye(
+    motion: _LidarMotion, error_of: MotionError, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    predicted, P_H = motion.in_camera(cTl, offset)
+    error, error_H_P = error_of(predicted)
+    return error, [error_H_P @ H for H in P_H] if jacobians else None
 
 
 def rotation_hand_eye(
@@ -91,21 +95,27 @@ def rotation_hand_eye(
     noise = gtsam.noiseModel.Gaussian.Covariance(
         checked_covariance("covariance of the rotation", covariance, 3)
     )
-
-    def function(cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool) -> Any:
-        predicted, P_H = motion.in_camera(cTl, offset)
-        error = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
-        if not jacobians:
-            return error, None
-        Log_H = gtsam.Rot3.LogmapDerivative(error)
-        return error, [Log_H @ H[:3] for H in P_H]
-
-    return _factor(E, D, function, noise, 3)
+    function = partial(_rotation_hand_eye, motion, c1Rc2)
+    return _factor("rotation_hand_eye", E, D, function, noise, 3)
 
 
-def _factor(E: int, D: int | None, function: ResidualFunction, noise: Any, rows: int) -> gtsam.CustomFactor:
-    keys, dims = ([E], [6]) if D is None else ([E, D], [6, 1])
-    return custom_factor(noise, keys, function, dims, rows)
+def _rotation_hand_eye(
+    motion: _LidarMotion, c1Rc2: gtsam.Rot3, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    predicted, P_H = motion.in_camera(cTl, offset)
+    error = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
+    if not jacobians:
+        return error, None
+    Log_H = gtsam.Rot3.LogmapDerivative(error)
+    return error, [Log_H @ H[:3] for H in P_H]
+
+
+def _factor(
+    name: str, E: int, D: int | None, function: ResidualFunction, noise: Any, rows: int
+) -> gtsam.CustomFactor:
+    kinds: list[Kind] = [gtsam.Pose3, Vector(1)]
+    keys = {"E": E} if D is None else {"E": E, "D": D}
+    return custom_factor(noise, keys, function, kinds[: len(keys)], rows, name)
 
 
 class _LidarMotion:
@@ -139,35 +149,31 @@ def camera_motion_error(
     """
     measured_covariance = checked_covariance("covariance of the hand-eye error", covariance, 6)
     if scale_known:
-        return _pose_error(c1Tc2), gtsam.noiseModel.Gaussian.Covariance(measured_covariance)
+        return partial(_pose_error, c1Tc2), gtsam.noiseModel.Gaussian.Covariance(measured_covariance)
     t = np.asarray(c1Tc2.translation())
     length = float(np.linalg.norm(t))
     if length == 0.0:
         raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
     noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, measured_covariance))
-    return _direction_error(c1Tc2.rotation(), t / length), noise
+    return partial(_direction_error, c1Tc2.rotation(), t / length), noise
 
 
-def _pose_error(c1Tc2: gtsam.Pose3) -> MotionError:
-    def error_of(predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
-        error = np.asarray(gtsam.Pose3.Logmap(c1Tc2.between(predicted)))
-        return error, np.asarray(gtsam.Pose3.LogmapDerivative(error))
-
-    return error_of
+def _pose_error(c1Tc2: gtsam.Pose3, predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+    error = np.asarray(gtsam.Pose3.Logmap(c1Tc2.between(predicted)))
+    return error, np.asarray(gtsam.Pose3.LogmapDerivative(error))
 
 
-def _direction_error(c1Rc2: gtsam.Rot3, direction: FloatArray) -> MotionError:
-    def error_of(predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
-        log = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
-        t = np.asarray(predicted.translation())
-        length = np.sqrt(t @ t + LOW_TRANSLATION_M**2)
-        H = np.zeros((6, 6))
-        H[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
-        # t of P Exp([w, v]) is t + R v
-        H[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
-        return np.concatenate([log, t / length - direction]), H
-
-    return error_of
+def _direction_error(
+    c1Rc2: gtsam.Rot3, direction: FloatArray, predicted: gtsam.Pose3
+) -> tuple[FloatArray, FloatArray]:
+    log = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
+    t = np.asarray(predicted.translation())
+    length = np.sqrt(t @ t + LOW_TRANSLATION_M**2)
+    H = np.zeros((6, 6))
+    H[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
+    # t of P Exp([w, v]) is t + R v
+    H[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
+    return np.concatenate([log, t / length - direction]), H
 
 
 def _direction_covariance(c1Tc2: gtsam.Pose3, covariance: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -38,18 +39,21 @@ def beta_regularizer(
     R_static, t_static = cTl_static.rotation(), cTl_static.translation()
     weights = (checked_positive("lambda_r", lambda_r), checked_positive("lambda_t", lambda_t))
     sigmas = np.repeat([weight**-0.5 for weight in weights], 3)
-
-    def function(cTl: gtsam.Pose3, *, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        difference = cTl.rotation() * R_static.inverse()
-        log = gtsam.Rot3.Logmap(difference)
-        error = np.concatenate([log, cTl.translation() - t_static])
-        if not jacobians:
-            return error, None
-        H = np.zeros((6, 6))
-        # R Exp(w) R_static^-1 = (R R_static^-1) Exp(R_static w)
-        H[:3, :3] = gtsam.Rot3.LogmapDerivative(log) @ R_static.matrix()
-        H[3:, 3:] = cTl.rotation().matrix()
-        return error, [H]
-
     noise: Any = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-    return custom_factor(noise, [key], function, [6], 6)
+    function = partial(_difference, R_static, np.asarray(t_static))
+    return custom_factor(noise, {"key": key}, function, [gtsam.Pose3], 6, "beta_regularizer")
+
+
+def _difference(
+    R_static: gtsam.Rot3, t_static: FloatArray, cTl: gtsam.Pose3, *, jacobians: bool
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    difference = cTl.rotation() * R_static.inverse()
+    log = gtsam.Rot3.Logmap(difference)
+    error = np.concatenate([log, cTl.translation() - t_static])
+    if not jacobians:
+        return error, None
+    H = np.zeros((6, 6))
+    # R Exp(w) R_static^-1 = (R R_static^-1) Exp(R_static w)
+    H[:3, :3] = gtsam.Rot3.LogmapDerivative(log) @ R_static.matrix()
+    H[3:, 3:] = cTl.rotation().matrix()
+    return error, [H]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, cast
 
 import gtsam
@@ -23,9 +24,10 @@ from numpy.typing import NDArray
 from .alignment import FrameResidual, GroupedBias, frame_residual
 from .condensed import condense, cost_rows
 from .custom import custom_factor
-from .errors import FactorError, checked_positive
+from .errors import FactorError, checked_positive, described
 from .matches import Alignment
 from .motion import se3_left_jacobian, twist_ad
+from .variables import Kind, Vector, checked_key, dimension, key_name, number_or_key, pose_or_key
 
 FloatArray = NDArray[np.float64]
 
@@ -42,6 +44,7 @@ def pose_alignment_factor(
     bTl: gtsam.Pose3 | None = None,
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | GroupedBias | None = None,
     image_after_middle_s: float | None = None,
+    noise: gtsam.noiseModel.Base | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """All alignments of one image as one factor on the user's own keys; the equation is the module's.
@@ -62,10 +65,15 @@ def pose_alignment_factor(
         image_after_middle_s: t_image_stamp minus the middle between X_a and X_b [s]. Given, the twist at
             the image's instant is the mean one plus (offset + image_after_middle_s) times the
             alignments' common ``c_acceleration``; None: the mean twist holds throughout.
+        noise: of one dimension, over the whole image: ``Isotropic.Sigma(1, s)`` multiplies every match's
+            sigma by s; a ``Robust`` around it gives the image one weight, by its distance
+            sqrt(2 cost) / s, which is near sqrt(number of matches) where they fit. None: each match counts
+            by its own sigma and kernel.
         condensed: False gives one or two rows a match and one more.
 
     Returns:
-        A factor with unit noise on the distinct keys: X_a, X_b, X_scan, cTl, offset_s, biases.
+        A factor on the distinct keys: X_a, X_b, X_scan, cTl, offset_s, biases; its noise is the unit's or,
+        in all its rows, the given one.
 
     Raises:
         FactorError: keys or intervals that make no factor; see also :func:`factors.frame_factor`.
@@ -75,13 +83,38 @@ def pose_alignment_factor(
     )
     rows = sum(frame.dims) + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
-    def function(*values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        if not jacobians:
-            return frame.error(values, condensed, rows), None
-        error, J = frame.condensed(values) if condensed else frame.stacked(values)
-        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
+    function = _PoseFrameError(frame, condensed, rows)
+    return custom_factor(_over_rows(noise, rows), frame.named, function, frame.kinds, rows, _NAME)
 
-    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.keys, function, frame.dims, rows)
+
+def _over_rows(noise: gtsam.noiseModel.Base | None, rows: int) -> gtsam.noiseModel.Base:
+    """The model of one dimension in every row."""
+    if noise is None:
+        return gtsam.noiseModel.Unit.Create(rows)
+    if not isinstance(noise, gtsam.noiseModel.Base):
+        raise FactorError(f"noise of {_NAME}", described(noise), "a gtsam.noiseModel of dimension 1, or None")
+    if noise.dim() != 1:
+        raise FactorError(f"noise of {_NAME}", f"dimension {noise.dim()}", "dimension 1, for the whole image")
+    if isinstance(noise, gtsam.noiseModel.Robust):
+        return gtsam.noiseModel.Robust.Create(noise.robust(), _over_rows(noise.noise(), rows))
+    sigma = float(noise.sigmas()[0])
+    return gtsam.noiseModel.Isotropic.Sigma(rows, checked_positive(f"sigma of the noise of {_NAME}", sigma))
+
+
+@dataclass(frozen=True)
+class _PoseFrameError:
+    """The error of a frame's factor on poses; a plain object, so that it copies and pickles."""
+
+    frame: _PoseFrame
+    condensed: bool
+    rows: int
+
+    def __call__(self, *values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        frame = self.frame
+        if not jacobians:
+            return frame.error(values, self.condensed, self.rows), None
+        error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
+        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
 
 
 @dataclass(frozen=True)
@@ -91,7 +124,7 @@ class _PoseFrame:
     Attributes:
         inner: residuals over extrinsic (in effect, with the scan's motion), offset, twist and biases. The
             twist goes under the key X_a there; the extrinsic is always a variable.
-        keys, dims: of the factor.
+        keys, names, kinds: of the factor's variables.
         X_a, X_b, X_s: keys of the poses.
         cTl, offset_s: key or constant.
         lTb: pose of the body in the LiDAR.
@@ -102,7 +135,8 @@ class _PoseFrame:
 
     inner: FrameResidual
     keys: tuple[int, ...]
-    dims: tuple[int, ...]
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
     X_a: int
     X_b: int
     X_s: int
@@ -112,6 +146,15 @@ class _PoseFrame:
     seconds: float
     c_acceleration: FloatArray
     image_after_middle_s: float
+
+    @cached_property
+    def dims(self) -> tuple[int, ...]:
+        return tuple(dimension(kind) for kind in self.kinds)
+
+    @property
+    def named(self) -> dict[str, int]:
+        """Keys by the argument that each came as."""
+        return dict(zip(self.names, self.keys, strict=True))
 
     def error(self, values: Sequence[Any], condensed: bool, rows: int) -> FloatArray:
         """(rows,) error, without the work for its Jacobian."""
@@ -129,7 +172,7 @@ class _PoseFrame:
         error, J = self.inner.stacked(self.inner_values(values))
         return error, J @ self.lift(values)
 
-    def _named(self, values: Sequence[Any]) -> dict[int, Any]:
+    def _by_key(self, values: Sequence[Any]) -> dict[int, Any]:
         return dict(zip(self.keys, values, strict=True))
 
     def _extrinsic(self, named: dict[int, Any]) -> gtsam.Pose3:
@@ -150,7 +193,7 @@ class _PoseFrame:
 
     def inner_values(self, values: Sequence[Any]) -> list[Any]:
         """Values of the inner residual's keys."""
-        named = self._named(values)
+        named = self._by_key(values)
         cTl = self._extrinsic(named)
         l_twist = np.asarray(self.lTb.AdjointMap()) @ self._step(named) / self.seconds
         c_twist = np.asarray(cTl.AdjointMap()) @ l_twist
@@ -162,7 +205,7 @@ class _PoseFrame:
 
     def lift(self, values: Sequence[Any]) -> FloatArray:
         """(inner cols, cols) derivative of the inner variables by those of the factor."""
-        named = self._named(values)
+        named = self._by_key(values)
         outer, inner = _places(self.keys, self.dims), _places(self.inner.keys, self.inner.dims)
         L = np.zeros((self.inner.cols, sum(self.dims)))
         for key, place in inner.items():
@@ -200,8 +243,9 @@ class _PoseFrame:
         rows[:, outer[self.X_a]] -= np.asarray((sTl * self.lTb).AdjointMap())
 
 
-_EXTRINSIC = -1
-"""Stands for the extrinsic in effect among the inner residual's keys; no key of gtsam is negative."""
+_EXTRINSIC = 2**64 - 1
+"""Stands for the extrinsic in effect among the inner residual's keys; gtsam.symbol makes no such key."""
+_NAME = "pose_alignment_factor"
 
 
 def _places(keys: Sequence[int], dims: Sequence[int]) -> dict[int, slice]:
@@ -221,25 +265,33 @@ def _on_poses(
     biases_px: Any,
     image_after_middle_s: float | None,
 ) -> _PoseFrame:
-    X_a, X_b = int(X_a), int(X_b)
-    X_s = X_a if X_scan is None else int(X_scan)
+    X_a, X_b = checked_key(_NAME, "X_a", X_a), checked_key(_NAME, "X_b", X_b)
+    X_s = X_a if X_scan is None else checked_key(_NAME, "X_scan", X_scan)
+    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
     if X_a == X_b:
-        raise FactorError("poses of an alignment", "one key for both ends", "two distinct keys")
-    E = cTl if isinstance(cTl, gtsam.Pose3) else int(cTl)
-    D = int(offset_s) if isinstance(offset_s, int | np.integer) else float(offset_s)
-    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px)
-    biases = [key for key in inner.keys if key not in (_EXTRINSIC, D, X_a)]
-    poses = [X_a, X_b] if X_s in (X_a, X_b) else [X_a, X_b, X_s]
-    variables = {key: 6 for key in poses}
-    for key, dim in [(E, 6), (D, 1), *((bias, 1) for bias in biases)]:
+        raise FactorError(f"keys of {_NAME}", f"{key_name(X_a)} for X_a and X_b", "distinct keys")
+    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, name=_NAME)
+    variables: dict[int, tuple[str, Kind]] = {X_a: ("X_a", gtsam.Pose3), X_b: ("X_b", gtsam.Pose3)}
+    variables.setdefault(X_s, ("X_scan", gtsam.Pose3))
+    own: list[tuple[Any, str, Kind]] = [(E, "cTl", gtsam.Pose3), (D, "offset_s", Vector(1))]
+    own += [
+        (key, name, kind)
+        for key, name, kind in zip(inner.keys, inner.names, inner.kinds, strict=True)
+        if name.startswith("bias")
+    ]
+    for key, name, kind in own:
         if isinstance(key, int):
             if key in variables:
-                raise FactorError("keys of an alignment", "one key for two variables", "distinct keys")
-            variables[key] = dim
+                both = f"{key_name(key)} for {variables[key][0]} and {name}"
+                raise FactorError(f"keys of {_NAME}", both, "distinct keys")
+            variables[key] = (name, kind)
+    if bTl is not None and not isinstance(bTl, gtsam.Pose3):
+        raise FactorError(f"bTl of {_NAME}", described(bTl), "a gtsam.Pose3, or None")
     return _PoseFrame(
         inner,
         tuple(variables),
-        tuple(variables.values()),
+        tuple(name for name, _ in variables.values()),
+        tuple(kind for _, kind in variables.values()),
         X_a,
         X_b,
         X_s,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from .custom import custom_factor
 from .errors import checked_array, checked_covariance
 from .motion import twist_ad
+from .variables import Kind, Vector
 
 FloatArray = NDArray[np.float64]
 
@@ -40,15 +43,26 @@ def twist_transfer_factor(
     measured = checked_array("l_twist", l_twist, (6,))
     rate = checked_array("l_acceleration", l_acceleration, (6,))
     noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
+    reference = float(checked_array("offset_0_s", [offset_0_s], (1,))[0])
+    keys = {"V_key": V_key, "E_key": E_key, "D_key": D_key}
+    kinds: list[Kind] = [Vector(6), gtsam.Pose3, Vector(1)]
+    function = partial(_twist_error, measured, rate, reference)
+    return custom_factor(noise, keys, function, kinds, 6, "twist_transfer_factor")
 
-    def function(
-        twist: FloatArray, cTl: gtsam.Pose3, offset_s: FloatArray, *, jacobians: bool
-    ) -> tuple[FloatArray, list[FloatArray] | None]:
-        Ad = np.asarray(cTl.AdjointMap())
-        now = measured + (float(offset_s[0]) - offset_0_s) * rate
-        error = twist - Ad @ now
-        if not jacobians:
-            return error, None
-        return error, [np.eye(6), Ad @ twist_ad(now), -(Ad @ rate)[:, None]]
 
-    return custom_factor(noise, [V_key, E_key, D_key], function, [6, 6, 1], 6)
+def _twist_error(
+    measured: FloatArray,
+    rate: FloatArray,
+    offset_0_s: float,
+    twist: FloatArray,
+    cTl: gtsam.Pose3,
+    offset_s: FloatArray,
+    *,
+    jacobians: bool,
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    Ad = np.asarray(cTl.AdjointMap())
+    now = measured + (float(offset_s[0]) - offset_0_s) * rate
+    error = twist - Ad @ now
+    if not jacobians:
+        return error, None
+    return error, [np.eye(6), Ad @ twist_ad(now), -(Ad @ rate)[:, None]]

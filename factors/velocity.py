@@ -5,12 +5,16 @@ Twists are ``Vector(6)`` = [omega, v] of the camera in its own frame [rad/s, m/s
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .custom import custom_factor
 from .errors import FactorError, checked_array, checked_covariance, checked_positive
+from .variables import Vector, checked_key, checked_keys
 
 FloatArray = NDArray[np.float64]
 
@@ -22,7 +26,7 @@ def velocity_factor(V_key: int, c_twist: ArrayLike, covariance: ArrayLike) -> gt
     """V - c_twist, with the (6, 6) covariance of the measured twist (visual odometry, one frame)."""
     measured = checked_array("c_twist", c_twist, (6,))
     noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
-    return gtsam.PriorFactorVector(V_key, measured, noise)
+    return gtsam.PriorFactorVector(checked_key("velocity_factor", "V_key", V_key), measured, noise)
 
 
 def velocity_direction_factor(
@@ -65,21 +69,33 @@ def velocity_direction_factor(
     sigmas = [checked_positive("sigma_omega", sigma_omega)] * 3
     sigmas += [checked_positive("sigma_direction_rad", sigma_direction_rad)] * 2
     sigmas += [checked_positive("sigma_speed_mps", sigma_speed_mps)]
+    function = _DirectionError(measured_omega, d, across, speed, s)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas))
+    return custom_factor(noise, {"V_key": V_key}, function, [Vector(6)], 6, "velocity_direction_factor")
 
-    def function(twist: FloatArray, *, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        v = twist[3:]
-        smooth_speed = np.sqrt(v @ v + s * s)
-        sideways = across @ v / smooth_speed
-        error = np.concatenate([twist[:3] - measured_omega, sideways, [d @ v - speed]])
+
+@dataclass(frozen=True)
+class _DirectionError:
+    """The error of :func:`velocity_direction_factor`; ``across`` is B^T, ``low_speed_mps`` s."""
+
+    omega: FloatArray
+    direction: FloatArray
+    across: FloatArray
+    speed_mps: float
+    low_speed_mps: float
+
+    def __call__(self, twist: FloatArray, *, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+        v, d = twist[3:], self.direction
+        smooth_speed = np.sqrt(v @ v + self.low_speed_mps**2)
+        sideways = self.across @ v / smooth_speed
+        error = np.concatenate([twist[:3] - self.omega, sideways, [d @ v - self.speed_mps]])
         if not jacobians:
             return error, None
         H = np.zeros((6, 6))
         H[:3, :3] = np.eye(3)
-        H[3:5, 3:] = across / smooth_speed - np.outer(sideways, v) / smooth_speed**2
+        H[3:5, 3:] = self.across / smooth_speed - np.outer(sideways, v) / smooth_speed**2
         H[5, 3:] = d
         return error, [H]
-
-    return custom_factor(gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas)), [V_key], function, [6], 6)
 
 
 def mean_velocity_factor(
@@ -94,14 +110,17 @@ def mean_velocity_factor(
     """
     measured = checked_array("mean_twist", mean_twist, (6,))
     noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
-    half = 0.5 * np.eye(6)
+    function = partial(_linear, (0.5, 0.5), measured)
+    kinds = [Vector(6), Vector(6)]
+    return custom_factor(noise, {"V_a": V_a, "V_b": V_b}, function, kinds, 6, "mean_velocity_factor")
 
-    def function(
-        a: FloatArray, b: FloatArray, *, jacobians: bool
-    ) -> tuple[FloatArray, list[FloatArray] | None]:
-        return 0.5 * (a + b) - measured, [half, half] if jacobians else None
 
-    return custom_factor(noise, [V_a, V_b], function, [6, 6], 6)
+def _linear(
+    scales: tuple[float, ...], measured: FloatArray, *twists: FloatArray, jacobians: bool
+) -> tuple[FloatArray, list[FloatArray] | None]:
+    """sum scale_i V_i - measured."""
+    error = sum((scale * twist for scale, twist in zip(scales, twists, strict=True)), -measured)
+    return np.asarray(error), [scale * np.eye(6) for scale in scales] if jacobians else None
 
 
 def twist_smoothness_factor(
@@ -116,7 +135,8 @@ def twist_smoothness_factor(
         sigma_lin_acc: m/s^2, each axis.
     """
     sigmas = _sigmas_by_kind("acc", sigma_rot_acc, sigma_lin_acc) * checked_positive("seconds", seconds)
-    return gtsam.BetweenFactorVector(V_a, V_b, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+    a, b = checked_keys("twist_smoothness_factor", {"V_a": V_a, "V_b": V_b})
+    return gtsam.BetweenFactorVector(a, b, np.zeros(6), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
 
 
 def twist_jerk_factor(
@@ -140,16 +160,11 @@ def twist_jerk_factor(
     """
     ab, bc = checked_positive("seconds_ab", seconds_ab), checked_positive("seconds_bc", seconds_bc)
     middle = 0.5 * (ab + bc)
-    scales = np.array([1.0 / ab, -1.0 / ab - 1.0 / bc, 1.0 / bc]) / middle
-    H = [scale * np.eye(6) for scale in scales]
+    scales = (1.0 / ab / middle, (-1.0 / ab - 1.0 / bc) / middle, 1.0 / bc / middle)
     noise = gtsam.noiseModel.Diagonal.Sigmas(_sigmas_by_kind("jerk", sigma_rot_jerk, sigma_lin_jerk))
-
-    def function(
-        a: FloatArray, b: FloatArray, c: FloatArray, *, jacobians: bool
-    ) -> tuple[FloatArray, list[FloatArray] | None]:
-        return scales[0] * a + scales[1] * b + scales[2] * c, list(H) if jacobians else None
-
-    return custom_factor(noise, [V_a, V_b, V_c], function, [6, 6, 6], 6)
+    function = partial(_linear, scales, np.zeros(6))
+    keys = {"V_a": V_a, "V_b": V_b, "V_c": V_c}
+    return custom_factor(noise, keys, function, [Vector(6)] * 3, 6, "twist_jerk_factor")
 
 
 def _sigmas_by_kind(name: str, rotation: float, translation: float) -> FloatArray:

@@ -4,25 +4,38 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from factors.errors import SstGraphError, printable
 
-class SstGraphError(Exception):
-    """Root of every error that sst_graph raises on purpose."""
+__all__ = [
+    "ConfigError",
+    "DataError",
+    "EstimationError",
+    "MissingDependencyError",
+    "SstGraphError",
+    "printable",
+]
+
+_MAX_PART = 390
+"""Characters of the place, of what was found and of what was expected: together they fit into a message."""
 
 
 class DataError(SstGraphError):
     """Input data that cannot be used: a file, an array or a value.
 
-    The message is one line: place, what was found, what was expected.
+    The message is one line: place, what was found, what was expected, each made :func:`printable`.
     """
 
     def __init__(self, place: str | Path, found: str, expected: str) -> None:
-        self.place = str(place)
-        self.found = found
-        self.expected = expected
-        super().__init__(f"{self.place}: found {found}, expected {expected}")
+        self.place = printable(place, _MAX_PART)
+        self.found = printable(found, _MAX_PART)
+        self.expected = printable(expected, _MAX_PART)
+        super().__init__(f"{self.place}: found {self.found}, expected {self.expected}")
+
+    def __reduce__(self) -> tuple[type[DataError], tuple[str, str, str]]:
+        return type(self), (self.place, self.found, self.expected)
 
 
-class ConfigError(SstGraphError):
+class ConfigError(SstGraphError, ValueError):
     """A configuration or command-line value that is unknown or out of its range."""
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from factors import residuals
 from factors.robust import RobustKernel
+from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import (
@@ -33,7 +34,7 @@ CONCENTRATION_SCALES = (1.0, 5.0)
 
 
 @dataclass(frozen=True)
-class JointConfig:
+class JointConfig(Settings):
     """Outer and inner loop of the joint method.
 
     Attributes:
@@ -50,13 +51,18 @@ class JointConfig:
     """
 
     graph: GraphConfig = field(default_factory=GraphConfig)
-    kernel_px: tuple[float, ...] = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
-    max_outer: int = 40
-    step_sigmas: float = 0.1
-    full_steps: int = 6
-    circle_sigmas: float = 1.5
-    inner_iterations: int = 2
-    min_matches: int = 30
+    kernel_px: tuple[float, ...] = setting(
+        (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0),
+        at_least=0.1,
+        at_most=1000.0,
+        length=(1, 100),
+    )
+    max_outer: int = setting(40, at_least=1, at_most=1000)
+    step_sigmas: float = setting(0.1, at_least=0.0, at_most=10.0)
+    full_steps: int = setting(6, at_least=0, at_most=1000)
+    circle_sigmas: float = setting(1.5, at_least=0.0, at_most=100.0)
+    inner_iterations: int = setting(2, at_least=1, at_most=100)
+    min_matches: int = setting(30, at_least=1, at_most=1_000_000)
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.config import Settings, setting
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class CommonErrorConfig:
+class CommonErrorConfig(Settings):
     """How far all contours may err together.
 
     Attributes:
@@ -26,11 +27,7 @@ class CommonErrorConfig:
             camera is known to the digit, lie 0.08 to 0.15 px too high (docs/accuracy.md).
     """
 
-    sigma_px: float = 0.1
-
-    def __post_init__(self) -> None:
-        if not 0.0 <= self.sigma_px < np.inf:
-            raise ValueError(f"sigma_px {self.sigma_px:g}: expected 0 or more")
+    sigma_px: float = setting(0.1, at_least=0.0, at_most=100.0)
 
 
 def common_covariance(cTl: gtsam.Pose3, camera: PinholeCamera, config: CommonErrorConfig) -> FloatArray:

@@ -71,15 +71,15 @@ def test_bad_arguments_raise(noise, keys, dims):
 
 def test_wrong_values_raise():
     factor = factor_over(np.zeros(2), [GOOD_H])
-    with pytest.raises(FactorError, match="no variable"):
+    with pytest.raises(FactorError, match="no such variable"):
         factor.error(gtsam.Values())
     wrong = gtsam.Values()
     wrong.insert(7, np.zeros(4))
-    with pytest.raises(FactorError, match=r"shape \(4,\)"):
+    with pytest.raises(FactorError, match=r"Vector\(4\), expected a type of tangent dimension 3"):
         factor.error(wrong)
     wrong = gtsam.Values()
     wrong.insert(7, gtsam.Pose3())
-    with pytest.raises(FactorError, match="another type"):
+    with pytest.raises(FactorError, match="Pose3, dimension 6"):
         factor.error(wrong)
 
 

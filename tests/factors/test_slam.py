@@ -264,9 +264,9 @@ def test_calibration_in_a_pose_graph_frame_by_frame(make_scene, smoother):
 
 def test_refuses_what_makes_no_factor(make_scene):
     alignment, *_ = make_scene(1)
-    with pytest.raises(FactorError, match="two distinct keys"):
+    with pytest.raises(FactorError, match="distinct keys"):
         pose_alignment_factor([alignment], X[0], X[0], E, D, SECONDS)
-    with pytest.raises(FactorError, match="one key for two variables"):
+    with pytest.raises(FactorError, match="x1 for X_b and cTl"):
         pose_alignment_factor([alignment], X[0], X[1], X[1], D, SECONDS)
     with pytest.raises(FactorError, match="seconds"):
         pose_alignment_factor([alignment], X[0], X[1], E, D, 0.0)

@@ -59,7 +59,7 @@ def test_settings_come_from_a_file_then_flags_then_set(tmp_path: Path) -> None:
         (["--frames", "0"], "frames: found 0, expected 1 to"),
         (["--delay", "2"], "time_offset_s: found 2.0, expected -0.5 to 0.5"),
         (["--delay", "nan"], "time_offset_s"),
-        (["--motion", "flying"], "'motion': found 'flying', expected one of mixed, standing"),
+        (["--motion", "flying"], "motion: found 'flying', expected one of mixed, standing"),
         (["--label-noise", "3"], "label_noise: found 3.0, expected 0 to 2"),
         (["--set", "speed=3"], "unknown setting 'speed'; did you mean 'speed_mps'?"),
         (["--set", "speed_mps"], "expected name=value"),

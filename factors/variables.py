@@ -1,0 +1,230 @@
+"""Keys and variables of a factor: what may stand for one, and how its value is read.
+
+A *kind* says what a factor wants of a variable: a tangent dimension that any type may have, a class of
+gtsam (``gtsam.Pose3``), or :class:`Vector`. A scalar, ``Vector(1)``, may be kept as a ``double`` as well:
+either arrives as a (1,) array.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from .errors import FactorError, described
+
+_MOST = 2**64
+"""gtsam's keys are unsigned numbers of 64 bits."""
+_FIRST_SYMBOL = 2**56
+"""Keys of ``gtsam.symbol`` carry their letter above these bits."""
+
+
+@dataclass(frozen=True)
+class Vector:
+    """Kind of a variable that is a vector of ``size`` numbers; of size 1 also a ``double``."""
+
+    size: int
+
+
+Kind = int | type | Vector
+"""What a factor wants of a variable: any type of this tangent dimension, this class of gtsam, or a vector."""
+
+
+def checked_key(factor: str, argument: str, value: Any) -> int:
+    """The key that ``value`` is: an int, ``gtsam.Symbol`` or ``gtsam.LabeledSymbol``.
+
+    Raises:
+        FactorError: anything else, and ints that gtsam has no key for.
+    """
+    if isinstance(value, gtsam.Symbol | gtsam.LabeledSymbol):
+        return int(value.key())
+    if not isinstance(value, int | np.integer) or isinstance(value, bool | np.bool_):
+        raise FactorError(f"{argument} of {factor}", described(value), _A_KEY)
+    if not 0 <= int(value) < _MOST:
+        raise FactorError(f"{argument} of {factor}", f"{value}", f"{_A_KEY} from 0 to 2^64 - 1")
+    return int(value)
+
+
+_A_KEY = "a key: an int, as gtsam.symbol gives it, or a gtsam.Symbol"
+
+
+def is_key(value: Any) -> bool:
+    """Whether ``value`` stands for a variable, not for a constant."""
+    return isinstance(value, int | np.integer | gtsam.Symbol | gtsam.LabeledSymbol | bool | np.bool_)
+
+
+def pose_or_key(factor: str, argument: str, value: Any) -> int | gtsam.Pose3:
+    """A fixed pose, or the key of one."""
+    if isinstance(value, gtsam.Pose3):
+        return value
+    if is_key(value):
+        return checked_key(factor, argument, value)
+    raise FactorError(f"{argument} of {factor}", described(value), f"a gtsam.Pose3, or {_A_KEY}")
+
+
+def number_or_key(factor: str, argument: str, value: Any) -> int | float:
+    """A fixed number, float or (1,), or the key of one.
+
+    Raises:
+        FactorError: neither; or the int 0, which is a key by its type and a constant by its look.
+    """
+    if is_key(value):
+        key = checked_key(factor, argument, value)
+        if key == 0:
+            raise FactorError(
+                f"{argument} of {factor}", "the int 0", "0.0 for the constant, or a key other than 0"
+            )
+        return key
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if value is None or array.shape not in ((), (1,)) or not np.isfinite(array).all():
+        raise FactorError(f"{argument} of {factor}", described(value), f"a finite float, or {_A_KEY}")
+    return float(array.reshape(()))
+
+
+def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:
+    """Distinct keys of a factor, with the name of the argument that each came as ('' where it has none)."""
+    named = keys.items() if isinstance(keys, Mapping) else [("", key) for key in keys]
+    found: dict[int, str] = {}
+    for name, value in named:
+        key = checked_key(factor, name or "keys", value)
+        if key in found:
+            both = f" for {found[key]} and {name}" if name else ""
+            raise FactorError(f"keys of {factor}", f"{key_name(key)} twice{both}", "distinct keys")
+        found[key] = name
+    if not found:
+        raise FactorError(f"keys of {factor}", "no key", "one or more distinct keys")
+    return found
+
+
+def key_name(key: int) -> str:
+    """As gtsam prints it: E0 for ``gtsam.symbol("E", 0)``."""
+    return str(gtsam.DefaultKeyFormatter(key))
+
+
+@cache
+def dimension(kind: Kind) -> int:
+    """Tangent dimension of a kind.
+
+    Raises:
+        FactorError: no such kind: a class without a default constructor or that ``gtsam.Values`` cannot hold.
+    """
+    if isinstance(kind, Vector):
+        return kind.size
+    if isinstance(kind, type):
+        try:
+            size = _tangent_dimension(kind())
+        except TypeError:
+            size = 0
+        if size == 0:
+            raise FactorError("kind of a variable", kind.__name__, "a class that gtsam.Values holds")
+        return size
+    if isinstance(kind, bool) or not isinstance(kind, int | np.integer) or kind < 1:
+        raise FactorError("kind of a variable", described(kind), "a dimension above 0, a class, or Vector(n)")
+    return int(kind)
+
+
+def _tangent_dimension(value: Any) -> int:
+    values = gtsam.Values()
+    values.insert(0, value)
+    return int(values.dim())
+
+
+@dataclass
+class Reader:
+    """Reads one variable of a factor from ``gtsam.Values``.
+
+    The accessor that fitted last is tried first, so that a read costs no more than a call; gtsam names the
+    stored type where it does not fit.
+
+    Attributes:
+        key: of the variable.
+        kind: what the factor wants.
+        factor, argument: names for messages.
+    """
+
+    key: int
+    kind: Kind
+    factor: str
+    argument: str
+    _accessor: str = field(init=False)
+    _checked: str = field(init=False, default="")
+    _size: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._size = dimension(self.kind)
+        if isinstance(self.kind, type):
+            self._accessor = f"at{self.kind.__name__}"
+        else:
+            self._accessor = "atPose3" if self.kind == 6 else "atVector"
+
+    def read(self, values: gtsam.Values) -> Any:
+        """The variable's value: an object of gtsam, or an array (n,); a ``double`` as (1,).
+
+        Raises:
+            FactorError: no such variable, or one of another kind.
+        """
+        try:
+            value = getattr(values, self._accessor)(self.key)
+        except RuntimeError as error:
+            value = self._read_as_stored(values, str(error))
+        if isinstance(value, float):
+            return np.array([value])
+        if isinstance(value, np.ndarray):
+            if value.shape != (self._size,):
+                raise self._error(f"Vector({len(value)})" if value.ndim == 1 else f"shape {value.shape}")
+        elif self._accessor != self._checked:
+            if _tangent_dimension(value) != self._size:
+                raise self._error(f"{type(value).__name__}, dimension {_tangent_dimension(value)}")
+            self._checked = self._accessor
+        return value
+
+    def _read_as_stored(self, values: gtsam.Values, message: str) -> Any:
+        if not values.exists(self.key):
+            expected = self._expected()
+            if self.kind == Vector(1) and self.key < _FIRST_SYMBOL:
+                expected += f" (an int is a key: {self.key}.0 is the constant)"
+            raise FactorError(self._place(), "no such variable in the values", expected)
+        stored = _stored_type(message)
+        fits = isinstance(self.kind, int | np.integer) or (
+            isinstance(self.kind, Vector) and (stored == "Vector" or (stored == "Double" and self._size == 1))
+        )
+        accessor: Callable[[int], Any] | None = getattr(values, f"at{stored}", None)
+        if not fits or accessor is None or stored == "Matrix":
+            raise self._error(stored)
+        self._accessor = f"at{stored}"
+        return accessor(self.key)
+
+    def _error(self, found: str) -> FactorError:
+        return FactorError(self._place(), found, self._expected())
+
+    def _place(self) -> str:
+        name = f"variable {key_name(self.key)}"
+        return f"{name} ({self.argument}) of {self.factor}" if self.argument else f"{name} of {self.factor}"
+
+    def _expected(self) -> str:
+        if isinstance(self.kind, Vector):
+            return f"Vector({self._size})" + (" or double" if self._size == 1 else "")
+        if isinstance(self.kind, type):
+            return self.kind.__name__
+        return f"a type of tangent dimension {self._size}"
+
+
+def _stored_type(message: str) -> str:
+    """The name in ``at<name>`` of the type that gtsam's message says is stored."""
+    found = re.search(r"stored in Values is (.*) but requested type", message)
+    name = found.group(1) if found else ""
+    generic = re.fullmatch(r"gtsam::GenericValue<(.*?) ?>", name)
+    name = generic.group(1) if generic else name
+    if name == "double":
+        return "Double"
+    if name.startswith("Eigen::Matrix"):
+        return "Matrix" if "-1, -1" in name else "Vector"
+    return re.sub(r"\w+::|[<> ]", "", name)

@@ -1,0 +1,236 @@
+"""Reading of files that others wrote: regular files of a bounded size, strict UTF-8, strict JSON and TOML.
+
+Every file that is read passes through :func:`read_file`. What is no regular file (a folder, FIFO, socket,
+device or looping link) and what is larger than its kind may be is refused before a byte is read, so that
+nothing blocks and no memory is taken for it. JSON and TOML are bounded in depth, in their number of values
+and in the length of a number, and hold finite numbers and unique keys only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+import tomllib
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sst_graph.errors import DataError
+
+MAX_DEPTH = 64
+"""Levels of JSON or TOML; what this package writes has at most ten."""
+MAX_VALUES = 5_000_000
+"""Values of a JSON document: with 100 bytes each in memory, half a gigabyte."""
+MAX_NUMBER_LENGTH = 100
+"""Characters of a number; a double needs 24, and none of our whole numbers has more than 20 digits."""
+MAX_DIGITS = 20
+MAX_DOTS = 500
+"""Dots in a line of TOML: the standard library takes time with the square of the parts of a dotted key, 81 s
+for 60,000 of them."""
+
+
+@dataclass(frozen=True)
+class FileKind:
+    """A kind of input file.
+
+    Attributes:
+        name: what it is, as errors say it: "a calibration.json".
+        max_bytes: the largest such file that is read.
+    """
+
+    name: str
+    max_bytes: int
+
+
+SETTINGS = FileKind("a settings file (JSON or TOML)", 256 * 1024)
+CALIBRATION = FileKind("a calibration.json", 64 * 1024 * 1024)
+MARGINAL = FileKind("a marginal.json", 1024 * 1024)
+GROUND_TRUTH = FileKind("a groundtruth.json", 1024 * 1024)
+CALIB_TXT = FileKind("a KITTI calib.txt", 1024 * 1024)
+TIMES_TXT = FileKind("a text file with one number of seconds a line", 32 * 1024 * 1024)
+
+
+def read_file(path: str | Path, kind: FileKind) -> bytes:
+    """Contents of a regular file of at most ``kind.max_bytes``.
+
+    Raises:
+        DataError: missing, unreadable, no regular file, or larger. Nothing blocks: a FIFO is not waited for.
+    """
+    try:
+        _require_regular(os.stat(path), path, kind)
+        # O_NONBLOCK: what was replaced by a FIFO since must not block either
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        with open(descriptor, "rb") as stream:
+            _require_regular(os.fstat(descriptor), path, kind)
+            data = stream.read(kind.max_bytes + 1)
+    except FileNotFoundError:
+        raise DataError(path, "no file", kind.name) from None
+    except OSError as error:
+        raise DataError(path, f"an unreadable file ({error.strerror or error})", kind.name) from None
+    except ValueError as error:  # a NUL or a lone surrogate in the name
+        raise DataError(path, f"no name of a file ({error})", kind.name) from None
+    if len(data) > kind.max_bytes:
+        raise _too_large(path, len(data), kind)
+    return data
+
+
+def read_text(path: str | Path, kind: FileKind) -> str:
+    """Contents of a UTF-8 text file, decoded strictly; a byte-order mark is left out.
+
+    Raises:
+        DataError: as :func:`read_file`, or bytes that are no UTF-8.
+    """
+    data = read_file(path, kind)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        found = f"no UTF-8 text (byte {error.start} is 0x{data[error.start]:02x})"
+        raise DataError(path, found, kind.name) from None
+
+
+def read_json(path: str | Path, kind: FileKind) -> Any:
+    """The value in a JSON file; see :func:`parse_json`.
+
+    Raises:
+        DataError: as :func:`read_text` and :func:`parse_json`.
+    """
+    return parse_json(read_text(path, kind), path, kind.name)
+
+
+def read_toml(path: str | Path, kind: FileKind) -> dict[str, Any]:
+    """The table in a TOML file; see :func:`parse_toml`.
+
+    Raises:
+        DataError: as :func:`read_text` and :func:`parse_toml`.
+    """
+    return parse_toml(read_text(path, kind), path, kind.name)
+
+
+def parse_json(text: str, place: str | Path, expected: str = "JSON") -> Any:
+    """The value of a JSON text: finite numbers, unique keys, bounded depth and size.
+
+    Raises:
+        DataError: naming ``place``: no JSON, NaN or Infinity (1e999 too), a key given twice, more than
+            MAX_DEPTH levels or MAX_VALUES values, a number of more than MAX_NUMBER_LENGTH characters or
+            MAX_DIGITS digits, a string with half a character (a lone surrogate).
+    """
+    if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
+        raise DataError(place, "too many values", f"{expected} with at most {MAX_VALUES}")
+
+    def parse() -> Any:
+        return json.loads(
+            text,
+            parse_int=_whole_number,
+            parse_float=_finite_number,
+            parse_constant=_no_constant,
+            object_pairs_hook=_unique_keys,
+        )
+
+    return _parsed(parse, place, "JSON", expected)
+
+
+def parse_toml(text: str, place: str | Path, expected: str = "TOML") -> dict[str, Any]:
+    """The table of a TOML text: finite numbers, bounded depth.
+
+    Raises:
+        DataError: naming ``place``: no TOML, inf or nan, more than MAX_DEPTH levels, a number that is too
+            long, more than MAX_DOTS dots in a line.
+    """
+    if len(text) > MAX_DOTS and max(line.count(".") for line in text.split("\n")) > MAX_DOTS:
+        raise DataError(place, f"a line with more than {MAX_DOTS} dots", expected)
+    table: dict[str, Any] = _parsed(
+        lambda: tomllib.loads(text, parse_float=_finite_number), place, "TOML", expected
+    )
+    return table
+
+
+def _parsed(parse: Callable[[], Any], place: str | Path, language: str, expected: str) -> Any:
+    try:
+        value = parse()
+        _check_values(value)
+    except RecursionError:
+        raise DataError(place, f"{language} nested too deeply", f"at most {MAX_DEPTH} levels") from None
+    except ValueError as error:  # JSONDecodeError, TOMLDecodeError and those of the hooks below
+        raise DataError(place, f"no {language} ({_first_line(error)})", expected) from None
+    return value
+
+
+def _check_values(value: Any) -> None:
+    """Depth, whole numbers (TOML's parser has no hook for them) and text of a parsed document."""
+    level, depth = [value], 0
+    while level:
+        depth += 1
+        if depth > MAX_DEPTH:
+            raise RecursionError
+        below: list[Any] = []
+        for item in level:
+            if isinstance(item, dict):
+                below.extend(item)
+                below.extend(item.values())
+            elif isinstance(item, list):
+                below.extend(item)
+            elif isinstance(item, str):
+                _check_text(item)
+            elif isinstance(item, int) and abs(item) >= 10**MAX_DIGITS:
+                raise ValueError(f"a whole number of more than {MAX_DIGITS} digits")
+        level = below
+
+
+def _check_text(text: str) -> None:
+    if not text.isascii() and any("\ud800" <= c <= "\udfff" for c in text):
+        raise ValueError("a lone surrogate in a string")
+
+
+def _whole_number(text: str) -> int:
+    if len(text) > MAX_DIGITS + 1:
+        raise ValueError(f"a whole number of {len(text)} characters")
+    return int(text)
+
+
+def _finite_number(text: str) -> float:
+    if len(text) > MAX_NUMBER_LENGTH:
+        raise ValueError(f"a number of {len(text)} characters")
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"the number {text} is not finite")
+    return number
+
+
+def _no_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        twice, _ = Counter(key for key, _ in pairs).most_common(1)[0]
+        raise ValueError(f"the key {twice!r:.60} twice")
+    return table
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _require_regular(status: os.stat_result, path: str | Path, kind: FileKind) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise DataError(path, _KINDS.get(stat.S_IFMT(status.st_mode), "no regular file"), kind.name)
+    if status.st_size > kind.max_bytes:
+        raise _too_large(path, status.st_size, kind)
+
+
+def _too_large(path: str | Path, size: int, kind: FileKind) -> DataError:
+    return DataError(path, f"{size} bytes or more", f"{kind.name} of at most {kind.max_bytes} bytes")
+
+
+_KINDS = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a character device",
+    stat.S_IFBLK: "a block device",
+    stat.S_IFSOCK: "a socket",
+}

@@ -1,0 +1,435 @@
+"""Keys, variables and constants of every factor: what is accepted, and how the rest is refused."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from factors import (
+    Between,
+    FactorError,
+    GroupedBias,
+    Vector,
+    beta_regularizer,
+    camera_motion_factor,
+    check_jacobians,
+    custom_factor,
+    delay_drift,
+    delay_prior,
+    extrinsic_drift,
+    frame_factor,
+    hand_eye_factor,
+    mean_velocity_factor,
+    pixel_to_point_factor,
+    point_to_pixel_factor,
+    pose_alignment_factor,
+    rotation_hand_eye,
+    silhouette_factor,
+    twist_jerk_factor,
+    twist_smoothness_factor,
+    twist_transfer_factor,
+    velocity_direction_factor,
+    velocity_factor,
+)
+
+E, D, B = (gtsam.symbol(letter, 0) for letter in "EDB")
+V = [gtsam.symbol("V", k) for k in range(3)]
+X = [gtsam.symbol("X", k) for k in range(3)]
+POSE, NEAR = gtsam.Pose3(), gtsam.Pose3.Expmap(np.array([0.1, -0.05, 0.08, 0.3, 0.2, -0.1]))
+TWIST = np.array([0.1, 0.2, 0.3, 1.0, -2.0, 5.0])
+COVARIANCE = np.diag(np.repeat([1e-4, 1e-2], 3))
+
+
+class Bench:
+    """One scene, and every factor on given keys."""
+
+    def __init__(self, make_scene):
+        self.points, self.cTl, self.offset_s, self.twist = make_scene(3)
+        self.contour, *_ = make_scene(3, normals=True)
+
+    def values(self, offset=None):
+        """All variables; the offset as a Vector(1), or as it is given."""
+        values = gtsam.Values()
+        values.insert(E, self.cTl)
+        values.insert(D, np.array([self.offset_s]) if offset is None else offset)
+        values.insert(B, np.array([0.5]))
+        for k in range(3):
+            values.insert(V[k], self.twist + 0.01 * k)
+            values.insert(X[k], gtsam.Pose3.Expmap(0.1 * k * TWIST))
+        return values
+
+    def makers(self):
+        """By name, of (extrinsic, offset) to the factor on them."""
+        between = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
+        points, contour = self.points, self.contour
+        return {
+            "frame_factor": lambda E, D: frame_factor([points, contour], E, D, V[0], [None, B]),
+            "stacked frame_factor": lambda E, D: frame_factor([points], E, D, V[0], condensed=False),
+            "point_to_pixel_factor": lambda E, D: point_to_pixel_factor(points, E, D, V[0]),
+            "pixel_to_point_factor": lambda E, D: pixel_to_point_factor(points, E, D, V[0]),
+            "silhouette_factor": lambda E, D: silhouette_factor(contour, E, D, V[0], B),
+            "pose_alignment_factor": lambda E, D: pose_alignment_factor([points], X[0], X[1], E, D, 0.1),
+            "with acceleration": lambda E, D: pose_alignment_factor(
+                [points], X[0], X[1], E, D, 0.1, X_scan=X[2], image_after_middle_s=0.02
+            ),
+            "camera_motion_factor": lambda E, D: camera_motion_factor(*between, E, D, NEAR, COVARIANCE),
+            "hand_eye_factor": lambda E, D: hand_eye_factor(
+                E, D, NEAR, NEAR, TWIST, 1.1 * TWIST, 0.0, COVARIANCE
+            ),
+            "rotation_hand_eye": lambda E, D: rotation_hand_eye(
+                E, D, NEAR.rotation(), NEAR.rotation(), TWIST[:3], TWIST[:3], 0.0, COVARIANCE[:3, :3]
+            ),
+            "twist_transfer_factor": lambda E, D: twist_transfer_factor(
+                V[0], E, D, TWIST, 0.1 * TWIST, 0.0, COVARIANCE
+            ),
+        }
+
+
+@pytest.fixture
+def bench(make_scene):
+    return Bench(make_scene)
+
+
+NAMES = [
+    "frame_factor",
+    "stacked frame_factor",
+    "point_to_pixel_factor",
+    "pixel_to_point_factor",
+    "silhouette_factor",
+    "pose_alignment_factor",
+    "with acceleration",
+    "camera_motion_factor",
+    "hand_eye_factor",
+    "rotation_hand_eye",
+    "twist_transfer_factor",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_offset_may_be_a_vector_or_a_double(bench, name):
+    factor = bench.makers()[name](E, D)
+    vector, double = bench.values(), bench.values(float(bench.offset_s))
+    # one factor on both by turns: the type is looked up anew where it changes
+    for values in (double, vector, double):
+        assert factor.error(values) == pytest.approx(factor.error(vector), rel=1e-12)
+        np.testing.assert_allclose(
+            factor.linearize(values).jacobian()[0], factor.linearize(vector).jacobian()[0], rtol=1e-12
+        )
+
+
+def test_a_graph_with_a_double_offset_is_solved(bench):
+    factor = bench.makers()["pose_alignment_factor"](E, D)
+    found = {}
+    for double in (False, True):
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(factor)
+        graph.add(delay_prior(D, 0.1, 0.05, double=double))
+        graph.add(gtsam.PriorFactorPose3(E, bench.cTl, gtsam.noiseModel.Isotropic.Sigma(6, 0.01)))
+        for k in range(3):
+            pose = gtsam.Pose3.Expmap(0.1 * k * TWIST)
+            graph.add(gtsam.PriorFactorPose3(X[k], pose, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+        start = bench.values(0.1 if double else np.array([0.1]))
+        solved = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
+        found[double] = solved.atDouble(D) if double else solved.atVector(D)[0]
+    assert found[True] == pytest.approx(found[False], abs=1e-9) and abs(found[True] - 0.1) > 1e-4
+
+
+def test_drift_of_a_double():
+    values = gtsam.Values()
+    values.insert(1, 0.3)
+    values.insert(2, 0.5)
+    assert delay_drift(1, 2, 4.0, 0.1, double=True).error(values) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_symbol_is_its_key(bench, name):
+    maker = bench.makers()[name]
+    symbols = maker(gtsam.Symbol("E", 0), gtsam.Symbol("D", 0))
+    assert symbols.keys() == maker(E, D).keys()
+    assert symbols.error(bench.values()) == maker(E, D).error(bench.values())
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        (None, "None"),
+        (1.5, "1.5"),
+        (True, "True"),
+        (-1, "-1"),
+        (2**64, str(2**64)),
+        ("E0", "a str"),
+        (np.eye(4), r"shape \(4, 4\)"),
+        (np.zeros(6), r"shape \(6,\)"),
+        (gtsam.Rot3(), "a Rot3"),
+        ([1, 2], "a list of 2"),
+    ],
+)
+def test_what_is_no_extrinsic_is_refused_at_once(bench, name, wrong, found):
+    with pytest.raises(FactorError, match=f"of .*: found .*{found}.*, expected .*key"):
+        bench.makers()[name](wrong, D)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("wrong", ["D0", True, -1, np.zeros(2), gtsam.Pose3(), [0.1, 0.2]])
+def test_what_is_no_offset_is_refused_at_once(bench, name, wrong):
+    with pytest.raises(FactorError, match=r"(offset_s|D|D_key) of .*: found .*, expected .*key"):
+        bench.makers()[name](E, wrong)
+
+
+@pytest.mark.parametrize("name", NAMES[:8])
+def test_an_integer_zero_is_no_offset(bench, name):
+    with pytest.raises(FactorError, match=r"offset_s of .*: found the int 0, expected 0\.0 for the constant"):
+        bench.makers()[name](E, 0)
+    factor = bench.makers()[name](E, 0.0)
+    assert 0 not in factor.keys() and D not in factor.keys()  # noqa: SIM118  (a gtsam factor, no dict)
+
+
+def test_a_constant_written_as_an_int_is_told(bench):
+    factor = silhouette_factor(bench.contour, E, D, V[0], 2)
+    with pytest.raises(
+        FactorError, match=r"bias 1\) of frame_factor.*no such variable.*2\.0 is the constant"
+    ):
+        factor.error(bench.values())
+    with pytest.raises(FactorError, match="biases_px of frame_factor: found the int 0"):
+        silhouette_factor(bench.contour, E, D, V[0], 0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_one_key_for_two_variables_is_refused(bench, name):
+    with pytest.raises(
+        FactorError, match=r"keys of \w+: found E0.*(cTl and offset_s|E and D|E_key and D_key)"
+    ):
+        bench.makers()[name](E, E)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    ("key", "stored", "found", "expected"),
+    [
+        (E, np.zeros(6), r"Vector", "Pose3"),
+        (E, np.eye(4), "Matrix", "Pose3"),
+        (E, gtsam.Rot3(), "Rot3", "Pose3"),
+        (E, gtsam.NavState(), "NavState", "Pose3"),
+        (E, gtsam.imuBias.ConstantBias(), "ConstantBias", "Pose3"),
+        (E, 0.1, "Double", "Pose3"),
+        (E, None, "no such variable", "Pose3"),
+        (D, np.zeros(2), r"Vector\(2\)", r"Vector\(1\) or double"),
+        (D, gtsam.Pose3(), "Pose3", r"Vector\(1\) or double"),
+        (D, gtsam.Rot2(), "Rot2", r"Vector\(1\) or double"),
+        (D, None, "no such variable", r"Vector\(1\) or double"),
+    ],
+)
+def test_a_variable_of_another_type_is_refused(bench, name, key, stored, found, expected):
+    factor, values = bench.makers()[name](E, D), bench.values()
+    values.erase(key)
+    if stored is not None:
+        values.insert(key, stored)
+    message = (
+        rf"variable {gtsam.DefaultKeyFormatter(key)} \(\w+\) of \w+: found {found}.*, expected {expected}"
+    )
+    for call in (factor.error, factor.linearize, factor.unwhitenedError):
+        with pytest.raises(FactorError, match=message):
+            call(values)
+
+
+def test_a_twist_must_be_a_vector(bench):
+    factor, values = mean_velocity_factor(V[0], V[1], TWIST, COVARIANCE), bench.values()
+    values.erase(V[0])
+    values.insert(V[0], gtsam.Pose3())
+    with pytest.raises(FactorError, match=r"V0 \(V_a\) of mean_velocity_factor: found Pose3.*Vector\(6\)"):
+        factor.error(values)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda key: velocity_factor(key, TWIST, COVARIANCE),
+        lambda key: velocity_direction_factor(key, TWIST[:3], TWIST[3:], 5.0, 0.01, 0.01, 0.1),
+        lambda key: mean_velocity_factor(V[1], key, TWIST, COVARIANCE),
+        lambda key: twist_smoothness_factor(V[1], key, 0.1, 1.0, 1.0),
+        lambda key: twist_jerk_factor(V[1], V[2], key, 0.1, 0.1, 1.0, 1.0),
+        lambda key: beta_regularizer(key, POSE, 1.0, 1.0),
+        lambda key: delay_prior(key, 0.0, 0.1),
+        lambda key: delay_drift(V[1], key, 1.0, 0.1),
+        lambda key: extrinsic_drift(V[1], key, 1.0, 0.1, 0.1),
+        lambda key: Between(V[1], key, 0.1, 0.0),
+        lambda key: custom_factor(
+            gtsam.noiseModel.Unit.Create(1), [key], lambda x, *, jacobians: (np.zeros(1), None), [1], 1
+        ),
+    ],
+)
+def test_every_key_is_checked(make):
+    for wrong in (None, 1.5, "x", True, -3, 2**64, np.zeros(3), POSE):
+        with pytest.raises(FactorError, match=r"of \w+.*: found .*, expected a key"):
+            make(wrong)
+    make(gtsam.Symbol("K", 4))
+
+
+def test_keys_of_poses_are_checked(bench):
+    arguments = dict(cTl=E, offset_s=D, seconds=0.1)
+    for wrong in (None, 0.5, "X", POSE):
+        for poses in ((wrong, X[1]), (X[0], wrong)):
+            with pytest.raises(FactorError, match=r"X_. of pose_alignment_factor: found .*, expected a key"):
+                pose_alignment_factor([bench.points], *poses, **arguments)
+        if wrong is not None:
+            with pytest.raises(FactorError, match="X_scan of pose_alignment_factor"):
+                pose_alignment_factor([bench.points], X[0], X[1], X_scan=wrong, **arguments)
+    for seconds in (None, "1", -1.0, float("nan"), True):
+        with pytest.raises(FactorError, match="seconds"):
+            pose_alignment_factor([bench.points], X[0], X[1], E, D, seconds)
+    with pytest.raises(FactorError, match="bTl of pose_alignment_factor: found an array"):
+        pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1, bTl=np.eye(4))
+    with pytest.raises(FactorError, match="alignments of frame_factor: found a Pose3"):
+        frame_factor([POSE], E)
+    with pytest.raises(FactorError, match="c_twist of frame_factor: found a Pose3"):
+        frame_factor([bench.points], E, D, POSE)
+
+
+def test_biases_may_share_a_key_but_nothing_else(bench):
+    groups = np.arange(len(bench.contour)) % 2
+    shared = frame_factor([bench.contour] * 2, E, D, V[0], [B, B])
+    assert shared.keys() == [E, D, V[0], B]
+    assert frame_factor([bench.contour], E, D, V[0], [GroupedBias((B, B), groups)]).keys() == [E, D, V[0], B]
+    with pytest.raises(FactorError, match="D0 for offset_s and bias"):
+        frame_factor([bench.contour], E, D, V[0], D)
+    with pytest.raises(FactorError, match="X1 for X_b and bias 1"):
+        pose_alignment_factor([bench.contour], X[0], X[1], E, D, 0.1, biases_px=X[1])
+
+
+# --- custom_factor: any variable that gtsam.Values holds
+
+
+VARIABLES = {
+    "Pose3": NEAR,
+    "Rot3": NEAR.rotation(),
+    "Pose2": gtsam.Pose2(1.0, 2.0, 0.3),
+    "Rot2": gtsam.Rot2(0.4),
+    "Point2": gtsam.Point2(1.0, 2.0),
+    "Point3": gtsam.Point3(1.0, 2.0, 3.0),
+    "Vector": np.arange(7.0),
+    "Unit3": gtsam.Unit3(np.array([0.6, 0.0, 0.8])),
+    "NavState": gtsam.NavState(NEAR, np.array([1.0, 2.0, 3.0])),
+    "ConstantBias": gtsam.imuBias.ConstantBias(np.ones(3), 0.1 * np.ones(3)),
+    "Cal3_S2": gtsam.Cal3_S2(700.0, 710.0, 0.1, 600.0, 180.0),
+    "Cal3DS2": gtsam.Cal3DS2(700.0, 710.0, 0.1, 600.0, 180.0, 0.01, -0.02, 0.001, 0.002),
+    "Cal3Bundler": gtsam.Cal3Bundler(700.0, 0.01, -0.02, 600.0, 180.0),
+    "Cal3Fisheye": gtsam.Cal3Fisheye(700.0, 710.0, 0.1, 600.0, 180.0, 0.1, 0.01, 0.0, 0.0),
+    "Cal3Unified": gtsam.Cal3Unified(700.0, 710.0, 0.1, 600.0, 180.0, 0.01, -0.02, 0.001, 0.002, 0.3),
+    "Similarity3": gtsam.Similarity3(NEAR.rotation(), np.ones(3), 1.5),
+    "EssentialMatrix": gtsam.EssentialMatrix(NEAR.rotation(), gtsam.Unit3(np.array([0.6, 0.0, 0.8]))),
+    "double": 0.7,
+}
+
+
+def local(reference, value):
+    """Tangent coordinates of a value about a reference."""
+    if isinstance(reference, float | np.ndarray):
+        return np.atleast_1d(value - reference)
+    return np.asarray(reference.localCoordinates(value))
+
+
+@pytest.mark.parametrize("kind", VARIABLES)
+def test_any_variable_of_gtsam_may_be_one_of_a_custom_factor(kind):
+    """|localCoordinates(reference, x)|^2 / 2, pulled to the reference by LM from a point beside it."""
+    reference, values = VARIABLES[kind], gtsam.Values()
+    values.insert(4, reference)
+    dim = values.dim()
+    seen = set()
+
+    def function(x, *, jacobians):
+        seen.add(type(x).__name__)
+        return local(reference, x), [np.eye(dim)] if jacobians else None
+
+    factor = custom_factor(gtsam.noiseModel.Unit.Create(dim), {"x": 4}, function, [dim], dim)
+    step = gtsam.VectorValues()
+    step.insert(4, 1e-3 * np.arange(1.0, dim + 1.0))
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    beside = values.retract(step)
+    assert factor.error(beside) > 1e-7
+    found = gtsam.LevenbergMarquardtOptimizer(graph, beside).optimize()
+    assert factor.error(found) < 1e-12
+    expected = "ndarray" if isinstance(reference, float | np.ndarray) else type(reference).__name__
+    assert seen == {expected}
+
+
+@pytest.mark.parametrize("kind", ["Pose3", "NavState", "ConstantBias", "Unit3", "Cal3DS2"])
+def test_a_class_may_be_asked_for(kind):
+    value = VARIABLES[kind]
+    values = gtsam.Values()
+    values.insert(4, value)
+    dim = values.dim()
+    factor = custom_factor(
+        gtsam.noiseModel.Unit.Create(dim),
+        {"x": 4},
+        lambda x, *, jacobians: (local(value, x), [np.eye(dim)] if jacobians else None),
+        [type(value)],
+        dim,
+        "my_factor",
+    )
+    check_jacobians(factor, values, tolerance=1e-5)
+    other = gtsam.Values()
+    other.insert(4, np.zeros(dim))
+    with pytest.raises(FactorError, match=rf"variable 4 \(x\) of my_factor: found Vector, expected {kind}"):
+        factor.error(other)
+
+
+@pytest.mark.parametrize("kind", [0, -1, None, "6", 2.5, True, list, gtsam.NonlinearFactorGraph])
+def test_what_is_no_kind_of_variable_is_refused(kind):
+    with pytest.raises(FactorError, match="kind of a variable"):
+        custom_factor(
+            gtsam.noiseModel.Unit.Create(1), [1], lambda *x, jacobians: (np.zeros(1), None), [kind], 1
+        )
+
+
+def test_vector_is_a_kind():
+    factor = custom_factor(
+        gtsam.noiseModel.Unit.Create(3), [1], lambda x, *, jacobians: (x, [np.eye(3)]), [Vector(3)], 3
+    )
+    values = gtsam.Values()
+    values.insert(1, gtsam.Rot3())
+    with pytest.raises(FactorError, match=r"found Rot3, expected Vector\(3\)"):
+        factor.error(values)
+
+
+def test_what_is_no_noise_is_refused():
+    for wrong in (None, 1.0, np.eye(2)):
+        with pytest.raises(FactorError, match="noise of a factor"):
+            custom_factor(wrong, [1], lambda x, *, jacobians: (np.zeros(2), None), [1], 2)
+
+
+# --- noise of a whole image
+
+
+def test_a_noise_scales_a_whole_image(bench):
+    values = bench.values()
+    plain = pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1)
+    arguments = ([bench.points], X[0], X[1], E, D, 0.1)
+    wider = pose_alignment_factor(*arguments, noise=gtsam.noiseModel.Isotropic.Sigma(1, 3.0))
+    assert wider.error(values) == pytest.approx(plain.error(values) / 9.0)
+    information = [f.linearize(values).information() for f in (plain, wider)]
+    np.testing.assert_allclose(information[1], information[0] / 9.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize("condensed", [True, False])
+def test_a_robust_noise_weighs_an_image_by_its_distance(bench, condensed):
+    values = bench.values()
+    arguments = ([bench.points], X[0], X[1], E, D, 0.1)
+    plain = pose_alignment_factor(*arguments, condensed=condensed)
+    distance, k = np.sqrt(2.0 * plain.error(values)), 2.0
+    huber = gtsam.noiseModel.Robust.Create(
+        gtsam.noiseModel.mEstimator.Huber.Create(k), gtsam.noiseModel.Unit.Create(1)
+    )
+    robust = pose_alignment_factor(*arguments, noise=huber, condensed=condensed)
+    assert distance > 2 * k
+    assert robust.error(values) == pytest.approx(k * (distance - 0.5 * k))
+    information = [f.linearize(values).information() for f in (plain, robust)]
+    np.testing.assert_allclose(information[1], information[0] * k / distance, rtol=1e-9)
+
+
+@pytest.mark.parametrize("noise", [1.0, np.eye(1), gtsam.noiseModel.Unit.Create(2), "unit"])
+def test_what_is_no_noise_of_an_image_is_refused(bench, noise):
+    with pytest.raises(FactorError, match=r"noise of pose_alignment_factor: found .*dimension"):
+        pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1, noise=noise)
