@@ -83,6 +83,8 @@ class Assumption:
         span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
         finding: what it means that the data contradict it, for people.
         remedy: what to do about it.
+        by_matches: whether the matches test it; the sweep, which at constant speed they take for a shift, has a
+            test of its own.
     """
 
     name: str
@@ -93,6 +95,7 @@ class Assumption:
     span: float
     finding: str
     remedy: str
+    by_matches: bool = True
 
     def figure(self, value: float, sigma: float) -> str:
         """The parameter's estimate as people read it."""

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -12,6 +12,13 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
+from sst_graph.estimators.assumption_tests import (
+    Finding,
+    TestedProblem,
+    assumption_report,
+    check_assumptions,
+    estimated_report,
+)
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import (
@@ -24,7 +31,7 @@ from sst_graph.estimators.contest import (
     solve_all,
 )
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
+from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
@@ -35,7 +42,7 @@ from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
-from sst_graph.uncertainty.common_error import common_covariance
+from sst_graph.uncertainty.assumptions import consider
 from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
@@ -83,7 +90,7 @@ def calibrate(
     seconds = time.perf_counter() - began
     result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
     timing = {"prepare": seconds, **result.diagnostics["seconds"]}
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    return replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 
 
 def prepare_drives(
@@ -92,7 +99,7 @@ def prepare_drives(
     """Of every frame what the method needs: image features are not tracked for one that does without."""
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
-        prepare = dataclasses.replace(prepare, use_visual_odometry=False)
+        prepare = replace(prepare, use_visual_odometry=False)
     if config.method != "joint" or config.undersides.use == "never":
         prepare = without_undersides(prepare)
     return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
@@ -116,7 +123,7 @@ def calibrate_prepared(
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
     timing = {"estimate": time.perf_counter() - began}
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    return replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -139,6 +146,7 @@ def answer_joint(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """The default: a global start, then silhouettes over the whole drive."""
+    config = replace(config, joint=_estimating(config))
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
     contest = choose_start(
@@ -156,7 +164,7 @@ def answer_joint(
     # 3. Edges towards the ground, where the labels agree about them.
     best = rivals(finals, guess.cTl, guess.offset_s, config.start)
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
-    config, finals = dataclasses.replace(config, joint=below.joint), below.solutions
+    config, finals = replace(config, joint=below.joint), below.solutions
     solution = finals[0]
     # 4. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
@@ -168,15 +176,26 @@ def answer_joint(
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
+    # 5. What is taken for granted: considered in the covariance, and tested.
+    considered = consider(robust, solution.pairs, solution.values, solution.state, config.assumptions)
+    centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+    problem = TestedProblem(drives, tracks, objects, solution, config.joint, centre)
+    findings = check_assumptions(problem, config.assumptions)
     model, cTl = robust.model, solution.state.cTl
+    size = 6 + len(solution.state.offsets_s)
+    covariance = covariance[:size, :size] + considered.covariance(size)
     return Answer(
         cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
+        covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
         remarks=_remarks(drives),
         by_standing=by_standing[:7, :7],
-        doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),
+        doubts=(
+            *_contradicted(findings),
+            *_doubts(solution, finals, covariance, evidence, guess, config),
+            *heard.doubts,
+        ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -191,10 +210,27 @@ def answer_joint(
             "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
             "undersides": [c.name.lower() for c in below.joint.graph.undersides],
             "motion": heard.diagnostics,
+            "assumptions": assumption_report(considered, findings),
+            "estimated": estimated_report(robust, solution.state),
             "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
             FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
         },
     )
+
+
+def _estimating(config: CalibrationConfig) -> JointConfig:
+    """The joint method's settings with the parameters that are to be estimated."""
+    joint = config.joint
+    return replace(joint, graph=replace(joint.graph, estimate=dict(config.assumptions.estimate)))
+
+
+def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The reason that the data contradict assumptions: the most likely one, and which others would do."""
+    against = [finding for finding in findings if finding.contradicted]
+    if not against:
+        return ()
+    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
+    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
 
 
 def _frozen(
@@ -289,14 +325,9 @@ def _doubts(
     return tuple(doubts)
 
 
-def _beside_matches(
-    drives: Sequence[Drive], solution: JointSolution, variance_s2: float, config: CalibrationConfig
-) -> FloatArray:
+def _beside_matches(solution: JointSolution, variance_s2: float, config: CalibrationConfig) -> FloatArray:
     """(7, 7) covariance by what no match shows."""
-    common = common_covariance(solution.state.cTl, drives[0].camera, config.common_error)
-    return common + unknown_motion_covariance(
-        solution.pairs, solution.state, variance_s2, config.unknown_motion
-    )
+    return unknown_motion_covariance(solution.pairs, solution.state, variance_s2, config.unknown_motion)
 
 
 def _remarks(drives: Sequence[Drive]) -> tuple[str, ...]:

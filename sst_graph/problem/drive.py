@@ -14,6 +14,7 @@ from sst_graph.association.boundary import Boundaries, BoundaryConfig, Edge, fin
 from sst_graph.association.contour import ContourMap
 from sst_graph.association.picture_edges import PictureConfig
 from sst_graph.errors import DataError
+from sst_graph.odometry.chains import ChainTracker, FeatureChain
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
@@ -105,6 +106,7 @@ class Drive:
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
+        chains: corners followed through several images, where image features are tracked.
     """
 
     name: str
@@ -113,6 +115,7 @@ class Drive:
     images: tuple[ImageFeatures, ...]
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
+    chains: tuple[FeatureChain, ...] = ()
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -156,7 +159,7 @@ def prepare_drive(
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
-    tracker = FeatureTracker(config.visual_odometry.features)
+    tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
     for position, frame in enumerate(source):
@@ -167,6 +170,7 @@ def prepare_drive(
             scans.append(scan_features(frame.index, frame.scan, classes, config))
         if frame.image is not None:
             if config.use_visual_odometry:
+                follower.add(frame.image)
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
@@ -177,7 +181,15 @@ def prepare_drive(
     if not scans or not images:
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
-    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs))
+    return Drive(
+        source.name,
+        source.camera,
+        tuple(scans),
+        tuple(images),
+        tuple(motions),
+        tuple(pairs),
+        follower.chains(),
+    )
 
 
 def scan_features(
