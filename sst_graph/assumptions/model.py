@@ -83,8 +83,8 @@ class Assumption:
         span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
         finding: what it means that the data contradict it, for people.
         remedy: what to do about it.
-        by_matches: whether the matches test it; the sweep, which at constant speed they take for a shift, has a
-            test of its own.
+        by_matches: whether the matches test it. They do not test the sweep: at constant speed it looks like a
+            shift.
     """
 
     name: str
