@@ -36,45 +36,55 @@ Arrays
     or column-major ``(cols, n)`` where speed needs it; each docstring says which.
 """
 
-from .alignment import (
-    Alignment,
-    GroupedBias,
-    LinearTerm,
-    alignment_cost,
-    frame_factor,
-    pixel_to_point_factor,
-    point_to_pixel_factor,
-    residuals,
-    weighted_residuals,
-)
-from .camera import MIN_DEPTH_M, PinholeCamera
-from .camera_motion import Between, camera_motion_factor
-from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
-from .condensed import condense
-from .custom import custom_factor
-from .delay import delay_drift, delay_prior, extrinsic_drift
-from .errors import FactorError
-from .hand_eye import hand_eye_factor, rotation_hand_eye
-from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
-from .regularizer import beta_regularizer
-from .robust import KernelKind, RobustKernel
-from .silhouette import silhouette_factor
-from .slam import pose_alignment_factor
-from .twist_transfer import twist_transfer_factor
-from .variables import Kind, Vector
-from .velocity import (
-    mean_velocity_factor,
-    twist_jerk_factor,
-    twist_smoothness_factor,
-    velocity_direction_factor,
-    velocity_factor,
-)
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .alignment import (
+        Alignment,
+        GroupedBias,
+        LinearTerm,
+        alignment_cost,
+        frame_factor,
+        pixel_to_point_factor,
+        point_to_pixel_factor,
+        residuals,
+        weighted_residuals,
+    )
+    from .camera import MIN_DEPTH_M, PinholeCamera
+    from .camera_motion import Between, camera_motion_factor
+    from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
+    from .cloning import GncConfig, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
+    from .condensed import condense
+    from .custom import FactorRecipe, custom_factor, recipe_of
+    from .delay import delay_drift, delay_prior, extrinsic_drift
+    from .errors import FactorError
+    from .hand_eye import hand_eye_factor, rotation_hand_eye
+    from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
+    from .regularizer import beta_regularizer
+    from .robust import KernelKind, RobustKernel
+    from .silhouette import silhouette_factor
+    from .slam import pose_alignment_factor
+    from .twist_transfer import twist_transfer_factor
+    from .variables import Kind, Vector
+    from .velocity import (
+        mean_velocity_factor,
+        twist_jerk_factor,
+        twist_smoothness_factor,
+        velocity_direction_factor,
+        velocity_factor,
+    )
 
 __all__ = [
     "MIN_DEPTH_M",
     "Alignment",
     "Between",
     "FactorError",
+    "FactorRecipe",
+    "GncConfig",
+    "GncSolution",
     "GroupedBias",
     "JacobianBlock",
     "JacobianReport",
@@ -82,6 +92,7 @@ __all__ = [
     "Kind",
     "LinearTerm",
     "MotionModel",
+    "PackedGraph",
     "PinholeCamera",
     "PointwiseMoved",
     "RigidlyMoved",
@@ -92,18 +103,23 @@ __all__ = [
     "camera_motion_factor",
     "check_gradient",
     "check_jacobians",
+    "clone_factor",
+    "clone_graph",
     "condense",
     "custom_factor",
     "delay_drift",
     "delay_prior",
     "extrinsic_drift",
     "frame_factor",
+    "gnc",
     "hand_eye_factor",
     "mean_velocity_factor",
     "move_points",
     "pixel_to_point_factor",
     "point_to_pixel_factor",
     "pose_alignment_factor",
+    "recipe_of",
+    "rekeyed",
     "residuals",
     "rotation_hand_eye",
     "silhouette_factor",
@@ -114,3 +130,68 @@ __all__ = [
     "velocity_factor",
     "weighted_residuals",
 ]
+
+_HOMES = {
+    "Alignment": "alignment",
+    "Between": "camera_motion",
+    "FactorError": "errors",
+    "FactorRecipe": "custom",
+    "GncConfig": "cloning",
+    "GncSolution": "cloning",
+    "GroupedBias": "alignment",
+    "JacobianBlock": "check",
+    "JacobianReport": "check",
+    "KernelKind": "robust",
+    "Kind": "variables",
+    "LinearTerm": "alignment",
+    "MIN_DEPTH_M": "camera",
+    "MotionModel": "motion",
+    "PackedGraph": "cloning",
+    "PinholeCamera": "camera",
+    "PointwiseMoved": "motion",
+    "RigidlyMoved": "motion",
+    "RobustKernel": "robust",
+    "Vector": "variables",
+    "alignment_cost": "alignment",
+    "beta_regularizer": "regularizer",
+    "camera_motion_factor": "camera_motion",
+    "check_gradient": "check",
+    "check_jacobians": "check",
+    "clone_factor": "cloning",
+    "clone_graph": "cloning",
+    "condense": "condensed",
+    "custom_factor": "custom",
+    "delay_drift": "delay",
+    "delay_prior": "delay",
+    "extrinsic_drift": "delay",
+    "frame_factor": "alignment",
+    "gnc": "cloning",
+    "hand_eye_factor": "hand_eye",
+    "mean_velocity_factor": "velocity",
+    "move_points": "motion",
+    "pixel_to_point_factor": "alignment",
+    "point_to_pixel_factor": "alignment",
+    "pose_alignment_factor": "slam",
+    "recipe_of": "custom",
+    "rekeyed": "cloning",
+    "residuals": "alignment",
+    "rotation_hand_eye": "hand_eye",
+    "silhouette_factor": "silhouette",
+    "twist_jerk_factor": "velocity",
+    "twist_smoothness_factor": "velocity",
+    "twist_transfer_factor": "twist_transfer",
+    "velocity_direction_factor": "velocity",
+    "velocity_factor": "velocity",
+    "weighted_residuals": "alignment",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for when it is asked for: the exceptions alone need no gtsam."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"factors.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,4 +1,4 @@
-"""The root of all exceptions raised on purpose, that of the factors, and the shape checks that raise it."""
+"""The exception of the package, and the shape checks that raise it."""
 
 from __future__ import annotations
 
@@ -7,44 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .exceptions import SstGraphError
+
 FloatArray = NDArray[np.float64]
-
-
-MAX_MESSAGE = 1200
-"""Characters of a message; what is longer loses its middle."""
-
-
-def printable(text: object, limit: int = MAX_MESSAGE) -> str:
-    """``text`` as it may stand in a message: no control character, and at most ``limit`` characters.
-
-    Line breaks, escape sequences, direction marks and lone surrogates appear as in a Python literal
-    (``\\n``, ``\\x1b``), so that no file's content reaches a terminal as anything but text. What is too
-    long loses its middle.
-    """
-    shown = _shortened(str(text), limit)
-    if not shown.isprintable():
-        escaped = (c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in shown)
-        shown = "".join(escaped)
-    return _shortened(shown, limit)
-
-
-def _shortened(text: str, limit: int) -> str:
-    if len(text) <= limit:
-        return text
-    gap = " ... "
-    tail = (limit - len(gap)) // 3
-    return text[: limit - len(gap) - tail] + gap + text[-tail:]
-
-
-class SstGraphError(Exception):
-    """Root of every error that sst_graph and factors raise on purpose.
-
-    The message is one line without control characters; line breaks in it become spaces.
-    """
-
-    def __init__(self, message: object = "") -> None:
-        text = _shortened(str(message), 4 * MAX_MESSAGE)
-        super().__init__(printable(" ".join(text.split())))
 
 
 class FactorError(SstGraphError, ValueError):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -22,11 +22,12 @@ class RobustKernel:
         kind: "none" (least squares), "huber", "cauchy", "geman_mcclure" or "tukey"; the last two
             redescend and are bounded.
         scale: in units of sigma: where Huber turns linear, where the others' weight has fallen to
-            1/2 (Cauchy), 1/4 (Geman-McClure), 0 (Tukey).
+            1/2 (Cauchy), 1/4 (Geman-McClure), 0 (Tukey). Above 0; a settings file may give it within the
+            bounds of the field's metadata.
     """
 
     kind: KernelKind = "none"
-    scale: float = 1.0
+    scale: float = field(default=1.0, metadata={"at_least": 0.01, "at_most": 1e6})
 
     def __post_init__(self) -> None:
         if self.kind not in get_args(KernelKind):

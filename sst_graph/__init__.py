@@ -3,28 +3,43 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
 
+TYPE_CHECKING = False  # as typing has it, whose import takes milliseconds of every command's start
 if TYPE_CHECKING:
+    from typing import Any
+
     from sst_graph.data import open_source
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.problem.align import align_frame
+    from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, Trajectory
+    from sst_graph.problem.incremental_terms import IncrementalTerms
+    from sst_graph.problem.rematching import solve_with_terms
     from sst_graph.result import CalibrationResult
     from sst_graph.uncertainty.inspection import inspect_result
 
 __all__ = [
+    "AlignmentKeys",
+    "AlignmentTerm",
     "CalibrationConfig",
     "CalibrationResult",
+    "IncrementalTerms",
     "TrackUpdate",
     "Tracker",
     "TrackerConfig",
+    "Trajectory",
     "align_frame",
     "calibrate",
     "inspect_result",
     "open_source",
+    "solve_with_terms",
 ]
 
 _HOMES = {
+    "AlignmentKeys": "sst_graph.problem.alignment_term",
+    "AlignmentTerm": "sst_graph.problem.alignment_term",
+    "IncrementalTerms": "sst_graph.problem.incremental_terms",
+    "Trajectory": "sst_graph.problem.alignment_term",
+    "solve_with_terms": "sst_graph.problem.rematching",
     "CalibrationConfig": "sst_graph.estimators",
     "CalibrationResult": "sst_graph.result",
     "TrackUpdate": "sst_graph.estimators",

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from factors.errors import SstGraphError, printable
+from factors.exceptions import SstGraphError, printable
 
 __all__ = [
+    "CheckpointError",
     "ConfigError",
     "DataError",
     "EstimationError",
@@ -35,12 +36,20 @@ class DataError(SstGraphError):
         return type(self), (self.place, self.found, self.expected)
 
 
+class CheckpointError(DataError):
+    """A checkpoint that cannot be read back: damaged, changed, or of another version."""
+
+
 class ConfigError(SstGraphError, ValueError):
     """A configuration or command-line value that is unknown or out of its range."""
 
 
 class EstimationError(SstGraphError):
     """An estimation step that could not be carried out (no match, indeterminate system)."""
+
+
+class ContradictionError(EstimationError):
+    """Estimates that are to be fused contradict one another beyond what their covariances allow."""
 
 
 class MissingDependencyError(SstGraphError):

@@ -68,7 +68,7 @@ def read_file(path: str | Path, kind: FileKind) -> bytes:
             _require_regular(os.fstat(descriptor), path, kind)
             data = stream.read(kind.max_bytes + 1)
     except FileNotFoundError:
-        raise DataError(path, "no file", kind.name) from None
+        raise DataError(path, "no such file", kind.name) from None
     except OSError as error:
         raise DataError(path, f"an unreadable file ({error.strerror or error})", kind.name) from None
     except ValueError as error:  # a NUL or a lone surrogate in the name
@@ -110,12 +110,12 @@ def read_toml(path: str | Path, kind: FileKind) -> dict[str, Any]:
     return parse_toml(read_text(path, kind), path, kind.name)
 
 
-def parse_json(text: str, place: str | Path, expected: str = "JSON") -> Any:
+def parse_json(text: str, place: str | Path, expected: str = "JSON", max_depth: int = MAX_DEPTH) -> Any:
     """The value of a JSON text: finite numbers, unique keys, bounded depth and size.
 
     Raises:
         DataError: naming ``place``: no JSON, NaN or Infinity (1e999 too), a key given twice, more than
-            MAX_DEPTH levels or MAX_VALUES values, a number of more than MAX_NUMBER_LENGTH characters or
+            ``max_depth`` levels or MAX_VALUES values, a number of more than MAX_NUMBER_LENGTH characters or
             MAX_DIGITS digits, a string with half a character (a lone surrogate).
     """
     if text.count(",") + text.count("[") + text.count("{") > MAX_VALUES:
@@ -130,7 +130,7 @@ def parse_json(text: str, place: str | Path, expected: str = "JSON") -> Any:
             object_pairs_hook=_unique_keys,
         )
 
-    return _parsed(parse, place, "JSON", expected)
+    return _parsed(parse, place, "JSON", expected, max_depth)
 
 
 def parse_toml(text: str, place: str | Path, expected: str = "TOML") -> dict[str, Any]:
@@ -148,23 +148,25 @@ def parse_toml(text: str, place: str | Path, expected: str = "TOML") -> dict[str
     return table
 
 
-def _parsed(parse: Callable[[], Any], place: str | Path, language: str, expected: str) -> Any:
+def _parsed(
+    parse: Callable[[], Any], place: str | Path, language: str, expected: str, max_depth: int = MAX_DEPTH
+) -> Any:
     try:
         value = parse()
-        _check_values(value)
+        _check_values(value, max_depth)
     except RecursionError:
-        raise DataError(place, f"{language} nested too deeply", f"at most {MAX_DEPTH} levels") from None
+        raise DataError(place, f"{language} nested too deeply", f"at most {max_depth} levels") from None
     except ValueError as error:  # JSONDecodeError, TOMLDecodeError and those of the hooks below
         raise DataError(place, f"no {language} ({_first_line(error)})", expected) from None
     return value
 
 
-def _check_values(value: Any) -> None:
+def _check_values(value: Any, max_depth: int) -> None:
     """Depth, whole numbers (TOML's parser has no hook for them) and text of a parsed document."""
     level, depth = [value], 0
     while level:
         depth += 1
-        if depth > MAX_DEPTH:
+        if depth > max_depth:
             raise RecursionError
         below: list[Any] = []
         for item in level:

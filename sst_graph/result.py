@@ -2,15 +2,13 @@
 
 The file's contract: ``{"format": "sst-graph/calibration", "version": 1, "T_camera_lidar": 4x4,
 "time_offset_s", "covariance": 7x7, "status", "reasons", "weak_directions", "camera", "frames_used",
-"drive_offsets", "config", "method", "initial", "diagnostics", "versions"}``; strict JSON, no NaN.
+"drive_offsets", "config", "method", "initial", "read_as", "diagnostics", "versions"}``; strict JSON, no NaN.
+The same data and settings give the same bytes: what a clock on the wall showed is left out.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import enum
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.checked import check_covariance, check_finite, checked_camera, checked_text
 from sst_graph.errors import DataError
+from sst_graph.input_files import CALIBRATION, parse_json, read_text
+from sst_graph.json_table import JsonTable, json_table
+from sst_graph.strict_json import strict_json
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 Status = Literal["ok", "unobservable", "not_converged"]
@@ -32,16 +35,20 @@ UNNAMED_CAMERA = "camera"
 FORMAT = "sst-graph/calibration"
 VERSION = 1
 
+WALL_CLOCK = "seconds"
+"""Entry of the diagnostics that tells how long each stage took [s]; it is not written."""
+
 DIRECTION_SCALES: FloatArray = np.array([np.radians(0.1)] * 3 + [0.01] * 3 + [0.001])
 """(7,) one scaled unit of a weak direction: 0.1 deg [rad], 1 cm [m], 1 ms [s]."""
 
 
-@dataclass(frozen=True)
-class WeakDirection:
+@dataclass(frozen=True, eq=False)
+class WeakDirection(ByValue):
     """A combination of the unknowns that the data hardly tells.
 
     Attributes:
-        vector: (7,) unit vector in scaled units (:data:`DIRECTION_SCALES`), order of the covariance.
+        vector: (7,) unit vector in scaled units (:data:`DIRECTION_SCALES`), order of the covariance; where
+            drives have a time offset each, the last is that of the drive which the sentence begins with.
         sigma: standard deviation along it, in scaled units; large but finite.
         sentence: what cannot be told, in words and numbers.
         advice: what to record to tell it.
@@ -79,9 +86,11 @@ class Sigmas:
     time_offset_ms: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CalibrationResult:
     """An estimated extrinsic and time offset, and how far to trust them. Signs: :mod:`factors`.
+
+    Two results are equal if :meth:`to_json` writes the same of them.
 
     Attributes:
         T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
@@ -99,6 +108,7 @@ class CalibrationResult:
         config: its settings, as a JSON-able dictionary.
         initial: where the estimation started, or None without a guess.
         initial_offset_s: time offset at the start [s].
+        read_as: how the drives were read, by option: what pairs of scans and images the result holds for.
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
     """
@@ -117,17 +127,27 @@ class CalibrationResult:
     config: Mapping[str, Any] = field(default_factory=dict)
     initial: gtsam.Pose3 | None = None
     initial_offset_s: float = 0.0
+    read_as: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         _check_status(self.status)
-        _check_finite("T_camera_lidar", self.T_camera_lidar.matrix(), (4, 4))
-        _check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
-        _check_covariance(self.covariance)
+        check_finite("T_camera_lidar", self.T_camera_lidar.matrix(), (4, 4))
+        check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
+        check_finite("covariance", self.covariance, (7, 7))
+        check_covariance("covariance", self.covariance)
         for weak in self.weak_directions:
-            _check_finite("weak_directions.vector", np.asarray(weak.vector), (7,))
-            _check_finite("weak_directions.sigma", np.asarray(weak.sigma), ())
+            check_finite("weak_directions.vector", np.asarray(weak.vector), (7,))
+            check_finite("weak_directions.sigma", np.asarray(weak.sigma), ())
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, CalibrationResult):
+            return NotImplemented
+        return self.to_json() == other.to_json()
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
 
     def sigmas(self) -> Sigmas:
         """Standard deviations of the seven unknowns, in degrees, centimetres and milliseconds."""
@@ -137,7 +157,11 @@ class CalibrationResult:
         return Sigmas((rx, ry, rz), (x, y, z), 1e3 * float(sigma[6]))
 
     def to_json(self) -> str:
-        """The text of ``calibration.json``; what is not finite in the diagnostics becomes null."""
+        """The text of ``calibration.json``; what is not finite in the diagnostics becomes null.
+
+        Text that is not Unicode (a lone surrogate) is escaped, so that the file is UTF-8.
+        """
+        diagnostics = {name: value for name, value in self.diagnostics.items() if name != WALL_CLOCK}
         document = {
             "format": FORMAT,
             "version": VERSION,
@@ -153,10 +177,11 @@ class CalibrationResult:
             "method": self.method,
             "config": self.config,
             "initial": self._initial_document(),
-            "diagnostics": self.diagnostics,
+            "read_as": self.read_as,
+            "diagnostics": diagnostics,
             "versions": self.versions,
         }
-        return _dump(json_able(document)) + "\n"
+        return strict_json(document) + "\n"
 
     def _initial_document(self) -> dict[str, Any] | None:
         if self.initial is None:
@@ -170,57 +195,39 @@ class CalibrationResult:
         Raises:
             DataError: naming ``place``, what was found and what was expected.
         """
-        reader = _Reader(_document(text, place), str(place))
+        reader = json_table(parse_json(text, place, CALIBRATION.name), place, FORMAT, VERSION)
         camera = reader.table("camera")
         initial = None if reader.value("initial", None) is None else reader.table("initial")
         try:
             return CalibrationResult(
                 T_camera_lidar=reader.pose("T_camera_lidar"),
-                time_offset_s=reader.number("time_offset_s"),
-                covariance=reader.matrix("covariance", (7, 7)),
+                time_offset_s=reader.offset_s("time_offset_s"),
+                covariance=_covariance(reader),
                 status=cast(Status, reader.text("status")),
-                camera=camera.camera(),
+                camera=_camera(camera),
                 camera_name=camera.text("name"),
-                reasons=tuple(str(reason) for reason in reader.sequence("reasons")),
-                weak_directions=tuple(weak.weak_direction() for weak in reader.tables("weak_directions")),
+                reasons=reader.sentences("reasons"),
+                weak_directions=tuple(map(_weak_direction, reader.tables("weak_directions"))),
                 frames_used=tuple(
                     FrameId(frame.text("drive"), frame.integer("frame"))
                     for frame in reader.tables("frames_used")
                 ),
                 drive_offsets=tuple(
-                    DriveOffset(drive.text("drive"), drive.number("time_offset_s"), drive.number("sigma_s"))
+                    DriveOffset(drive.text("drive"), drive.offset_s("time_offset_s"), drive.number("sigma_s"))
                     for drive in reader.tables("drive_offsets")
                 ),
                 method=reader.text("method", "joint"),
                 config=reader.mapping("config"),
                 initial=None if initial is None else initial.pose("T_camera_lidar"),
-                initial_offset_s=0.0 if initial is None else initial.number("time_offset_s"),
+                initial_offset_s=0.0 if initial is None else initial.offset_s("time_offset_s"),
+                read_as=reader.mapping("read_as"),
                 diagnostics=reader.mapping("diagnostics"),
-                versions=reader.mapping("versions"),
+                versions=_versions(reader),
             )
         except DataError as error:
             if error.place.startswith(str(place)):
                 raise
             raise DataError(f"{place}: {error.place}", error.found, error.expected) from error
-
-
-def json_able(value: Any) -> Any:
-    """``value`` with arrays and tuples as lists, enums as names, and None for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): json_able(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_able(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [json_able(item) for item in value]
-    if isinstance(value, enum.Enum):
-        return value.name.lower()
-    if isinstance(value, np.generic):
-        return json_able(value.item())
-    if isinstance(value, Path):
-        return str(value)
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return json_able({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def read_result(path: Path) -> CalibrationResult:
@@ -229,147 +236,35 @@ def read_result(path: Path) -> CalibrationResult:
     Raises:
         DataError: the file is missing, unreadable or not such a file.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError(path, "no such file", "a calibration.json") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, str(error), "a readable calibration.json") from error
-    return CalibrationResult.from_json(text, path)
-
-
-def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
-    """The pose of a (4, 4) homogeneous matrix; a rotation off by rounding is made orthonormal.
-
-    Raises:
-        DataError: not finite, a last row other than 0 0 0 1, or a rotation that is none (1e-3).
-    """
-    _check_finite(place, matrix, (4, 4))
-    R = matrix[:3, :3]
-    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-9:
-        raise DataError(place, f"last row {matrix[3].tolist()}", "0 0 0 1")
-    off = float(np.abs(R @ R.T - np.eye(3)).max())
-    if off > 1e-3 or np.linalg.det(R) < 0.0:
-        found = f"a 3x3 block with |R R' - I| = {off:.2g}, det {np.linalg.det(R):.3g}"
-        raise DataError(place, found, "a rotation matrix")
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(R) if off > 1e-12 else gtsam.Rot3(R), matrix[:3, 3])
+    return CalibrationResult.from_json(read_text(path, CALIBRATION), path)
 
 
 def _check_status(status: str) -> None:
     if status not in get_args(Status):
-        raise DataError("status", repr(status), "one of " + ", ".join(get_args(Status)))
+        raise DataError("status", f"{status!r:.60}", "one of " + ", ".join(get_args(Status)))
 
 
-def _check_finite(place: str, array: FloatArray, shape: tuple[int, ...]) -> None:
-    if array.shape != shape:
-        raise DataError(place, f"shape {array.shape}", f"shape {shape}")
-    if not np.isfinite(array).all():
-        raise DataError(place, "a value that is not finite", "finite numbers")
+def _camera(table: JsonTable) -> PinholeCamera:
+    fx, fy, cx, cy = (table.number(key) for key in ("fx", "fy", "cx", "cy"))
+    camera = PinholeCamera(fx, fy, cx, cy, table.integer("width"), table.integer("height"))
+    return checked_camera(camera, table.place)
 
 
-def _check_covariance(covariance: FloatArray) -> None:
-    _check_finite("covariance", covariance, (7, 7))
-    variances = np.diag(covariance)
-    if (variances < 0.0).any():
-        raise DataError("covariance", f"a variance of {variances.min():.3g}", "variances of at least 0")
-    scale = np.sqrt(np.outer(variances, variances)) + np.finfo(float).tiny
-    if (np.abs(covariance - covariance.T) > 1e-6 * scale).any():
-        raise DataError("covariance", "a matrix that is not symmetric", "a covariance")
+def _weak_direction(table: JsonTable) -> WeakDirection:
+    return WeakDirection(
+        table.matrix("vector", (7,)),
+        table.number("sigma"),
+        table.sentence("sentence"),
+        table.sentence("advice"),
+    )
 
 
-def _dump(document: dict[str, Any]) -> str:
-    """Strict JSON, one key a line, matrices one row a line."""
-    entries = []
-    for key, value in document.items():
-        rows = isinstance(value, list) and value and isinstance(value[0], (list, dict))
-        if rows:
-            body = ",\n".join("    " + json.dumps(row, allow_nan=False, ensure_ascii=False) for row in value)
-            entries.append(f"  {json.dumps(key)}: [\n{body}\n  ]")
-        else:
-            entries.append(f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False, ensure_ascii=False)}")
-    return "{\n" + ",\n".join(entries) + "\n}"
+def _covariance(table: JsonTable) -> FloatArray:
+    covariance = table.matrix("covariance", (7, 7))
+    check_covariance(f"{table.place}: covariance", covariance)
+    return covariance
 
 
-def _document(text: str, place: str | Path) -> dict[str, Any]:
-    """The JSON object in ``text``, of the right format and version."""
-    try:
-        document = json.loads(text, parse_constant=_refuse_constant)
-    except ValueError as error:
-        raise DataError(place, f"no JSON ({error})", "a calibration.json") from error
-    if not isinstance(document, dict) or document.get("format") != FORMAT:
-        found = document.get("format") if isinstance(document, dict) else type(document).__name__
-        raise DataError(place, f"format {found!r}", f"format '{FORMAT}'")
-    if document.get("version") != VERSION:
-        raise DataError(place, f"version {document.get('version')!r}", f"version {VERSION}")
-    return document
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
-
-
-_REQUIRED: Any = object()
-
-
-@dataclass(frozen=True)
-class _Reader:
-    """Typed access to a JSON object; every complaint names its place."""
-
-    data: Mapping[str, Any]
-    place: str
-
-    def value(self, key: str, default: Any = _REQUIRED) -> Any:
-        if key not in self.data and default is _REQUIRED:
-            raise DataError(self.place, f"no '{key}'", f"'{key}'")
-        return self.data.get(key, default)
-
-    def _typed(self, key: str, kinds: Any, expected: str, default: Any = _REQUIRED) -> Any:
-        value = self.value(key, default)
-        if not isinstance(value, kinds) or isinstance(value, bool):
-            raise DataError(f"{self.place}: {key}", f"{value!r:.60}", expected)
-        return value
-
-    def number(self, key: str) -> float:
-        return float(self._typed(key, (int, float), "a number"))
-
-    def integer(self, key: str) -> int:
-        return int(self._typed(key, int, "a whole number"))
-
-    def text(self, key: str, default: Any = _REQUIRED) -> str:
-        return str(self._typed(key, str, "text", default))
-
-    def sequence(self, key: str) -> list[Any]:
-        return list(self._typed(key, list, "a list", []))
-
-    def mapping(self, key: str) -> dict[str, Any]:
-        return dict(self._typed(key, dict, "an object", {}))
-
-    def table(self, key: str) -> _Reader:
-        return _Reader(self._typed(key, dict, "an object"), f"{self.place}: {key}")
-
-    def tables(self, key: str) -> list[_Reader]:
-        items = self.sequence(key)
-        for item in items:
-            if not isinstance(item, dict):
-                raise DataError(f"{self.place}: {key}", f"{item!r:.60}", "objects")
-        return [_Reader(item, f"{self.place}: {key}[{i}]") for i, item in enumerate(items)]
-
-    def matrix(self, key: str, shape: tuple[int, ...]) -> FloatArray:
-        try:
-            array = np.array(self.value(key), dtype=np.float64)
-        except (ValueError, TypeError):
-            raise DataError(f"{self.place}: {key}", "no numeric array", f"shape {shape}") from None
-        _check_finite(f"{self.place}: {key}", array, shape)
-        return array
-
-    def pose(self, key: str) -> gtsam.Pose3:
-        return checked_pose(self.matrix(key, (4, 4)), f"{self.place}: {key}")
-
-    def camera(self) -> PinholeCamera:
-        fx, fy, cx, cy = (self.number(key) for key in ("fx", "fy", "cx", "cy"))
-        return PinholeCamera(fx, fy, cx, cy, self.integer("width"), self.integer("height"))
-
-    def weak_direction(self) -> WeakDirection:
-        return WeakDirection(
-            self.matrix("vector", (7,)), self.number("sigma"), self.text("sentence"), self.text("advice")
-        )
+def _versions(table: JsonTable) -> dict[str, str]:
+    found = JsonTable(table.mapping("versions"), f"{table.place}: versions")
+    return {checked_text(name, found.place): found.text(name) for name in found.data}

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+import re
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.input_files import TIMES_TXT, read_text
 
 NS_PER_S = 1_000_000_000
+
+MAX_LENGTH = 64
+"""Characters of a stamp; ten digits before the point and nine behind it say all that is kept."""
+MAX_STAMPS = 2_000_000
+"""Of a drive: more than a day at 20 Hz."""
+
+_DECIMAL = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,9})?", re.ASCII)
+_MAX_EXPONENT = 10
 
 
 def parse_seconds(text: str, place: str | Path) -> int:
@@ -19,12 +29,13 @@ def parse_seconds(text: str, place: str | Path) -> int:
     Raises:
         DataError: the text is no finite number, or does not fit into int64 nanoseconds.
     """
-    try:
-        seconds = Decimal(text.strip())
-    except InvalidOperation:
-        raise DataError(place, f"{text.strip()!r}", "a number of seconds") from None
-    if not seconds.is_finite() or abs(seconds) > Decimal(2**63 - 1) / NS_PER_S:
-        raise DataError(place, f"{text.strip()!r}", "a finite number of seconds")
+    text = text.strip()
+    if len(text) > MAX_LENGTH or not _DECIMAL.fullmatch(text):
+        raise DataError(place, f"{text!r:.60}", "a number of seconds")
+    seconds = Decimal(text)
+    # By the exponent first: arithmetic with 1e999999999 overflows.
+    if seconds.adjusted() > _MAX_EXPONENT or abs(seconds) > Decimal(2**63 - 1) / NS_PER_S:
+        raise DataError(place, f"{text!r:.60}", "seconds that fit into 64 bits as nanoseconds")
     return int((seconds * NS_PER_S).to_integral_value())
 
 
@@ -48,21 +59,13 @@ def read_times(path: Path) -> NDArray[np.int64]:
     Raises:
         DataError: a missing or empty file, a line that is no number, stamps that do not rise.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, _reason(error), "a text file with one number of seconds a line") from None
-    while lines and not lines[-1].strip():
-        lines.pop()
-    if not lines:
+    text = read_text(path, TIMES_TXT).rstrip()
+    if text.count("\n") >= MAX_STAMPS:
+        raise DataError(path, f"{text.count(chr(10)) + 1} lines", f"at most {MAX_STAMPS} stamps")
+    if not text:
         raise DataError(path, "no stamp", "one number of seconds a line")
+    lines = text.splitlines()
     stamps = [parse_seconds(line, f"{path}:{number}") for number, line in enumerate(lines, 1)]
     stamps_ns = np.array(stamps, np.int64)
     check_rising(stamps_ns, path)
     return stamps_ns
-
-
-def _reason(error: OSError | UnicodeDecodeError) -> str:
-    if isinstance(error, FileNotFoundError):
-        return "no file"
-    return f"an unreadable file ({type(error).__name__})"

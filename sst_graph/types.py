@@ -5,11 +5,12 @@ Conventions (frames, signs, units) are stated in :mod:`factors`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -18,6 +19,40 @@ from numpy.typing import NDArray
 from factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
+
+
+class ByValue:
+    """Equality and hash of a frozen dataclass with arrays, poses or tables in it: by value, bit by bit.
+
+    The dataclass is declared with ``eq=False``. NaN equals NaN, and 0.0 equals -0.0 not.
+    """
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return _value(self) == _value(other)
+
+    def __hash__(self) -> int:
+        return hash(_value(self))
+
+
+def _value(item: Any) -> Hashable:
+    """``item`` as a hashable value that is equal for equal content."""
+    if isinstance(item, np.ndarray):
+        return item.dtype.str, item.shape, item.tobytes()
+    if isinstance(item, gtsam.Pose3):
+        return "Pose3", item.matrix().tobytes()
+    if isinstance(item, Mapping):
+        return frozenset((key, _value(one)) for key, one in item.items())
+    if isinstance(item, list | tuple):
+        return tuple(_value(one) for one in item)
+    if isinstance(item, float):
+        return "float", float(item).hex()
+    if dataclasses.is_dataclass(item) and not isinstance(item, type):
+        values = (_value(getattr(item, f.name)) for f in dataclasses.fields(item) if f.compare)
+        return (type(item).__qualname__, *values)
+    hash(item)
+    return item  # type: ignore[no-any-return]
 
 
 class SemanticClass(IntEnum):
@@ -41,8 +76,8 @@ class SemanticClass(IntEnum):
     IGNORE = 255
 
 
-@dataclass(frozen=True)
-class Scan:
+@dataclass(frozen=True, eq=False)
+class Scan(ByValue):
     """One LiDAR sweep.
 
     Attributes:
@@ -53,6 +88,7 @@ class Scan:
         offsets_s: (n,) float32, time of each point minus ``stamp_ns`` [s], or None where all
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
+        left_out: number of points that the data held beside these, and that were NaN or inf.
     """
 
     stamp_ns: int
@@ -61,16 +97,26 @@ class Scan:
     instances: NDArray[np.uint16] | None = None
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
+    left_out: int = 0
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether any point is known to be of some class."""
+        return bool((self.classes != SemanticClass.IGNORE).any())
 
 
-@dataclass(frozen=True)
-class CameraImage:
+NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
+"""Pixels of an image whose picture is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImage(ByValue):
     """One camera image with its semantic mask.
 
     Attributes:
         stamp_ns: camera-clock stamp [ns].
-        mask: (h, w) uint8 of :class:`SemanticClass`.
-        pixels: (h, w, 3) uint8 BGR picture.
+        mask: (h, w) uint8 of :class:`SemanticClass`; all IGNORE where there is no mask.
+        pixels: (h, w, 3) uint8 BGR picture, or :data:`NO_PICTURE`.
         instances: (h, w) uint16 instance number (0: none), or None.
     """
 
@@ -79,9 +125,18 @@ class CameraImage:
     pixels: NDArray[np.uint8]
     instances: NDArray[np.uint16] | None = None
 
+    @property
+    def has_mask(self) -> bool:
+        """Whether any pixel is known to be of some class."""
+        return bool((self.mask != SemanticClass.IGNORE).any())
 
-@dataclass(frozen=True)
-class Frame:
+    @property
+    def has_picture(self) -> bool:
+        return self.pixels.size > 0
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(ByValue):
     """Scan ``index`` of a drive and the image that carries the same stamp; one may be missing."""
 
     index: int
@@ -89,8 +144,8 @@ class Frame:
     image: CameraImage | None
 
 
-@dataclass(frozen=True)
-class GroundTruth:
+@dataclass(frozen=True, eq=False)
+class GroundTruth(ByValue):
     """What is known to be true of a drive (simulated, or a published reference).
 
     Attributes:
@@ -126,8 +181,8 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[Frame]: ...
 
 
-@dataclass(frozen=True)
-class RelativeMotion:
+@dataclass(frozen=True, eq=False)
+class RelativeMotion(ByValue):
     """Motion of one sensor between two of its stamps.
 
     Attributes:

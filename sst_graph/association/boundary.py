@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.beams import Beams, arrange_beams
+from sst_graph.config import Settings, setting
 from sst_graph.types import Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +38,7 @@ class Edge(IntEnum):
 
 
 @dataclass(frozen=True)
-class BoundaryConfig:
+class BoundaryConfig(Settings):
     """Which returns make a boundary.
 
     Attributes:
@@ -55,17 +56,17 @@ class BoundaryConfig:
         cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
 
-    behind_m: float = 0.5
-    behind_ratio: float = 0.0
-    max_steps: float = 1.6
-    max_elevation_gap_deg: float = 0.9
-    max_range_m: float = 60.0
-    min_points: int = 15
+    behind_m: float = setting(0.5, at_least=0.0, at_most=100.0)
+    behind_ratio: float = setting(0.0, at_least=0.0, at_most=10.0)
+    max_steps: float = setting(1.6, at_least=0.1, at_most=1000.0)
+    max_elevation_gap_deg: float = setting(0.9, at_least=0.01, at_most=90.0)
+    max_range_m: float = setting(60.0, at_least=1.0, at_most=1000.0)
+    min_points: int = setting(15, at_least=1, at_most=1_000_000)
     bottom_edges: bool = True
-    ground_margin_m: float = 0.3
-    max_slope_m: float = 1.0
-    max_roof_m: float = 0.6
-    cell_m: float = 0.3
+    ground_margin_m: float = setting(0.3, at_least=0.0, at_most=10.0)
+    max_slope_m: float = setting(1.0, at_least=0.0, at_most=100.0)
+    max_roof_m: float = setting(0.6, at_least=0.0, at_most=100.0)
+    cell_m: float = setting(0.3, at_least=0.05, at_most=10.0)
 
 
 @dataclass(frozen=True)

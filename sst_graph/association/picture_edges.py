@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sst_graph.association.sampling import sampled
+from sst_graph.config import Settings, setting
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
@@ -41,7 +42,7 @@ _EVERY = 2
 
 
 @dataclass(frozen=True)
-class PictureConfig:
+class PictureConfig(Settings):
     """How contours follow the picture.
 
     Attributes:
@@ -57,17 +58,12 @@ class PictureConfig:
     """
 
     use: bool = True
-    reach_px: float = 3.0
-    mask_sigma_px: float = 1.4
-    along_px: int = 4
-    min_contrast: float = 1.5
-    max_rival: float = 0.6
-    min_share: float = 0.2
-
-    def __post_init__(self) -> None:
-        for name, least in (("reach_px", 1.0), ("mask_sigma_px", 0.1), ("along_px", 2)):
-            if not getattr(self, name) >= least:
-                raise ValueError(f"{name} {getattr(self, name):g}: expected {least:g} or more")
+    reach_px: float = setting(3.0, at_least=1.0, at_most=20.0)
+    mask_sigma_px: float = setting(1.4, at_least=0.1, at_most=100.0)
+    along_px: int = setting(4, at_least=2, at_most=64)
+    min_contrast: float = setting(1.5, at_least=0.0, at_most=100.0)
+    max_rival: float = setting(0.6, at_least=0.0, at_most=1.0)
+    min_share: float = setting(0.2, at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)

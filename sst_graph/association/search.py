@@ -18,14 +18,19 @@ from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from sst_graph.association.votes import CELLS, Judge, Level, SearchFrame, States, Votes
+from sst_graph.config import Settings, setting
+from sst_graph.errors import ConfigError
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
+_MOST_STEPS = 40
+"""Widest box in steps to either side: (2 * 40 + 1)^3 rotations take a second a score, and 100 MB."""
+
 
 @dataclass(frozen=True)
-class SearchConfig:
+class SearchConfig(Settings):
     """How the start is searched.
 
     Attributes:
@@ -49,25 +54,33 @@ class SearchConfig:
         seed: of the sampler.
     """
 
-    frames: int = 6
-    points_per_class: int = 250
-    grid_step_deg: float = 7.5
-    box_deg: float = 30.0
-    box_step_deg: float = 5.0
-    reach_deg: float = 42.0
-    apart_deg: float = 3.0
-    held_translation_m: float = 0.1
-    translation_m: float = 0.6
-    free_translation_m: float = 2.0
-    delay_s: float = 0.5
-    blurs_px: tuple[float, ...] = (45.0, 22.0, 10.0, 4.0)
-    judges: tuple[Judge, ...] = ("votes", "dependence")
-    candidates: tuple[int, ...] = (80, 40, 20, 12)
-    free_breadth: int = 4
-    shares: tuple[float, ...] = (0.25, 0.5, 1.0, 1.0)
-    population: int = 64
-    rounds: int = 4
-    seed: int = 0
+    frames: int = setting(6, at_least=1, at_most=50)
+    points_per_class: int = setting(250, at_least=1, at_most=5000)
+    grid_step_deg: float = setting(7.5, at_least=3.0, at_most=60.0)
+    box_deg: float = setting(30.0, at_least=0.0, at_most=180.0)
+    box_step_deg: float = setting(5.0, at_least=0.5, at_most=60.0)
+    reach_deg: float = setting(42.0, at_least=0.0, at_most=180.0)
+    apart_deg: float = setting(3.0, at_least=0.1, at_most=180.0)
+    held_translation_m: float = setting(0.1, at_least=0.0, at_most=20.0)
+    translation_m: float = setting(0.6, at_least=0.001, at_most=20.0)
+    free_translation_m: float = setting(2.0, at_least=0.001, at_most=20.0)
+    delay_s: float = setting(0.5, at_least=0.0, at_most=5.0)
+    blurs_px: tuple[float, ...] = setting(
+        (45.0, 22.0, 10.0, 4.0), at_least=0.5, at_most=500.0, length=(1, 10)
+    )
+    judges: tuple[Judge, ...] = setting(("votes", "dependence"), length=(1, 2))
+    candidates: tuple[int, ...] = setting((80, 40, 20, 12), at_least=1, at_most=2000, length=(1, 10))
+    free_breadth: int = setting(4, at_least=1, at_most=20)
+    shares: tuple[float, ...] = setting((0.25, 0.5, 1.0, 1.0), at_least=0.001, at_most=1.0, length=(1, 10))
+    population: int = setting(64, at_least=1, at_most=1000)
+    rounds: int = setting(4, at_least=0, at_most=50)
+    seed: int = setting(0, at_least=0, at_most=10**15)
+
+    def __post_init__(self) -> None:
+        blurs, shares = len(self.blurs_px), len(self.shares)
+        if blurs != shares:
+            raise ConfigError(f"blurs_px: found {blurs} of them, expected {shares}, as many as shares")
+        self.expect_at_most("box_deg", _MOST_STEPS * self.box_step_deg, f"{_MOST_STEPS} box_step_deg")
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
 from sst_graph.association.contour import ContourMap
 from sst_graph.assumptions.model import Effect
+from sst_graph.config import Settings, setting
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +31,7 @@ BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 
 
 @dataclass(frozen=True)
-class MatchConfig:
+class MatchConfig(Settings):
     """How boundary points are matched to contours.
 
     Attributes:
@@ -44,12 +45,12 @@ class MatchConfig:
         top_edges: use boundaries towards the ring above.
     """
 
-    mask_sigma_px: float = 1.0
-    side_sigma_px: float = 0.7
-    underside_sigma_px: float = 1.2
-    gate: float = 3.0
-    min_cosine: float = 0.5
-    min_object_share: float = 0.1
+    mask_sigma_px: float = setting(1.0, at_least=0.01, at_most=100.0)
+    side_sigma_px: float = setting(0.7, at_least=0.0, at_most=100.0)
+    underside_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
+    gate: float = setting(3.0, at_least=0.1, at_most=100.0)
+    min_cosine: float = setting(0.5, at_least=0.0, less_than=1.0)
+    min_object_share: float = setting(0.1, at_least=0.0, at_most=1.0)
     top_edges: bool = True
 
 

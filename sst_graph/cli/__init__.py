@@ -1,52 +1,40 @@
-"""The command ``sst-graph``: one module a command, imported when it is called."""
+"""The command ``sst-graph``: one module a command, imported when it is called.
+
+This module imports next to nothing, so that a signal finds its handler from the first milliseconds on.
+"""
 
 from __future__ import annotations
 
-import importlib
-import logging
-import os
-import sys
-from collections.abc import Sequence
-
-from sst_graph.cli.options import build_parser
-from sst_graph.errors import SstGraphError
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 EXIT_OK = 0
 EXIT_BAD_INPUT = 2
 EXIT_NOT_TRUSTED = 3
 EXIT_INTERRUPTED = 130
+EXIT_READER_GONE = 141
+EXIT_TERMINATED = 143
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``sst-graph`` with ``argv`` (default: the process's arguments) and return its exit code.
+    """Run ``sst-graph`` with ``argv`` and return its exit code.
 
-    0: done. 2: bad input or usage, one line on stderr. 3: finished, but the result is not to be trusted.
+    Without ``argv`` it is the process's own command: the arguments are the process's, signals end it without
+    a trace, its streams are made safe, and its arithmetic is that of one thread. With ``argv`` nothing of
+    the process is touched.
+
+    0: done. 2: bad input or usage, or an output that could not be written, one line on stderr. 3: finished,
+    but the result is not to be trusted. 130, 143, 129: ended by Ctrl-C, SIGTERM, SIGHUP. 141: the
+    reader of stdout has gone.
     """
-    try:
-        args = build_parser().parse_args(argv)
-        _set_up_logging(args.verbose)
-        command = importlib.import_module(f"sst_graph.cli.{args.command}")
-        code: int = command.run(args)
-        sys.stdout.flush()
-        return code
-    except BrokenPipeError:
-        # The reader of our output is gone: nothing can be said, and nothing should be at shutdown.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except KeyboardInterrupt:
-        return _complain("interrupted", EXIT_INTERRUPTED)
-    except (SstGraphError, OSError) as error:
-        return _complain(str(error), EXIT_BAD_INPUT)
+    if argv is not None:
+        from sst_graph.cli.command import run
 
+        return run(argv)
+    from sst_graph.cli.process import own_process
 
-def _complain(message: str, code: int) -> int:
-    """One line on stderr, whatever the message holds."""
-    print("sst-graph: error: " + " ".join(message.split()), file=sys.stderr)
-    return code
+    with own_process() as arguments:
+        from sst_graph.cli.command import run
 
-
-def _set_up_logging(verbose: bool) -> None:
-    level = logging.DEBUG if verbose else logging.WARNING
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", force=True)
-    for name in ("sst_graph", "factors"):
-        logging.getLogger(name).setLevel(level)
+        return run(arguments)

@@ -4,36 +4,48 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 from collections.abc import Sequence
 
 import gtsam
 
 from sst_graph.cli.inputs import chosen_classes, open_drives, settings, starting_point
-from sst_graph.cli.outputs import MARKER, comparison, verdict, write_calibration
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, verdict, write_calibration
 from sst_graph.cli.progress import ProgressBar
+from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.estimators import CalibrationConfig, calibrate
-from sst_graph.files import atomic_directory, check_writable_target
+from sst_graph.files import atomic_directory
 from sst_graph.report import Comparison, summary
-from sst_graph.result import CalibrationResult
+from sst_graph.result import WALL_CLOCK, CalibrationResult
 from sst_graph.types import Source
+
+logger = logging.getLogger(__name__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Calibrate ``args.data``, write the result, print its summary."""
+    """Calibrate ``args.data``, print the summary of the result, write it."""
     flags = {
         "method": args.method,
         "classes": chosen_classes(args.classes),
         "delay_per_drive": args.delay_per_drive,
+        "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(CalibrationConfig(), args, flags)
-    check_writable_target(args.out, args.overwrite, owned_by=MARKER)
-    sources = open_drives(args)
-    initial, offset_s = starting_point(args.init, sources[0], args.camera)
-    result, against = calibrate_drives(sources, initial, offset_s, config, args.camera)
-    with atomic_directory(args.out, args.overwrite, owned_by=MARKER) as folder:
+    inputs = {"DATA": None, "--init": args.init, "--config": args.config}
+    for path in args.data:
+        check_apart({**inputs, "DATA": path}, {"--out": args.out})
+    with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
+        read_as = options_of(args)
+        sources = open_drives(args)
+        warn_of_other_pairs(args.init, read_as)
+        initial, offset_s = starting_point(args.init, sources[0], args.camera)
+        result, against = calibrate_drives(sources, initial, offset_s, config, args.camera)
+        result = dataclasses.replace(result, read_as=read_as)
+        # The numbers first: what follows may find the disk full.
+        mention(summary(result, against))
         names = write_calibration(folder, result, sources, against)
-    print(summary(result, against))
-    print(f"{'wrote':<15} {args.out}: {', '.join(names)}")
+    mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
     return verdict(result)
 
 
@@ -47,5 +59,7 @@ def calibrate_drives(
     """The calibration of ``sources``, with progress on stderr, and its errors where they can be known."""
     with ProgressBar() as progress:
         result = calibrate(sources, initial, config, initial_offset_s=initial_offset_s, progress=progress)
+    for stage, seconds in result.diagnostics.get(WALL_CLOCK, {}).items():
+        logger.info("%s took %.1f s", stage, seconds)
     result = dataclasses.replace(result, camera_name=camera)
     return result, comparison(result, sources)

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import sys
 
 from sst_graph.cli.calibrate import calibrate_drives
+from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.outputs import verdict, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data import open_source
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.data.simulator import SimulationConfig, fill_drive, simulate
 from sst_graph.estimators import CalibrationConfig
-from sst_graph.files import atomic_directory, check_writable_target
+from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.report import summary
 
 CAMERA = "image_2"
 DRIVE = "drive"
 CALIBRATION = "calibration"
+DEMO = OutputKind("demo", exclusive=(DRIVE,))
 
 MAX_ROTATION_DEG = 0.3
 MAX_TRANSLATION_M = 0.03
@@ -32,22 +33,21 @@ def street(seed: int) -> SimulationConfig:
 
 def run(args: argparse.Namespace) -> int:
     """Simulate, calibrate, compare, write ``args.out``."""
-    check_writable_target(args.out, args.overwrite, owned_by=CALIBRATION)
     config = street(args.seed)
-    with atomic_directory(args.out, args.overwrite, owned_by=CALIBRATION) as folder:
+    with atomic_directory(args.out, args.overwrite, DEMO) as folder:
         with ProgressBar() as progress:
-            write_drive(simulate(config), folder / DRIVE, progress=progress.stage("simulate"))
+            fill_drive(simulate(config), folder / DRIVE, progress=progress.stage("simulate"))
         source = open_source(folder / DRIVE, camera=CAMERA)
         result, against = calibrate_drives([source], source.nominal, 0.0, CalibrationConfig(), CAMERA)
         (folder / CALIBRATION).mkdir()
+        mention(summary(result, against))
         names = write_calibration(folder / CALIBRATION, result, [source], against)
-    print(summary(result, against))
-    print(f"{'wrote':<15} {args.out}/{DRIVE}, {args.out}/{CALIBRATION}: {', '.join(names)}")
+    mention(f"{'wrote':<15} {args.out}/{DRIVE}, {args.out}/{CALIBRATION}: {', '.join(names)}")
     if against is None:
         raise AssertionError("a simulated drive brings its truth")
     faults = over_bounds(against.errors)
     if faults:
-        print(f"sst-graph: demo failed: {', '.join(faults)}", file=sys.stderr)
+        complain(f"demo failed: {', '.join(faults)}")
     return verdict(result) or (3 if faults else 0)
 
 

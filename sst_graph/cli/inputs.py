@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 from typing import Any, TypeVar
 
 import gtsam
 
+from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
-from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.reference import load_initial
 from sst_graph.result import CalibrationResult, read_result
@@ -19,30 +20,25 @@ from sst_graph.types import SemanticClass, Source
 T = TypeVar("T")
 
 
-def open_drive(args: argparse.Namespace, path: Path) -> Source:
-    """The drive at ``path``, read as the data options say."""
-    return open_source(
-        path,
-        loader=args.loader,
-        sequence=args.sequence,
-        frames=args.frames,
-        image_shift=args.image_shift,
-        camera=args.camera,
-        cloud=args.cloud,
-        sweep=args.sweep,
-    )
-
-
 def open_drives(args: argparse.Namespace) -> list[Source]:
     """All drives of DATA, each once.
 
     Raises:
-        ConfigError: a drive is named twice.
+        ConfigError: a drive is given twice, or two have the same name.
     """
-    paths = [path.resolve() for path in args.data]
+    paths = [os.path.realpath(path) for path in args.data]
     if len(set(paths)) != len(paths):
         raise ConfigError("the same DATA is given twice: each drive counts once")
-    return [open_drive(args, path) for path in args.data]
+    sources = [open_drive(args, path) for path in args.data]
+    places: dict[str, Path] = {}
+    for source, path in zip(sources, args.data, strict=True):
+        if source.name in places:
+            raise ConfigError(
+                f"{places[source.name]} and {path}: found two drives named {source.name}, expected names "
+                "that differ (the name is that of the folder and its sequence)"
+            )
+        places[source.name] = path
+    return sources
 
 
 def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose3 | None, float]:
@@ -89,4 +85,9 @@ def chosen_classes(text: str | None) -> list[str] | None:
 
 def result_at(path: Path) -> CalibrationResult:
     """The result in a ``calibration.json`` or in the folder that holds it."""
-    return read_result(path / "calibration.json" if path.is_dir() else path)
+    return read_result(result_file(path))
+
+
+def result_file(path: Path) -> Path:
+    """The ``calibration.json`` that a file or the folder that holds one stands for."""
+    return path / "calibration.json" if path.is_dir() else path

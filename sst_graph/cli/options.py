@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
+from sst_graph.cli.messages import say
 from sst_graph.errors import ConfigError
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsWrite
 
 SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -18,16 +22,21 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise ConfigError(f"{message} (see '{self.prog} --help')")
 
+    def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
+        # Help and version are printed nowhere else; argparse's own passes over a stdout that fails.
+        say(message, end="")
+
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of ``sst-graph`` with all its commands."""
     parser = _Parser(
         prog="sst-graph",
         description="LiDAR-camera calibration without targets, in space and time, as a GTSAM factor graph.",
-        epilog="Exit codes: 0 done; 2 bad input or usage; 3 finished, but the result is not to be trusted "
-        "(the reason is on stderr, the files are written).",
+        epilog="Exit codes: 0 done; 2 bad input or usage, or an output that could not be written; 3 "
+        "finished, but the result is not to be trusted (the reason is on stderr, the files are written); "
+        "130, 143, 129 ended by Ctrl-C, SIGTERM, SIGHUP; 141 the reader of stdout has gone.",
     )
-    parser.add_argument("--version", action="version", version=f"sst-graph {version('sst-graph')}")
+    parser.add_argument("--version", action="version", version=f"sst-graph {_version()}")
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
     )
@@ -45,6 +54,14 @@ def build_parser() -> argparse.ArgumentParser:
         command = add(commands)
         command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
     return parser
+
+
+def _version() -> str:
+    """Of the installed distribution; a checkout on the path has none."""
+    try:
+        return version("sst-graph")
+    except PackageNotFoundError:
+        return "(not installed)"
 
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
@@ -111,6 +128,12 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument(
         "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
+    )
+    calibrate.add_argument(
+        "--estimate",
+        metavar="NAMES",
+        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
+        "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0 beforehand",
     )
     _add_settings(calibrate)
     calibrate.add_argument(
@@ -261,25 +284,36 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     return experiment
 
 
+SOURCE_DEFAULTS: dict[str, str | int | None] = {
+    "loader": "auto",
+    "sequence": None,
+    "frames": None,
+    "camera": "image_2",
+    "cloud": "velodyne",
+    "image_shift": 0,
+    "sweep": "auto",
+}
+"""How a drive is read where neither the command line nor a result says it. The parser leaves these options
+None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
+
+
 def _add_source_options(command: argparse.ArgumentParser) -> None:
     """How a drive is read."""
     source = command.add_argument_group("data")
-    source.add_argument("--loader", default="auto", help="format of the drives: auto (default) or kitti")
+    source.add_argument("--loader", help="format of the drives: auto (default) or kitti")
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
-    source.add_argument("--camera", default="image_2", help="camera folder (default %(default)s)")
-    source.add_argument("--cloud", default="velodyne", help="folder of the scans (default %(default)s)")
+    source.add_argument("--camera", help=f"camera folder (default {SOURCE_DEFAULTS['camera']})")
+    source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
     source.add_argument(
         "--image-shift",
         type=int,
-        default=0,
         metavar="N",
         help="pair scan k with image k+N, stamped as if it were image k: an offset of N frame times",
     )
     source.add_argument(
         "--sweep",
         choices=("auto", "instant", "azimuth"),
-        default="auto",
         help="times of the points: stored ones where there are (auto), all at the stamp, or by azimuth",
     )
 

@@ -1,22 +1,32 @@
-"""What a calibration leaves behind: calibration.json, report.md, overlays, and a verdict on stderr."""
+"""What the commands leave behind: kinds of outputs, a calibration's files, and a verdict on stderr."""
 
 from __future__ import annotations
 
+import itertools
+import os
 import re
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from sst_graph.cli.overlay import png
-from sst_graph.cli.pictures import overlay, telling_positions
+from sst_graph.cli.messages import complain
+from sst_graph.cli.pictures import overlay, png, telling_positions
+from sst_graph.errors import ConfigError
+from sst_graph.files import FileKind, OutputKind
 from sst_graph.metrics import calibration_errors
 from sst_graph.report import Comparison, markdown_report
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
 
-MARKER = "calibration.json"
-"""The file by which a folder is known as ours, and may be replaced."""
+RESULT_NAME = "calibration.json"
+
+CALIBRATION = OutputKind("calibration")
+RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
+CHECKPOINT_FILE = FileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
+PNG_FILE = FileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
+
+_NO_PATHS = ("dataset", "none", "initial")
+"""Choices of ``--init`` and ``--before`` that are no files."""
 
 PICTURES = 3
 """Overlays of a calibration, over all its drives."""
@@ -49,9 +59,9 @@ def write_calibration(
             picture = overlay(source, position, result, _before(result, source))
             (folder / name).write_bytes(png(picture))
             pictures.append(name)
-    (folder / MARKER).write_text(result.to_json(), encoding="utf-8")
+    (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     (folder / "report.md").write_text(markdown_report(result, against, pictures), encoding="utf-8")
-    return [MARKER, "report.md", *pictures]
+    return [RESULT_NAME, "report.md", *pictures]
 
 
 def verdict(result: CalibrationResult) -> int:
@@ -59,8 +69,41 @@ def verdict(result: CalibrationResult) -> int:
     if result.status == "ok":
         return 0
     reasons = "; ".join(result.reasons) or "the result carries no reason"
-    print(f"sst-graph: {result.status}: {' '.join(reasons.split())}", file=sys.stderr)
+    complain(f"{result.status}: {reasons}")
     return 3
+
+
+def check_apart(
+    inputs: Mapping[str, str | Path | None],
+    outputs: Mapping[str, Path | None],
+) -> None:
+    """Refuse outputs that are the same file, or that would replace what is read.
+
+    Args:
+        inputs: what is read, by the name of its option; None and choices that are no paths are passed over.
+        outputs: what is to be written, by the name of its option.
+
+    Raises:
+        ConfigError: two of them are one, or an input lies in a folder that would be replaced.
+    """
+    written = {name: Path(os.path.realpath(path)) for name, path in outputs.items() if path is not None}
+    for (first, a), (second, b) in itertools.combinations(written.items(), 2):
+        if _same(a, b):
+            raise ConfigError(f"{first} and {second}: found the same file {outputs[first]}, expected two")
+    named = {name: path for name, path in inputs.items() if path is not None and path not in _NO_PATHS}
+    read = {name: Path(os.path.realpath(path)) for name, path in named.items()}
+    for (output, a), (given, b) in itertools.product(written.items(), read.items()):
+        if _same(a, b) or a in b.parents:
+            raise ConfigError(
+                f"{output} {outputs[output]}: is read as {given} and would be replaced, expected another name"
+            )
+
+
+def _same(a: Path, b: Path) -> bool:
+    try:
+        return a == b or os.path.samefile(a, b)
+    except OSError:
+        return False
 
 
 def _before(result: CalibrationResult, source: Source) -> Placement | None:

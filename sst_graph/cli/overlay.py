@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import cv2
-import numpy as np
-from numpy.typing import NDArray
-
-from sst_graph.cli.inputs import open_drive, result_at
-from sst_graph.cli.pictures import overlay, position_of
+from sst_graph.cli.inputs import result_at, result_file
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import PNG_FILE, check_apart
+from sst_graph.cli.pictures import overlay, png, position_of
+from sst_graph.cli.reading import open_drive_of
 from sst_graph.errors import ConfigError
-from sst_graph.files import atomic_write_bytes
+from sst_graph.files import output_file
 from sst_graph.reference import load_initial
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
@@ -23,21 +22,16 @@ def run(args: argparse.Namespace) -> int:
     """Write the picture of one frame to ``args.out``."""
     if args.out.suffix.lower() != ".png":
         raise ConfigError(f"--out {args.out}: expected a name that ends in .png")
-    if args.out.exists() and not args.overwrite:
-        raise ConfigError(f"{args.out}: exists already (give --overwrite to replace it)")
-    result = result_at(args.result)
-    source = open_drive(args, args.data)
-    position = len(source) // 2 if args.frame is None else position_of(source, args.frame)
-    before = _before(args.before, result, source)
-    atomic_write_bytes(args.out, png(overlay(source, position, result, before)))
-    print(f"wrote {args.out}: frame {source[position].index} of {source.name}")
+    inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
+    check_apart(inputs, {"--out": args.out})
+    with output_file(args.out, args.overwrite, PNG_FILE) as out:
+        result = result_at(args.result)
+        source = open_drive_of(args, args.data, result, args.result)
+        position = len(source) // 2 if args.frame is None else position_of(source, args.frame)
+        before = _before(args.before, result, source)
+        out.write_bytes(png(overlay(source, position, result, before)))
+    mention(f"wrote {args.out}: frame {source[position].index} of {source.name}")
     return 0
-
-
-def png(picture: NDArray[np.uint8]) -> bytes:
-    """The picture (h, w, 3) BGR as the bytes of a PNG file."""
-    _, data = cv2.imencode(".png", picture)
-    return bytes(data)
 
 
 def _before(choice: str, result: CalibrationResult, source: Source) -> Placement | None:

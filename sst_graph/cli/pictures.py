@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,12 @@ def overlay(
         return after
     start = source[position], source.camera, before.cTl, before.time_offset_s, c_twist, before.caption
     return stacked(draw_overlay(*start), after)
+
+
+def png(picture: NDArray[np.uint8]) -> bytes:
+    """The picture (h, w, 3) BGR as the bytes of a PNG file."""
+    _, data = cv2.imencode(".png", picture)
+    return bytes(data)
 
 
 def _at_true_time(source: Source, position: int, offset_s: float) -> tuple[Frame, bool]:

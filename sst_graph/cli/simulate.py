@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 
 from sst_graph.cli.inputs import settings
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.progress import ProgressBar
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
-from sst_graph.files import check_writable_target
+from sst_graph.data.simulator import DRIVE, SimulationConfig, fill_drive, simulate
+from sst_graph.files import atomic_directory
 
 
 def run(args: argparse.Namespace) -> int:
@@ -21,9 +23,9 @@ def run(args: argparse.Namespace) -> int:
         "rolling": args.rolling,
     }
     config = settings(SimulationConfig(), args, flags)
-    check_writable_target(args.out, args.overwrite, owned_by="sequences")
-    drive = simulate(config)
-    with ProgressBar() as progress:
-        write_drive(drive, args.out, overwrite=args.overwrite, progress=progress.stage("simulate"))
-    print(f"wrote {args.out}: {len(drive)} frames, true time offset {1e3 * config.time_offset_s:+.1f} ms")
+    check_apart({"--config": args.config}, {"OUT": args.out})
+    with atomic_directory(args.out, args.overwrite, DRIVE) as folder, ProgressBar() as progress:
+        drive = simulate(config)
+        fill_drive(drive, folder, progress.stage("simulate"))
+    mention(f"wrote {args.out}: {len(drive)} frames, true time offset {1e3 * config.time_offset_s:+.1f} ms")
     return 0

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
-import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 
-from sst_graph.cli.inputs import chosen_classes, open_drive, settings, starting_point
+from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.messages import complain, say
+from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
+from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
-from sst_graph.files import atomic_write_text
+from sst_graph.files import output_file
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame, Source
 
@@ -22,20 +26,34 @@ from sst_graph.types import Frame, Source
 def run(args: argparse.Namespace) -> int:
     """Track ``args.data``; 0 if the last estimate may be trusted, else 3."""
     _check(args)
-    source = open_drive(args, args.data)
-    tracker = _tracker(args, source)
-    done = tracker.window.last_stamp_ns
-    for number, frame in enumerate(_after(source, done), 1):
-        print(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False), flush=True)
+    with ExitStack() as outputs:
+        out = None
+        if args.out is not None:
+            out = outputs.enter_context(output_file(args.out, args.overwrite, RESULT_FILE))
+        if args.checkpoint is not None:
+            # Taken for the whole run: no other tracker may save there.
+            replace = args.resume or args.overwrite
+            outputs.enter_context(output_file(args.checkpoint, replace, CHECKPOINT_FILE))
+        read_as = options_of(args)
+        source = open_drive(args, args.data)
+        tracker = _tracker(args, source)
+        _track(args, source, tracker)
+        tracker.settle()
+        result = tracker_result(tracker, source.name, args.camera)
+        result = dataclasses.replace(result, read_as=read_as)
+        if out is not None:
+            out.write_text(result.to_json())
+    return _verdict(tracker.current(), result)
+
+
+def _track(args: argparse.Namespace, source: Source, tracker: Tracker) -> None:
+    """Add the frames that the tracker has not seen, and save it as it goes."""
+    for number, frame in enumerate(_after(source, tracker.window.last_stamp_ns), 1):
+        say(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False))
         if args.checkpoint is not None and number % args.checkpoint_every == 0:
             save_checkpoint(tracker, args.checkpoint)
     if args.checkpoint is not None:
         save_checkpoint(tracker, args.checkpoint)
-    tracker.settle()
-    result = tracker_result(tracker, source.name, args.camera)
-    if args.out is not None:
-        atomic_write_text(args.out, result.to_json())
-    return _verdict(tracker.current(), result)
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -45,8 +63,10 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"--checkpoint-every {args.checkpoint_every}: expected 1 or more")
     if args.checkpoint is not None and args.checkpoint.exists() and not (args.resume or args.overwrite):
         raise ConfigError(f"{args.checkpoint}: found a file, expected none (or --resume, or --overwrite)")
-    if args.out is not None and args.out.exists() and not args.overwrite:
-        raise ConfigError(f"{args.out}: found a file, expected none (or --overwrite)")
+    check_apart(
+        {"DATA": args.data, "--init": args.init, "--config": args.config},
+        {"--out": args.out, "--checkpoint": args.checkpoint},
+    )
 
 
 def _tracker(args: argparse.Namespace, source: Source) -> Tracker:
@@ -58,6 +78,7 @@ def _tracker(args: argparse.Namespace, source: Source) -> Tracker:
         return tracker
     default = TrackerConfig()
     config = settings(default, args, {"calibration.classes": chosen_classes(args.classes)})
+    warn_of_other_pairs(args.init, options_of(args))
     initial, offset_s = starting_point(args.init, source, args.camera)
     return Tracker(source.camera, config, initial, offset_s)
 
@@ -75,5 +96,5 @@ def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
     if last.status == "ok":
         return 0
-    print(f"sst-graph: {last.status}: {'; '.join(result.reasons)}", file=sys.stderr)
+    complain(f"{last.status}: {'; '.join(result.reasons)}")
     return 3

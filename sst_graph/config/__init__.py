@@ -16,11 +16,10 @@ Unknown names are refused with the nearest known one.
 from __future__ import annotations
 
 from sst_graph.config.ranges import Bounds, Range, setting
-from sst_graph.config.reading import MAX_FILE_BYTES, from_dict, read_config, with_overrides
+from sst_graph.config.reading import from_dict, read_config, with_overrides
 from sst_graph.config.settings import Settings, settings_fields, to_dict, walk_settings
 
 __all__ = [
-    "MAX_FILE_BYTES",
     "Bounds",
     "Range",
     "Settings",

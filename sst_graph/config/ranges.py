@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Collection
 from typing import Any, Literal, TypedDict, TypeVar, Unpack
 
 T = TypeVar("T")
 
 _UNITS = {
     "deg_per_s": "deg/s",
+    "deg_s": "deg/s",
     "inverse_m": "1/m",
     "mps2": "m/s^2",
     "mps": "m/s",
@@ -33,7 +36,7 @@ class Bounds(TypedDict, total=False):
     less_than: float
     length: tuple[int, int]
     order: Literal["increasing", "decreasing"]
-    choices: tuple[str, ...]
+    choices: Collection[str]
 
 
 def setting(default: T, **bounds: Unpack[Bounds]) -> T:
@@ -68,23 +71,13 @@ class Range:
     open_high: bool = False
     length: tuple[int, int] | None = None
     order: Literal["increasing", "decreasing"] | None = None
-    choices: tuple[str, ...] | None = None
+    choices: Collection[str] | None = None
     unit: str = ""
 
-    @classmethod
-    def of(cls, field: dataclasses.Field[Any]) -> Range:
+    @staticmethod
+    def of(field: dataclasses.Field[Any]) -> Range:
         """The range in the metadata of ``field``, whose keys are those of :class:`Bounds`."""
-        given = field.metadata
-        return cls(
-            low=given.get("more_than", given.get("at_least")),
-            high=given.get("less_than", given.get("at_most")),
-            open_low="more_than" in given,
-            open_high="less_than" in given,
-            length=given.get("length"),
-            order=given.get("order"),
-            choices=given.get("choices"),
-            unit=next((unit for end, unit in _UNITS.items() if field.name.endswith("_" + end)), ""),
-        )
+        return _range_of(field)
 
     def holds(self, number: Any) -> bool:
         """Whether a number is within the bounds."""
@@ -100,3 +93,23 @@ class Range:
         if self.high is not None:
             parts.append(f"{'less than' if self.open_high else 'at most'} {self.high:.10g}")
         return f"{' and '.join(parts)} {self.unit}".strip() if parts else ""
+
+
+@functools.cache
+def _range_of(field: dataclasses.Field[Any]) -> Range:
+    given = field.metadata
+    return Range(
+        low=given.get("more_than", given.get("at_least")),
+        high=given.get("less_than", given.get("at_most")),
+        open_low="more_than" in given,
+        open_high="less_than" in given,
+        length=given.get("length"),
+        order=given.get("order"),
+        choices=given.get("choices"),
+        unit=unit_of(field.name),
+    )
+
+
+def unit_of(name: str) -> str:
+    """The unit that the name of a field ends with; empty without one."""
+    return next((unit for end, unit in _UNITS.items() if name.endswith("_" + end)), "")

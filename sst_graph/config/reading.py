@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import stat
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,11 +13,9 @@ from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
 from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.input_files import SETTINGS, read_json, read_toml
 
 T = TypeVar("T")
-
-MAX_FILE_BYTES = 1_000_000
-"""Largest settings file that is read; every setting written out takes a few ten kB."""
 
 
 def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
@@ -73,21 +69,7 @@ def _read_table(path: Path) -> Mapping[str, Any]:
     """The table in a JSON or TOML file."""
     if path.suffix not in (".json", ".toml"):
         raise DataError(path, f"suffix '{path.suffix}'", ".json or .toml")
-    kind = path.suffix[1:].upper()
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise DataError(path, "no regular file", "a configuration file")
-        if status.st_size > MAX_FILE_BYTES:
-            raise DataError(path, f"{status.st_size} bytes", f"settings of at most {MAX_FILE_BYTES} bytes")
-        text = path.read_text(encoding="utf-8")
-        data = json.loads(text) if kind == "JSON" else tomllib.loads(text)
-    except FileNotFoundError:
-        raise DataError(path, "no such file", "a configuration file") from None
-    except RecursionError:
-        raise DataError(path, "tables or lists nested too deep", f"readable {kind}") from None
-    except (OSError, ValueError) as error:  # ValueError: no UTF-8, no JSON or TOML, endless integers
-        raise DataError(path, (str(error).splitlines() or [""])[0], f"readable {kind}") from error
+    data = read_json(path, SETTINGS) if path.suffix == ".json" else read_toml(path, SETTINGS)
     if not isinstance(data, dict):
         raise DataError(path, type(data).__name__, "a table of settings")
     return data

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from sst_graph.config.ranges import Range
+from sst_graph.config.ranges import Range, unit_of
 from sst_graph.config.values import checked
 from sst_graph.errors import ConfigError, SstGraphError
 
@@ -29,6 +29,20 @@ class Settings:
 
     def __post_init__(self) -> None:
         _check_fields(self)
+
+    def expect_at_most(self, name: str, bound: float, why: str) -> None:
+        """A rule between fields: raise where the field ``name`` is above a bound, which ``why`` explains."""
+        if getattr(self, name) > bound:
+            raise self._outside(name, f"at most {bound:.10g}", why)
+
+    def expect_at_least(self, name: str, bound: float, why: str) -> None:
+        """The same for a field below a bound."""
+        if getattr(self, name) < bound:
+            raise self._outside(name, f"at least {bound:.10g}", why)
+
+    def _outside(self, name: str, bound: str, why: str) -> ConfigError:
+        unit = f" {unit_of(name)}".rstrip()
+        return ConfigError(f"{name}: found {getattr(self, name):.10g}, expected {bound}{unit} ({why})")
 
 
 def _checked_before(own: Callable[[Any], None]) -> Callable[[Any], None]:

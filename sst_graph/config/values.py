@@ -20,9 +20,13 @@ from sst_graph.errors import ConfigError
 
 def checked(hint: Any, value: Any, place: str, limits: Range) -> Any:
     """``value`` in the type ``hint`` and within ``limits``, or a ConfigError that names both."""
+    if hint in (int, float):
+        return _checked_number(hint, value, place, limits)
+    if hint is str:
+        return _checked_text(value, place, limits)
+    if isinstance(hint, type) and not get_args(hint):
+        return _checked_scalar(hint, value, place)
     origin, arguments = get_origin(hint), get_args(hint)
-    if hint is Any:
-        return value
     if origin in (Union, types.UnionType):
         return _checked_union(arguments, value, place, limits)
     if origin is Literal:
@@ -31,11 +35,7 @@ def checked(hint: Any, value: Any, place: str, limits: Range) -> Any:
         raise mismatch(place, value, "one of " + ", ".join(map(str, arguments)))
     if origin in (tuple, list, frozenset):
         return _checked_sequence(hint, value, place, limits)
-    if hint in (int, float):
-        return _checked_number(hint, value, place, limits)
-    if hint is str:
-        return _checked_text(value, place, limits)
-    return _checked_scalar(hint, value, place)
+    return value
 
 
 def _checked_union(arguments: tuple[Any, ...], value: Any, place: str, limits: Range) -> Any:
@@ -74,6 +74,8 @@ def _checked_sequence(hint: Any, value: Any, place: str, limits: Range) -> Any:
 
 
 def _checked_number(hint: type, value: Any, place: str, limits: Range) -> int | float:
+    if hint is float and isinstance(value, float) and limits.holds(value) and math.isfinite(value):
+        return float(value)
     kind = numbers.Integral if hint is int else numbers.Real
     words = "a whole number" if hint is int else "a number"
     if isinstance(value, bool) or not isinstance(value, kind):

@@ -9,9 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
+from sst_graph.input_files import FileKind, read_file
+
+MAX_POINTS = 10_000_000
+"""Points of a scan: a sweep of the densest spinning scanners has under one million. This many take 160 MB."""
+
+SCAN = FileKind("a cloud of x y z r in float32", 16 * MAX_POINTS)
+LABELS = FileKind("labels, one uint32 a point", 4 * MAX_POINTS)
+POINT_TIMES = FileKind("times, one float32 a point", 4 * MAX_POINTS)
 
 MAX_COORDINATE_M = 10_000.0
 """Coordinates beyond this [m] mean that the file holds something else than metres in float32."""
+
+
+def listed(folder: Path, expected: str) -> list[Path]:
+    """Entries of a folder, sorted.
+
+    Raises:
+        DataError: no folder, or one that cannot be listed.
+    """
+    try:
+        return sorted(folder.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        raise DataError(folder, "no folder", expected) from None
+    except OSError as error:
+        raise DataError(folder, f"an unreadable folder ({error.strerror})", expected) from None
 
 
 def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
@@ -22,12 +44,7 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
             with one number.
     """
     expected = f"files 000000{suffixes[0]}, 000001{suffixes[0]}, ..."
-    if not folder.is_dir():
-        raise DataError(folder, "no folder", expected)
-    try:
-        entries = sorted(folder.iterdir())
-    except OSError as error:
-        raise DataError(folder, f"an unreadable folder ({error.strerror})", expected) from None
+    entries = listed(folder, expected)
     files: dict[int, Path] = {}
     for path in entries:
         if path.suffix.lower() not in suffixes or not path.stem.isdecimal():
@@ -40,35 +57,21 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     return dict(sorted(files.items()))
 
 
-def read_bytes(path: Path) -> bytes:
-    """Contents of a file.
-
-    Raises:
-        DataError: it is missing or cannot be read.
-    """
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise DataError(path, "no file", "a file") from None
-    except OSError as error:
-        raise DataError(path, f"an unreadable file ({error.strerror})", "a readable file") from None
-
-
 def read_points(path: Path) -> NDArray[np.float32]:
     """Points (n, 3) float32 [m] of a KITTI cloud: x y z reflectance, float32 little-endian.
 
+    Points that are NaN or inf, as drivers give for beams without a return, are left in: they have labels.
+
     Raises:
-        DataError: a missing or truncated file, NaN or inf in a coordinate, or one that is no length.
+        DataError: a missing or truncated file, one of more than MAX_POINTS points, or a coordinate that is
+            no length.
     """
-    values = _values(read_bytes(path), path, "<f4", 4, "x y z r in float32")
+    values = _values(read_file(path, SCAN), path, "<f4", 4, "x y z r in float32")
     points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
-        bad = np.flatnonzero(~finite)
-        raise DataError(path, f"{len(bad)} points with NaN or inf, first at index {bad[0]}", "finite points")
-    if len(points) and float(np.abs(points).max()) > MAX_COORDINATE_M:
-        k = int(np.argmax(np.abs(points).max(axis=1)))
-        found = f"a coordinate of {float(np.abs(points[k]).max()):.3g} m at index {k}"
+    lengths = np.abs(np.where(np.isfinite(points), points, 0.0))
+    if len(points) and float(lengths.max()) > MAX_COORDINATE_M:
+        k = int(np.argmax(lengths.max(axis=1)))
+        found = f"a coordinate of {float(lengths[k].max()):.3g} m at index {k}"
         raise DataError(path, found, f"metres in float32, at most {MAX_COORDINATE_M:g}")
     return points
 
@@ -79,21 +82,24 @@ def read_labels(path: Path, count: int) -> NDArray[np.uint32]:
     Raises:
         DataError: a missing or truncated file, or another number of labels than points.
     """
-    labels = _values(read_bytes(path), path, "<u4", 1, "one uint32 a point")
+    labels = _values(read_file(path, LABELS), path, "<u4", 1, "one uint32 a point")
     _check_count(path, len(labels), count, "labels")
     return labels
 
 
-def read_offsets(path: Path, count: int) -> NDArray[np.float32]:
-    """Per-point times (n,) float32 [s], relative to the scan's stamp, for ``count`` points.
+def read_offsets(path: Path, used: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Per-point times (n,) float32 [s], relative to the scan's stamp.
+
+    Args:
+        used: (n,) False for points that are left out, whose times may be anything.
 
     Raises:
         DataError: a missing or truncated file, another number of times than points, a time that
             is not finite or lies more than a second from the stamp.
     """
-    offsets = _values(read_bytes(path), path, "<f4", 1, "one float32 a point")
-    _check_count(path, len(offsets), count, "times")
-    bad = np.flatnonzero(~(np.abs(offsets) <= 1.0))
+    offsets = _values(read_file(path, POINT_TIMES), path, "<f4", 1, "one float32 a point")
+    _check_count(path, len(offsets), len(used), "times")
+    bad = np.flatnonzero(used & ~(np.abs(offsets) <= 1.0))
     if len(bad):
         found = f"{len(bad)} times that are NaN or beyond 1 s, first at index {bad[0]}"
         raise DataError(path, found, "seconds relative to the scan's stamp")

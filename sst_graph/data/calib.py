@@ -16,43 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.checked import checked_camera, checked_pose
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.input_files import CALIB_TXT, read_text
 
 FloatArray = NDArray[np.float64]
 
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R^T R - I that is put down to rounding in a file."""
-
-
-def rotation_from(matrix: FloatArray, place: str | Path) -> gtsam.Rot3:
-    """Rotation nearest to a (3, 3) matrix that is one but for rounding.
-
-    Raises:
-        DataError: not finite, not orthonormal within :data:`ROTATION_TOLERANCE`, or a reflection.
-    """
-    if not np.isfinite(matrix).all():
-        raise DataError(place, "a matrix with NaN or inf", "a rotation")
-    error = float(np.abs(matrix.T @ matrix - np.eye(3)).max())
-    if error > ROTATION_TOLERANCE:
-        raise DataError(place, f"a matrix with |R^T R - I| up to {error:.3g}", "a rotation (orthonormal)")
-    if np.linalg.det(matrix) < 0:
-        raise DataError(place, "a reflection (determinant -1)", "a rotation (determinant +1)")
-    return gtsam.Rot3.ClosestTo(matrix)
+MAX_ENTRY = 1e12
+"""Of a projection matrix [px]: beyond it, or its inverse as a focal length, products overflow."""
 
 
 def pose_from(matrix: FloatArray, place: str | Path) -> gtsam.Pose3:
     """Pose of a (3, 4) or (4, 4) matrix [R t; 0 0 0 1], t in [m].
 
     Raises:
-        DataError: another shape, another last row, no rotation, or a translation that is not finite.
+        DataError: another shape, another last row, no rotation, or a translation that is none between two
+            sensors.
     """
-    if matrix.shape not in ((3, 4), (4, 4)):
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
         raise DataError(place, f"an array of shape {matrix.shape}", "(3, 4) or (4, 4)")
-    if matrix.shape == (4, 4) and not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise DataError(place, f"last row {matrix[3].tolist()}", "0 0 0 1")
-    if not np.isfinite(matrix[:3]).all():
-        raise DataError(place, "a matrix with NaN or inf", "a rigid transform")
-    return gtsam.Pose3(rotation_from(matrix[:3, :3], place), matrix[:3, 3])
+    return checked_pose(matrix, str(place))
 
 
 @dataclass(frozen=True)
@@ -84,8 +69,9 @@ class KittiCalibration:
             raise DataError(self.path, f"no line P{number}", f"the projection matrix of {camera}")
         P = self.projections[number]
         pinhole = (
-            P[0, 0] > 0
-            and P[1, 1] > 0
+            np.abs(P).max() < MAX_ENTRY
+            and P[0, 0] > 1.0 / MAX_ENTRY
+            and P[1, 1] > 1.0 / MAX_ENTRY
             and np.allclose([P[0, 1], P[1, 0]], 0.0, atol=1e-6 * P[0, 0])
             and np.allclose(P[2, :3], [0.0, 0.0, 1.0], atol=1e-9)
         )
@@ -94,16 +80,25 @@ class KittiCalibration:
         return P
 
     def camera(self, name: str, width: int, height: int) -> PinholeCamera:
-        """Intrinsics of camera ``name`` with an image of width x height [px]."""
+        """Intrinsics of camera ``name`` with an image of width x height [px].
+
+        Raises:
+            DataError: as :meth:`projection`, or intrinsics that do not go with the image's size.
+        """
         P = self.projection(name)
-        return PinholeCamera(
-            float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2]), width=width, height=height
-        )
+        fx, fy, cx, cy = float(P[0, 0]), float(P[1, 1]), float(P[0, 2]), float(P[1, 2])
+        camera = PinholeCamera(fx, fy, cx, cy, width=width, height=height)
+        return checked_camera(camera, f"{self.path} (P of {name})")
 
     def cTc0(self, camera: str) -> gtsam.Pose3:
-        """Pose of the rectified camera 0 in ``camera``: [I | K^-1 P[:, 3]]."""
+        """Pose of the rectified camera 0 in ``camera``: [I | K^-1 P[:, 3]].
+
+        Raises:
+            DataError: as :meth:`projection`, or cameras that do not stand on one vehicle.
+        """
         P = self.projection(camera)
-        return gtsam.Pose3(gtsam.Rot3(), np.linalg.solve(P[:, :3], P[:, 3]))
+        shift = np.linalg.solve(P[:, :3], P[:, 3])
+        return pose_from(np.column_stack([np.eye(3), shift]), f"{self.path} (shift of {camera})")
 
     def cTl(self, camera: str) -> gtsam.Pose3:
         """Pose of the LiDAR in ``camera``."""
@@ -117,12 +112,7 @@ def read_calibration(path: Path) -> KittiCalibration:
         DataError: a missing file, a line with the wrong number of values or a value that is no
             finite number, no line Tr, or a Tr whose rotation is none.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError(path, "no file", "KITTI calib.txt with lines P0..P3 and Tr") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, f"an unreadable file ({type(error).__name__})", "KITTI calib.txt") from None
+    text = read_text(path, CALIB_TXT)
     matrices: dict[str, FloatArray] = {}
     for number, line in enumerate(text.splitlines(), 1):
         name, colon, values = line.partition(":")
@@ -140,8 +130,17 @@ def _matrix(words: list[str], name: str, place: str) -> FloatArray:
         raise DataError(place, f"{len(words)} values for {name}", "12")
     try:
         values = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise DataError(place, f"{name}: {error}", "12 numbers") from None
+    except ValueError:
+        wrong = next(word for word in words if not _is_number(word))
+        raise DataError(place, f"{wrong!r:.60} in {name}", "12 numbers") from None
     if not np.isfinite(values).all():
         raise DataError(place, f"NaN or inf in {name}", "12 finite numbers")
     return values.reshape(3, 4)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

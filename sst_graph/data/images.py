@@ -1,9 +1,11 @@
-"""Reading of pictures, semantic masks and instance masks, refusing files that are not whole."""
+"""Reading of pictures, semantic masks and instance masks, refusing files that are not whole.
+
+The size that a file declares is compared with what is expected before anything is decoded, so that no memory
+is taken for a wrong one.
+"""
 
 from __future__ import annotations
 
-import struct
-import zlib
 from pathlib import Path
 from typing import Any
 
@@ -11,30 +13,59 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.arrays import read_bytes
+from sst_graph.data.decoder_output import decoder_output
+from sst_graph.data.image_header import check_whole, image_size
 from sst_graph.errors import DataError
+from sst_graph.input_files import FileKind, read_file
 
-_PNG = b"\x89PNG\r\n\x1a\n"
-_JPEG = b"\xff\xd8\xff"
+IMAGE = FileKind("a PNG or JPEG file", 128 * 1024 * 1024)
+
+MAX_PIXELS = 50_000_000
+"""Pixels of an image; a picture of 8K video has 33 million. As 16-bit RGBA this many take 0.4 GB."""
+
+Size = tuple[int, int]
+"""Width, height [px]."""
+
+_PADDING = "extraneous bytes before marker 0xd9"
+"""What libjpeg says of padding before the end, as some cameras write it: no pixel is missing."""
 
 
-def read_picture(path: Path) -> NDArray[np.uint8]:
+def picture_size(path: Path) -> Size:
+    """Width and height [px] by the header of a PNG or JPEG file; nothing is decoded.
+
+    Raises:
+        DataError: a missing file, no PNG or JPEG, or more than MAX_PIXELS.
+    """
+    return _checked_size(read_file(path, IMAGE), path, None)
+
+
+def read_picture(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     """Picture (h, w, 3) uint8 BGR of a PNG or JPEG file, grey ones repeated in the channels.
 
+    Rows and columns are those of the sensor: an orientation tag is not followed, as intrinsics and masks do
+    not follow it either.
+
+    Args:
+        size: width and height that it must have [px]; None: any.
+
     Raises:
-        DataError: a missing, truncated or damaged file.
+        DataError: a missing, truncated or damaged file, or one of another size.
     """
-    return _decode(path, cv2.IMREAD_COLOR).astype(np.uint8, copy=False)
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    return _decode(path, flags, size).astype(np.uint8, copy=False)
 
 
-def read_mask(path: Path) -> NDArray[np.uint8]:
+def read_mask(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     """Mask (h, w) uint8 of a PNG file; several channels or 16 bits only where nothing is lost.
 
+    Args:
+        size: width and height that it must have [px]; None: any.
+
     Raises:
-        DataError: a missing, truncated or damaged file, channels that differ (a coloured mask),
-            values that do not fit into 8 bits.
+        DataError: a missing, truncated or damaged file, one of another size, channels that differ (a
+            coloured mask), values that do not fit into 8 bits.
     """
-    mask = _single_channel(path)
+    mask = _single_channel(path, size)
     if mask.dtype != np.uint8:
         if int(mask.max(initial=0)) > 255:
             raise DataError(path, f"{mask.dtype} values up to {mask.max()}", "8-bit class numbers")
@@ -42,30 +73,22 @@ def read_mask(path: Path) -> NDArray[np.uint8]:
     return mask
 
 
-def read_instances(path: Path) -> NDArray[np.uint16]:
+def read_instances(path: Path, size: Size | None = None) -> NDArray[np.uint16]:
     """Instances (h, w) uint16 of a PNG file with class * 256 + instance; 0: none.
 
+    Args:
+        size: width and height that it must have [px]; None: any.
+
     Raises:
-        DataError: a missing, truncated or damaged file, or channels that differ.
+        DataError: a missing, truncated or damaged file, one of another size, or channels that differ.
     """
-    values = _single_channel(path).astype(np.uint16)
+    values = _single_channel(path, size).astype(np.uint16)
     instances: NDArray[np.uint16] = np.where(values < 256, 0, values % 256).astype(np.uint16)
     return instances
 
 
-def check_size(path: Path, shape: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Require an image's shape (h, w, ...) to begin with the expected (h, w).
-
-    Raises:
-        DataError: another size.
-    """
-    if shape[:2] != expected[:2]:
-        wanted = f"{expected[1]}x{expected[0]} px, as the first image"
-        raise DataError(path, f"{shape[1]}x{shape[0]} px", wanted)
-
-
-def _single_channel(path: Path) -> NDArray[Any]:
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+def _single_channel(path: Path, size: Size | None) -> NDArray[Any]:
+    image = _decode(path, cv2.IMREAD_UNCHANGED, size)
     if image.ndim == 3:
         channels = image[:, :, :3]
         if (channels != channels[:, :, :1]).any():
@@ -74,40 +97,39 @@ def _single_channel(path: Path) -> NDArray[Any]:
     return np.ascontiguousarray(image)
 
 
-def _decode(path: Path, flags: int) -> NDArray[Any]:
-    data = read_bytes(path)
-    _check_whole(path, data)
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:
-        image = None
+def _decode(path: Path, flags: int, size: Size | None) -> NDArray[Any]:
+    data = read_file(path, IMAGE)
+    width, height = _checked_size(data, path, size)
+    check_whole(data, path)
+    with decoder_output() as complaints:
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except cv2.error:
+            image = None
     if image is None:
         raise DataError(path, "an image that does not decode", "a whole PNG or JPEG file")
+    damage = [line for line in complaints if _tells_damage(line)]
+    if damage:
+        raise DataError(path, f"a damaged image ({damage[0]})", "a whole PNG or JPEG file")
     decoded: NDArray[Any] = np.asarray(image)
+    if decoded.shape[:2] != (height, width):
+        found = f"{decoded.shape[1]}x{decoded.shape[0]} px"
+        raise DataError(path, found, f"{width}x{height} px, as its header says")
     return decoded
 
 
-def _check_whole(path: Path, data: bytes) -> None:
-    """Find truncation and damage that decoders pass over in silence, leaving grey areas."""
-    if data.startswith(_PNG):
-        _check_png_chunks(path, data)
-    elif data.startswith(_JPEG):
-        if b"\xff\xd9" not in data[-64:]:
-            raise DataError(path, "a truncated JPEG file", "an end-of-image marker")
-    else:
-        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", "a PNG or JPEG file")
+def _tells_damage(line: str) -> bool:
+    """Whether a decoder's line tells that pixels are missing or wrong; libpng warns of much besides."""
+    if line.startswith("libpng warning"):
+        return "IDAT" in line
+    return line.startswith(("libpng", "Corrupt", "Premature", "Inconsistent")) and _PADDING not in line
 
 
-def _check_png_chunks(path: Path, data: bytes) -> None:
-    at = len(_PNG)
-    while at + 12 <= len(data):
-        (length,) = struct.unpack_from(">I", data, at)
-        end = at + 12 + length
-        if end > len(data):
-            break
-        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            raise DataError(path, f"a damaged PNG chunk at byte {at}", "one that fits its checksum")
-        if data[at + 4 : at + 8] == b"IEND":
-            return
-        at = end
-    raise DataError(path, f"a PNG file truncated at byte {len(data)}", "its last chunk IEND")
+def _checked_size(data: bytes, path: Path, expected: Size | None) -> Size:
+    width, height = image_size(data, path)
+    if expected is not None and (width, height) != expected:
+        wanted = f"{expected[0]}x{expected[1]} px, as the first image"
+        raise DataError(path, f"{width}x{height} px", wanted)
+    if width * height > MAX_PIXELS:
+        raise DataError(path, f"{width}x{height} px", f"at most {MAX_PIXELS} pixels")
+    return width, height

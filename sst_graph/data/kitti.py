@@ -3,10 +3,15 @@
 Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``, ``velodyne``, ``labels``,
 ``image_2`` and ``semantic_2``; where present also ``instance_2`` (uint16, class * 256 + instance),
 ``velodyne_times`` (float32 seconds relative to the stamp, one a point) and ``groundtruth.json``.
+
+Some labels, masks and pictures may be missing: where nothing is labelled nothing is associated, and an image
+without its picture has no features. Points that are NaN or inf are left out and counted.
 """
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,14 +25,16 @@ from factors.camera import PinholeCamera
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
 from sst_graph.data.arrays import read_labels, read_offsets, read_points
 from sst_graph.data.calib import read_calibration
-from sst_graph.data.images import check_size, read_instances, read_mask, read_picture
+from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
 from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
 from sst_graph.data.kitti_truth import drive_truth
 from sst_graph.data.scan_order import rings_from_order, sweep_offsets_s
 from sst_graph.data.source import Loader, SourceOptions, Sweep
-from sst_graph.errors import ConfigError
+from sst_graph.errors import ConfigError, printable
 from sst_graph.timestamps import read_times
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, GroundTruth, Scan, SemanticClass
+
+_LOG = logging.getLogger(__name__)
 
 _MASKS_TO_JUDGE = 8
 """How many masks, spread over the drive, decide on their encoding."""
@@ -75,7 +82,7 @@ class KittiSource:
         """Frame at a position (read from disk), or the drive restricted to a slice of positions.
 
         Raises:
-            DataError: a file of the frame is missing, truncated or holds what it must not.
+            DataError: a file of the frame is truncated, damaged or holds what it must not.
             IndexError: no frame at this position.
         """
         if isinstance(position, slice):
@@ -91,42 +98,64 @@ class KittiSource:
         if path is None:
             return None
         points = read_points(path)
-        labels_path = self.files.labels[index]
-        labels = read_labels(labels_path, len(points))
-        classes, instances = classes_of_points(labels, labels_path)
+        # Beams without a return come as NaN from many drivers.
+        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        classes, instances = self._labels(index, used)
+        offsets_s = self._offsets(index, points, used)
+        points = np.ascontiguousarray(points[used])
         return Scan(
             stamp_ns=int(self.stamps_ns[index]),
             points=points,
             classes=classes,
             instances=instances,
-            offsets_s=self._offsets(index, points),
+            offsets_s=None if offsets_s is None else offsets_s[used],
             rings=rings_from_order(points),
+            left_out=len(used) - len(points),
         )
 
-    def _offsets(self, index: int, points: NDArray[np.float32]) -> NDArray[np.float32] | None:
+    def _labels(self, index: int, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """Classes and instances of a scan's used points; where it has no labels they may be anything."""
+        path = self.files.labels.get(index)
+        if path is None:
+            count = int(used.sum())
+            return np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
+        return classes_of_points(read_labels(path, len(used))[used], path)
+
+    def _offsets(
+        self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
+    ) -> NDArray[np.float32] | None:
         if self.sweep == "azimuth":
             return sweep_offsets_s(points, float(np.median(np.diff(self.stamps_ns))) * 1e-9)
         if self.sweep == "auto" and self.files.point_times is not None:
-            return read_offsets(self.files.point_times[index], len(points))
+            return read_offsets(self.files.point_times[index], used)
         return None
 
     def _image(self, index: int) -> CameraImage | None:
         number = index + self.image_shift
-        path = self.files.images.get(number)
-        if path is None:
+        if number not in self.files.image_numbers:
             return None
-        size = (self.camera.height, self.camera.width)
-        pixels = read_picture(path)
-        check_size(path, pixels.shape, size)
-        mask_path = self.files.masks[number]
-        mask = read_mask(mask_path)
-        check_size(mask_path, mask.shape, size)
-        instances = None
-        if self.files.instances is not None:
-            instances = read_instances(self.files.instances[number])
-            check_size(self.files.instances[number], instances.shape, size)
-        stamp_ns = int(self.stamps_ns[index])
-        return CameraImage(stamp_ns, classes_of_mask(mask, self.encoding, mask_path), pixels, instances)
+        return CameraImage(
+            stamp_ns=int(self.stamps_ns[index]),
+            mask=self._mask(self.files.masks.get(number)),
+            pixels=self._pixels(self.files.images.get(number)),
+            instances=self._instances(self.files.instances.get(number)),
+        )
+
+    @property
+    def _size(self) -> tuple[int, int]:
+        return self.camera.width, self.camera.height
+
+    def _mask(self, path: Path | None) -> NDArray[np.uint8]:
+        """Classes (h, w); where there is no mask every pixel may be anything."""
+        if path is None:
+            return np.full((self.camera.height, self.camera.width), SemanticClass.IGNORE, np.uint8)
+        return classes_of_mask(read_mask(path, self._size), self.encoding, path)
+
+    def _pixels(self, path: Path | None) -> NDArray[np.uint8]:
+        return NO_PICTURE if path is None else read_picture(path, self._size)
+
+    def _instances(self, path: Path | None) -> NDArray[np.uint16] | None:
+        return None if path is None else read_instances(path, self._size)
 
 
 def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
@@ -144,12 +173,14 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
     if options.sweep == "azimuth" and len(stamps_ns) < 2:
         raise ConfigError("sweep 'azimuth': the period of a turn needs two stamps or more")
     indices = _select(files, options, len(stamps_ns))
-    height, width = read_picture(next(iter(files.images.values()))).shape[:2]
+    size = picture_size(next(iter(files.images.values())))
+    if missing := files.missing():
+        _LOG.info("%s: %s", printable(folder), missing)
     truth, is_reference = drive_truth(folder, calibration, options.camera)
-    pairs = [k for k in indices if k in files.scans and k + options.image_shift in files.images]
+    pairs = [k for k in indices if k in files.scans and k + options.image_shift in files.image_numbers]
     return KittiSource(
         name=_name(folder),
-        camera=calibration.camera(options.camera, width, height),
+        camera=calibration.camera(options.camera, *size),
         nominal=nominal,
         truth=_shifted(truth, stamps_ns, pairs, options.image_shift),
         truth_is_reference=is_reference,
@@ -157,7 +188,7 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
         stamps_ns=stamps_ns,
         indices=indices,
         image_shift=options.image_shift,
-        encoding=_encoding(files, options),
+        encoding=_encoding(files, options, size),
         sweep=options.sweep,
     )
 
@@ -169,8 +200,8 @@ def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int,
     if first >= count or last > count:
         raise ConfigError(f"frames {first}:{last}: the drive has frames 0:{count}")
     shift = options.image_shift
-    indices = tuple(k for k in range(first, last) if k in files.scans or k + shift in files.images)
-    if not any(k in files.scans and k + shift in files.images for k in indices):
+    indices = tuple(k for k in range(first, last) if k in files.scans or k + shift in files.image_numbers)
+    if not any(k in files.scans and k + shift in files.image_numbers for k in indices):
         raise ConfigError(f"frames {first}:{last} with image shift {shift}: no scan is left with an image")
     return indices
 
@@ -184,19 +215,18 @@ def _shifted(truth: GroundTruth, stamps_ns: NDArray[np.int64], pairs: list[int],
     return replace(truth, time_offset_s=truth.time_offset_s + seconds)
 
 
-def _encoding(files: KittiFiles, options: SourceOptions) -> MaskEncoding:
+def _encoding(files: KittiFiles, options: SourceOptions, size: tuple[int, int]) -> MaskEncoding:
     if options.label_encoding != "auto":
         return MaskEncoding(options.label_encoding)
     paths = list(files.masks.values())
     chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
-    return guess_mask_encoding(map(read_mask, [paths[k] for k in chosen]), paths[0].parent)
+    return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
 
 
 def _name(folder: Path) -> str:
-    folder = folder.resolve()
-    if folder.parent.name == "sequences":
-        return f"{folder.parent.parent.name}/{folder.name}"
-    return folder.name
+    folder = Path(os.path.realpath(folder))
+    sequence = folder.parent.name == "sequences"
+    return printable(f"{folder.parent.parent.name}/{folder.name}" if sequence else folder.name)
 
 
 KITTI_LOADER = Loader(recognizes=is_kitti, open=open_kitti, layout=LAYOUT)

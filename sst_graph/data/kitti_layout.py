@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
-from sst_graph.data.arrays import numbered_files
+from sst_graph.data.arrays import listed, numbered_files
 from sst_graph.errors import ConfigError, DataError
 
 LAYOUT = "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, labels, image_2, semantic_2"
@@ -16,13 +18,15 @@ _PICTURES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class KittiFiles:
-    """Paths of a drive by frame number. Every scan has labels, every image a mask.
+    """Paths of a drive by frame number; some labels, pictures and masks may be missing.
 
     Attributes:
-        scans, labels: point clouds and their labels.
+        scans: point clouds.
+        labels: of the scans that have them.
         point_times: per-point times of every scan, or None.
-        images, masks: pictures and their semantic masks.
-        instances: instance masks of every image, or None.
+        images: pictures.
+        masks: semantic masks, of the same or of other numbers.
+        instances: instance masks; empty where there is no folder of them.
     """
 
     scans: Mapping[int, Path]
@@ -30,7 +34,23 @@ class KittiFiles:
     point_times: Mapping[int, Path] | None
     images: Mapping[int, Path]
     masks: Mapping[int, Path]
-    instances: Mapping[int, Path] | None
+    instances: Mapping[int, Path]
+
+    @cached_property
+    def image_numbers(self) -> frozenset[int]:
+        """Numbers that have a picture or a mask."""
+        return frozenset(self.images) | frozenset(self.masks)
+
+    def missing(self) -> str:
+        """What is missing, in words and numbers; empty where nothing is."""
+        owners = (
+            ("scans without labels", set(self.scans) - set(self.labels)),
+            ("labels without a scan", set(self.labels) - set(self.scans)),
+            ("pictures without a mask", set(self.images) - set(self.masks)),
+            ("masks without a picture", set(self.masks) - set(self.images)),
+        )
+        found = (f"{len(lonely)} {what} (first: {min(lonely)})" for what, lonely in owners if lonely)
+        return ", ".join(found)
 
 
 def is_kitti(path: Path) -> bool:
@@ -50,10 +70,11 @@ def find_sequence(path: Path, sequence: str | None) -> Path:
             raise DataError(path, "no folder", LAYOUT)
         if not _is_sequence(path):
             raise DataError(path, "neither a folder sequences nor calib.txt", LAYOUT)
-        if sequence not in (None, path.resolve().name):
+        if sequence not in (None, Path(os.path.realpath(path)).name):
             raise ConfigError(f"sequence {sequence!r}: {path} is itself the folder of a sequence")
         return path
-    names = sorted(entry.name for entry in (path / "sequences").iterdir() if entry.is_dir())
+    folders = listed(path / "sequences", "folders 00, 01, ...")
+    names = [entry.name for entry in folders if entry.is_dir()]
     if not names:
         raise DataError(path / "sequences", "an empty folder", "folders 00, 01, ...")
     if sequence is None:
@@ -69,13 +90,13 @@ def find_sequence(path: Path, sequence: str | None) -> Path:
 def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles:
     """Files of a sequence, checked against each other and against the number of stamps.
 
-    A number that has neither a scan nor labels is a gap, and so is one with neither image nor mask;
-    one without the other is an error. Labels may go on after the last scan of another
-    ``cloud`` than "velodyne".
+    A number that has neither a scan nor labels is a gap, and so is one with neither image nor mask. What
+    has lost its partner is left to :meth:`KittiFiles.missing`. Labels may go on after the last scan of
+    another ``cloud`` than "velodyne".
 
     Raises:
-        DataError: an empty or missing folder, a file without its partner, more or fewer frames
-            than stamps.
+        DataError: an empty or missing folder, a scan without its times, more or fewer frames than stamps,
+            no scan with labels, no picture with a mask.
         ConfigError: the camera's name is not of the form image_N.
     """
     if not camera.startswith("image_"):
@@ -84,20 +105,20 @@ def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles
     labels = numbered_files(folder / "labels", (".label",))
     images = numbered_files(folder / camera, _PICTURES)
     masks = numbered_files(folder / camera.replace("image", "semantic"), (".png",))
-    frames = max(*scans, *images) + 1
+    frames = max(*scans, *images, *masks) + 1
     if frames != stamps:
         raise DataError(folder / "times.txt", f"{stamps} stamps", f"{frames}, as there are frames")
     if cloud != "velodyne":
         labels = {k: path for k, path in labels.items() if k <= max(scans)}
-    _check_partners(scans, labels, folder / "labels")
-    _check_partners(images, masks, folder / camera.replace("image", "semantic"))
+    _check_some_partner(scans, labels, folder / "labels")
+    _check_some_partner(images, masks, folder / camera.replace("image", "semantic"))
     return KittiFiles(
         scans=scans,
         labels=labels,
-        point_times=_optional(folder / f"{cloud}_times", (".bin",), scans),
+        point_times=_point_times(folder / f"{cloud}_times", scans),
         images=images,
         masks=masks,
-        instances=_optional(folder / camera.replace("image", "instance"), (".png",), images),
+        instances=_optional(folder / camera.replace("image", "instance"), (".png",)),
     )
 
 
@@ -105,22 +126,23 @@ def _is_sequence(path: Path) -> bool:
     return (path / "calib.txt").is_file() or (path / "velodyne").is_dir()
 
 
-def _optional(folder: Path, suffixes: tuple[str, ...], owners: Mapping[int, Path]) -> dict[int, Path] | None:
-    """Files of a folder that need not be there, but if so then for every owner."""
+def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files of a folder that need not be there."""
+    return numbered_files(folder, suffixes) if folder.is_dir() else {}
+
+
+def _point_times(folder: Path, scans: Mapping[int, Path]) -> dict[int, Path] | None:
+    """Times of the points, which need not be there, but if so then of every scan: no other tells them."""
     if not folder.is_dir():
         return None
-    files = numbered_files(folder, suffixes)
-    lonely = sorted(set(owners) - set(files))
+    files = numbered_files(folder, (".bin",))
+    lonely = sorted(set(scans) - set(files))
     if lonely:
-        raise DataError(folder, f"no file for frame {lonely[0]}", f"one for each of {len(owners)} frames")
+        raise DataError(folder, f"no file for frame {lonely[0]}", f"one for each of {len(scans)} frames")
     return files
 
 
-def _check_partners(owners: Mapping[int, Path], partners: Mapping[int, Path], folder: Path) -> None:
-    lonely = sorted(set(owners) - set(partners))
-    if lonely:
-        raise DataError(folder, f"no file for frame {lonely[0]}", f"a partner of {owners[lonely[0]]}")
-    lonely = sorted(set(partners) - set(owners))
-    if lonely:
-        home = next(iter(owners.values())).parent
-        raise DataError(home, f"no file for frame {lonely[0]}", f"a partner of {partners[lonely[0]]}")
+def _check_some_partner(owners: Mapping[int, Path], partners: Mapping[int, Path], folder: Path) -> None:
+    if not set(owners) & set(partners):
+        first = next(iter(owners.values()))
+        raise DataError(folder, "no file with the number of one beside it", f"a partner of {first}")

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
-import math
+import os
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from sst_graph.data.arrays import read_bytes
 from sst_graph.data.calib import KittiCalibration, pose_from
 from sst_graph.errors import DataError
+from sst_graph.input_files import GROUND_TRUTH, read_json
+from sst_graph.json_table import JsonTable
 from sst_graph.types import GroundTruth
 
 _FILE = "groundtruth.json"
@@ -29,28 +26,17 @@ def drive_truth(folder: Path, calibration: KittiCalibration, camera: str) -> tup
         DataError: a file that is no such JSON.
     """
     path = folder / _FILE
-    if not path.is_file():
+    if not os.path.lexists(path):
         return GroundTruth(calibration.cTl(camera), 0.0), True
-    values = _parse(path)
-    offset_s = values.get("time_offset_s")
-    if offset_s is not None and not (isinstance(offset_s, int | float) and math.isfinite(offset_s)):
-        raise DataError(path, f"time_offset_s {offset_s!r}", "seconds, or null")
-    try:
-        matrix = np.array(values["T_camera_lidar"], dtype=np.float64)
-    except (KeyError, TypeError, ValueError):
-        raise DataError(path, "no numeric T_camera_lidar", _EXPECTED) from None
+    values = read_json(path, GROUND_TRUTH)
+    if not isinstance(values, dict):
+        raise DataError(path, f"a JSON {type(values).__name__}", _EXPECTED)
+    table = JsonTable(values, str(path))
+    offset_s = None if values.get("time_offset_s") is None else table.offset_s("time_offset_s")
+    rows = values.get("T_camera_lidar")
+    matrix = table.matrix("T_camera_lidar", (len(rows) if isinstance(rows, list) else 4, 4))
     truth_cTl = pose_from(matrix, f"{path} (T_camera_lidar)")
     own = values.get("camera", "image_2")
     if isinstance(own, str) and own != camera:
         truth_cTl = calibration.cTc0(camera) * calibration.cTc0(own).inverse() * truth_cTl
-    return GroundTruth(truth_cTl, None if offset_s is None else float(offset_s)), False
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    try:
-        values = json.loads(read_bytes(path))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(path, f"no JSON ({error})", _EXPECTED) from None
-    if not isinstance(values, dict):
-        raise DataError(path, f"a JSON {type(values).__name__}", _EXPECTED)
-    return values
+    return GroundTruth(truth_cTl, offset_s), False

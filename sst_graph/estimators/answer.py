@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
+import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +16,19 @@ from sst_graph.config import to_dict
 from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.rhythm import jumps_of
 from sst_graph.problem.drive import Drive
-from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status
-from sst_graph.uncertainty.observability import MOTION, SILHOUETTES, open_directions
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
+from sst_graph.uncertainty.observability import (
+    MOTION,
+    SILHOUETTES,
+    Advice,
+    ObservabilityConfig,
+    involves_offset,
+    open_directions,
+)
 
 FloatArray = NDArray[np.float64]
 
-PACKAGES = ("sst-graph", "gtsam", "numpy", "opencv-python-headless", "scipy", "small_gicp")
+PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,21 @@ class Guess:
 
     cTl: gtsam.Pose3 | None
     offset_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class DriveKnowledge:
+    """How well the extrinsic and the time offset of one drive are known.
+
+    Attributes:
+        drive: its name.
+        covariance: (7, 7) of the extrinsic and the drive's own offset.
+        by_standing: (7, 7) the same by objects that stand alone.
+    """
+
+    drive: str
+    covariance: FloatArray
+    by_standing: FloatArray
 
 
 @dataclass(frozen=True)
@@ -43,6 +66,7 @@ class Answer:
         remarks: what else was missing, for the reader.
         by_standing: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
         drive_offsets: an offset for each drive, where one each was asked for.
+        by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
     """
 
@@ -54,6 +78,7 @@ class Answer:
     remarks: tuple[str, ...] = ()
     by_standing: FloatArray | None = None
     drive_offsets: tuple[DriveOffset, ...] = ()
+    by_drive: tuple[DriveKnowledge, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -62,7 +87,7 @@ def result_of(
 ) -> CalibrationResult:
     """The result: unobservable where the covariance says so, not_converged where there are doubts."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
-    weak = open_directions(answer.covariance, answer.by_standing, answer.cTl, config.observability, advice)
+    weak = _weak_directions(answer, config.observability, advice)
     doubts = (*answer.doubts, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if doubts else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
@@ -83,6 +108,22 @@ def result_of(
         diagnostics=answer.diagnostics,
         versions=_versions(),
     )
+
+
+def _weak_directions(
+    answer: Answer, limits: ObservabilityConfig, advice: Advice
+) -> tuple[WeakDirection, ...]:
+    """What is not known; where drives have an offset each, of each drive's, named by the drive."""
+    if not answer.by_drive:
+        return open_directions(answer.covariance, answer.by_standing, answer.cTl, limits, advice)
+    found: list[WeakDirection] = []
+    for number, known in enumerate(answer.by_drive):
+        for weak in open_directions(known.covariance, known.by_standing, answer.cTl, limits, advice):
+            if involves_offset(weak):
+                found.append(replace(weak, sentence=f"drive {known.drive!r}: {weak.sentence}"))
+            elif number == 0:  # of the extrinsic alone, which all drives share
+                found.append(weak)
+    return tuple(sorted(found, key=lambda weak: -weak.sigma))
 
 
 def _jumps(drives: Sequence[Drive]) -> list[str]:
@@ -120,4 +161,13 @@ def no_answer(
 
 
 def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    """Of what took part; OpenCV's by the module, for four distributions bring it."""
+    return {**{name: _version(name) for name in PACKAGES}, "opencv": str(cv2.__version__)}
+
+
+def _version(name: str) -> str:
+    """A distribution's version; a package that was put on the path by hand has none."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"

@@ -94,7 +94,7 @@ def check_assumptions(problem: TestedProblem, config: AssumptionConfig) -> tuple
     """What the data say of the assumptions that the score test hints at, the most contradicted first."""
     if not config.test:
         return ()
-    free = problem.config.graph.estimate
+    free = dict(problem.config.graph.estimate)
     names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in free]
     found = []
     for name, score in zip(names, scores(problem, names), strict=True):
@@ -149,7 +149,7 @@ def _estimated(problem: TestedProblem, name: str, config: AssumptionConfig) -> F
         problem.config,
         kernel_px=(*_WIDE_PX, *(narrow or problem.config.kernel_px[-1:])),
         graph=replace(
-            problem.config.graph, estimate={**problem.config.graph.estimate, name: assumption.span}
+            problem.config.graph, estimate=(*problem.config.graph.estimate, (name, assumption.span))
         ),
     )
     start = replace(before, nuisances={**before.nuisances, name: 0.0})

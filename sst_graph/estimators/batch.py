@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, EstimationError
-from sst_graph.estimators.answer import Answer, Guess, no_answer, result_of
+from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
 from sst_graph.estimators.assumption_tests import (
     Finding,
     TestedProblem,
@@ -20,6 +21,7 @@ from sst_graph.estimators.assumption_tests import (
     estimated_report,
 )
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
+from sst_graph.estimators.causes import with_causes
 from sst_graph.estimators.config import CalibrationConfig, Method
 from sst_graph.estimators.contest import (
     REACH,
@@ -30,20 +32,22 @@ from sst_graph.estimators.contest import (
     rivals,
     solve_all,
 )
+from sst_graph.estimators.contradictions import find_contradictions
 from sst_graph.estimators.frames import as_sources
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
-from sst_graph.estimators.motion_joint import WithMotion, with_motion
-from sst_graph.estimators.undersides import with_undersides, without_undersides
+from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
+from sst_graph.estimators.parts import Parts
+from sst_graph.estimators.undersides import WithUndersides, with_undersides, without_undersides
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
-from sst_graph.uncertainty.assumptions import consider
-from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.assumptions import BUDGET, budget, consider, motion_covariance
+from sst_graph.uncertainty.covariance import RobustCovariance, robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
 from sst_graph.uncertainty.gains import frame_gains
@@ -122,8 +126,13 @@ def calibrate_prepared(
         result = result_of(answer, drives, guess, config)
     except EstimationError as error:
         result = no_answer(drives, guess, config, str(error))
-    timing = {"estimate": time.perf_counter() - began}
-    return replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    # What is probably wrong with the data comes first.
+    result = with_causes(result, drives, guess, config)
+    diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
+    left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
+    if left_out:
+        diagnostics["left_out"] = left_out
+    return replace(result, diagnostics=diagnostics)
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -166,54 +175,54 @@ def answer_joint(
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
     config, finals = replace(config, joint=below.joint), below.solutions
     solution = finals[0]
-    # 4. How sure; where the labels tell everything, the motion is heard too.
+    # 4. Do the drives agree, and the stretches of each?
+    parts = Parts(drives, tracks, objects, solution.state, config.joint, config.assumptions)
+    contradictions = find_contradictions(parts, config.contradictions)
+    # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
     covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
-    heard = _hear_motion(drives, tracks, solution, covariance, guess, config, progress)
+    labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
+    heard = _hear_motion(drives, tracks, labels, guess, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
-    # 5. What is taken for granted: considered in the covariance, and tested.
-    considered = consider(robust, solution.pairs, solution.values, solution.state, config.assumptions)
+    # 6. What is taken for granted: considered in the covariance, and tested.
+    frozen = solution.pairs, solution.values, solution.state
+    considered = consider(robust, *frozen, config.assumptions)
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
     problem = TestedProblem(drives, tracks, objects, solution, config.joint, centre)
     findings = check_assumptions(problem, config.assumptions)
-    model, cTl = robust.model, solution.state.cTl
     size = 6 + len(solution.state.offsets_s)
+    motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
+    parts_of_sigma = budget(covariance, motion, considered)
     covariance = covariance[:size, :size] + considered.covariance(size)
     return Answer(
-        cTl,
+        solution.state.cTl,
         solution.state.offsets_s[0],
         covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
-        remarks=_remarks(drives),
+        remarks=(*_remarks(drives), *heard.remarks),
         by_standing=by_standing[:7, :7],
         doubts=(
             *_contradicted(findings),
             *_doubts(solution, finals, covariance, evidence, guess, config),
+            *contradictions.sentences,
             *heard.doubts,
         ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
+        by_drive=_by_drive(drives, solution, covariance, by_standing, config),
         diagnostics={
-            "outer_iterations": solution.outer_iterations,
-            "matches": sum(len(pair) for pair in solution.pairs),
-            "pairs": len(solution.pairs),
-            "start_score": contest.score,
             **evidence,
-            "mask_bias_px": {
-                f"{drives[d].name}:{c.name.lower()}": bias
-                for (d, c), bias in solution.state.biases_px.items()
-            },
-            "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
-            "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+            "start_score": contest.score,
             "motion": heard.diagnostics,
             "assumptions": assumption_report(considered, findings),
+            BUDGET: parts_of_sigma,
             "estimated": estimated_report(robust, solution.state),
-            "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+            "contradictions": contradictions.diagnostics,
+            **_numbers(drives, solution, below, robust),
         },
     )
 
@@ -221,7 +230,7 @@ def answer_joint(
 def _estimating(config: CalibrationConfig) -> JointConfig:
     """The joint method's settings with the parameters that are to be estimated."""
     joint = config.joint
-    return replace(joint, graph=replace(joint.graph, estimate=dict(config.assumptions.estimate)))
+    return replace(joint, graph=replace(joint.graph, estimate=config.assumptions.estimated))
 
 
 def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:
@@ -231,6 +240,25 @@ def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:
         return ()
     others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
     return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
+
+
+def _numbers(
+    drives: Sequence[Drive], solution: JointSolution, below: WithUndersides, robust: RobustCovariance
+) -> dict[str, Any]:
+    """JSON-able numbers about a joint solution."""
+    model = robust.model
+    return {
+        "outer_iterations": solution.outer_iterations,
+        "matches": sum(len(pair) for pair in solution.pairs),
+        "pairs": len(solution.pairs),
+        "mask_bias_px": {
+            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
+        },
+        "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
+        "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+        "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+        FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
+    }
 
 
 def _frozen(
@@ -243,23 +271,23 @@ def _frozen(
 def _hear_motion(
     drives: Sequence[Drive],
     tracks: Tracks,
-    solution: JointSolution,
-    covariance: FloatArray,
+    labels: Labels,
     guess: Guess,
     config: CalibrationConfig,
     progress: Progress | None,
 ) -> WithMotion:
     """The solution with the motion in its graph, where it is asked for and there is any."""
+    solution = labels.solution
     if not _may_hear_motion(config):
         return WithMotion(solution)
     if config.use_motion == "auto":
-        weak = weak_directions(covariance[:7, :7], solution.state.cTl, config.observability)
+        weak = weak_directions(labels.covariance, solution.state.cTl, config.observability)
         rolling = any(scan.offsets_s.any() for drive in drives for scan in drive.scans)
         if weak or rolling:
             why = "the labels alone leave directions open" if weak else "the scans take their time"
             return WithMotion(solution, diagnostics={"left_out": why})
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
-    return with_motion(drives, tracks, solution, covariance[:7, :7], centre, config, progress)
+    return with_motion(drives, tracks, labels, centre, config, progress)
 
 
 def _finals(
@@ -358,6 +386,23 @@ def _drive_offsets(
         DriveOffset(drive.name, solution.state.offset_s(i), float(sigmas[6 + i]))
         for i, drive in enumerate(drives)
     )
+
+
+def _by_drive(
+    drives: Sequence[Drive],
+    solution: JointSolution,
+    covariance: FloatArray,
+    by_standing: FloatArray,
+    config: CalibrationConfig,
+) -> tuple[DriveKnowledge, ...]:
+    """What is known of the extrinsic and each drive's own offset, where drives have one each."""
+    found = []
+    for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
+        own = [*range(6), 6 + number]
+        block, standing = covariance[np.ix_(own, own)], by_standing[np.ix_(own, own)]
+        block = block + _beside_matches(solution, float(block[6, 6]), config)
+        found.append(DriveKnowledge(drives[number].name, block, standing))
+    return tuple(found)
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], Answer]

@@ -9,20 +9,21 @@ import numpy as np
 
 from sst_graph.association.search import SearchConfig, search_start
 from sst_graph.association.votes import CELLS, SearchFrame, States, Votes
+from sst_graph.config import Settings, setting
 from sst_graph.estimators.rematch import Calibration, MatchFrame, spread
 from sst_graph.problem.drive import Drive
 from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
-class ChallengeConfig:
+class ChallengeConfig(Settings):
     """When an answer is believed.
 
     Attributes:
         min_ratio: its score, at least, as a fraction of the best that the search finds around it.
     """
 
-    min_ratio: float = 0.9
+    min_ratio: float = setting(0.9, at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)

@@ -1,23 +1,53 @@
-"""A tracker on disk: one npz file, written whole or not at all, arrays and JSON only."""
+"""A tracker on disk: one npz file, written whole or not at all, arrays and JSON only.
+
+What is read is held against its checksum, against the classes of the estimators, and against what a tracker
+can answer; a file that passes none of it is refused as a whole.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
+import importlib
 import io
 import json
+import pkgutil
+import zipfile
 import zlib
+from functools import cache
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import numpy as np
 
-from sst_graph.errors import DataError
+from sst_graph.checked import checked_camera
+from sst_graph.errors import CheckpointError, DataError
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.files import atomic_write_bytes
-from sst_graph.storage import restored, stored
+from sst_graph.input_files import FileKind, parse_json, read_file
+from sst_graph.storage import class_name, restored, stored
+from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
-VERSION = 13
+VERSION = 15
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
+
+CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
+
+_MEMBERS = ("head", "data", "sha256")
+_MAX_DEPTH = 200
+"""Levels of a checkpoint's JSON; a tracker's has about forty."""
+
+_PACKAGES = (
+    "factors",
+    "sst_graph.association",
+    "sst_graph.estimators",
+    "sst_graph.odometry",
+    "sst_graph.problem",
+    "sst_graph.types",
+    "sst_graph.uncertainty",
+)
+"""Where the classes are defined that a tracker is made of."""
 
 
 def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
@@ -30,10 +60,12 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
         OSError: it cannot be written; what stood there is untouched.
     """
     tracker.consolidate()
-    node, data = stored(tracker)
-    head = json.dumps({"format": FORMAT, "version": VERSION, "tracker": node})
+    node, data = stored(tracker, checkpoint_classes())
+    document = {"format": FORMAT, "version": VERSION, "tracker": node}
+    head = json.dumps(document, allow_nan=False).encode("ascii")
+    parts = {"head": head, "data": data, "sha256": _digest(head, data)}
     stream = io.BytesIO()
-    np.savez(stream, head=np.frombuffer(head.encode(), np.uint8), data=np.frombuffer(data, np.uint8))
+    np.savez(stream, **{name: np.frombuffer(part, np.uint8) for name, part in parts.items()})  # type: ignore[arg-type]
     atomic_write_bytes(path, stream.getvalue())
 
 
@@ -41,22 +73,126 @@ def load_checkpoint(path: str | Path) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
 
     Raises:
-        DataError: no such file, or not a checkpoint of this version.
+        CheckpointError: no such file, not a checkpoint of this version, or one that was changed or damaged.
     """
     try:
-        with np.load(Path(path), allow_pickle=False) as file:
-            head, data = json.loads(bytes(file["head"])), bytes(file["data"])
-    except FileNotFoundError:
-        raise DataError(path, "no such file", "a checkpoint of the tracker") from None
-    except (OSError, ValueError, KeyError, EOFError, zlib.error, BadZipFile) as error:
-        raise DataError(path, f"no readable checkpoint ({error})", "a checkpoint of the tracker") from error
-    found = (head.get("format"), head.get("version")) if isinstance(head, dict) else (None, None)
+        head, data = _members(read_file(path, CHECKPOINT), path)
+        document = parse_json(head, path, CHECKPOINT.name, max_depth=_MAX_DEPTH)
+    except CheckpointError:
+        raise
+    except DataError as error:
+        raise CheckpointError(path, error.found, error.expected) from None
+    found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
     if found != (FORMAT, VERSION):
-        raise DataError(path, f"{found[0]} version {found[1]}", f"{FORMAT} version {VERSION}")
+        raise CheckpointError(
+            path, f"{found[0]!r:.60} version {found[1]!r:.60}", f"{FORMAT} version {VERSION}"
+        )
+    _rehearse(_tracker(document.get("tracker"), data, path), path)
+    return _tracker(document.get("tracker"), data, path)
+
+
+def _tracker(node: Any, data: memoryview, path: str | Path) -> Tracker:
     try:
-        tracker = restored(head.get("tracker"), data)
-    except (ValueError, RuntimeError) as error:
-        raise DataError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
+        tracker = restored(node, data, checkpoint_classes())
+    except ValueError as error:
+        raise CheckpointError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
     if not isinstance(tracker, Tracker):
-        raise DataError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
+        raise CheckpointError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
     return tracker
+
+
+def _rehearse(tracker: Tracker, path: str | Path) -> None:
+    """Require a tracker that answers and takes its last frame once more: its parts go with each other.
+
+    Raises:
+        CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
+    """
+    try:
+        checked_camera(tracker.camera, "camera")
+        tracker.current().to_dict()
+        tracker.consolidate()
+        _again(tracker)
+        tracker.current().to_dict()
+        stored(tracker)
+    except Exception as error:
+        found = f"a tracker that does not answer ({type(error).__name__}: {error})"
+        raise CheckpointError(path, found, "all of a tracker") from error
+
+
+def _again(tracker: Tracker) -> None:
+    """The last frame once more, a second later."""
+    scan, images = tracker.last_scan, tracker.window.images
+    stamps = [one.stamp_ns for one in (scan, *images) if one is not None]
+    if not stamps:
+        return
+    later = max(stamps) + 1_000_000_000
+    if images:
+        tracker.add_image(CameraImage(later, images[-1].mask, NO_PICTURE))
+    if scan is not None:
+        tracker.add_scan(dataclasses.replace(scan, stamp_ns=later))
+
+
+@cache
+def checkpoint_classes() -> dict[str, type]:
+    """Classes and enumerations that a checkpoint may name."""
+    modules = []
+    for package in map(importlib.import_module, _PACKAGES):
+        modules.append(package)
+        names = (info.name for info in pkgutil.iter_modules(getattr(package, "__path__", ())))
+        modules += [importlib.import_module(f"{package.__name__}.{name}") for name in names]
+    return {
+        class_name(cls): cls
+        for module in modules
+        for cls in vars(module).values()
+        if isinstance(cls, type) and cls.__module__ == module.__name__ and not issubclass(cls, Exception)
+    }
+
+
+def _members(archive: bytes, path: str | Path) -> tuple[str, memoryview]:
+    """JSON and bytes of an npz file whose members are stored as they are, and have their checksum.
+
+    Nothing is unpacked: a member's declared shape is compared with the bytes that are there.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(archive)) as file:
+            names = [f"{name}.npy" for name in _MEMBERS]
+            if file.namelist() != names:
+                raise ValueError(f"members {file.namelist()!r:.100}")
+            head, data, digest = (_bytes_of(file, name, len(archive)) for name in names)
+            text = bytes(head).decode("ascii")
+    except (zipfile.BadZipFile, zlib.error, ArithmeticError, LookupError, OSError, RuntimeError) as error:
+        raise _unreadable(path, error) from error
+    except (EOFError, MemoryError, NotImplementedError, SyntaxError, TypeError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if _digest(head, data) != bytes(digest):
+        raise CheckpointError(path, "no readable checkpoint (another checksum)", "one as it was written")
+    return text, data
+
+
+def _bytes_of(file: zipfile.ZipFile, name: str, most: int) -> memoryview:
+    info = file.getinfo(name)
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.file_size > most:
+        raise ValueError(f"{name} compressed, encrypted or larger than the file")
+    content = file.read(info)
+    stream = io.BytesIO(content)
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"{name} of npy version {version}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    rest = memoryview(content)[stream.tell() :]
+    if dtype != np.uint8 or shape != (len(rest),):
+        raise ValueError(f"{name} with {len(rest)} bytes for {dtype} of shape {shape}")
+    return rest
+
+
+def _digest(head: bytes | memoryview, data: bytes | memoryview) -> bytes:
+    """SHA-256 of both: a damaged or edited checkpoint is told from one as it was written."""
+    sum_ = hashlib.sha256(len(head).to_bytes(8, "little"))
+    sum_.update(head)
+    sum_.update(data)
+    return sum_.digest()
+
+
+def _unreadable(path: str | Path, error: Exception) -> CheckpointError:
+    found = f"no readable checkpoint ({type(error).__name__}: {error})"
+    return CheckpointError(path, found, CHECKPOINT.name)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from sst_graph.config import Settings
 from sst_graph.estimators.challenge import ChallengeConfig
+from sst_graph.estimators.contradictions import ContradictionConfig
 from sst_graph.estimators.joint import JointConfig
 from sst_graph.estimators.motion import MotionConfig
 from sst_graph.estimators.paper import PaperConfig
@@ -15,7 +17,6 @@ from sst_graph.estimators.undersides import UndersideConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.assumptions import AssumptionConfig
-from sst_graph.uncertainty.common_error import CommonErrorConfig
 from sst_graph.uncertainty.observability import ObservabilityConfig
 from sst_graph.uncertainty.unknown_motion import UnknownMotionConfig
 
@@ -24,7 +25,7 @@ UseMotion = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
-class CalibrationConfig:
+class CalibrationConfig(Settings):
     """What to do and how; one part a stage, written beside every result.
 
     Attributes:
@@ -46,11 +47,14 @@ class CalibrationConfig:
         motion: hand-eye calibration.
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
         assumptions: what is taken for granted: considered in the covariance, tested, or estimated.
-        common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
-        unknown_motion: the same where a single scan tells no motion; both 0 where the vehicle stood.
+        unknown_motion: what the covariance has beside that of the matches where a single scan tells no
+            motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
+        contradictions: when method joint finds that drives, or parts of one, contradict each other.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
             no one time offset; not for sensors whose rate goes up and down.
+        find_causes: where a result of method joint is doubted or missing, try changes of the data that would
+            make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
     """
 
     method: Method = "joint"
@@ -66,7 +70,8 @@ class CalibrationConfig:
     motion: MotionConfig = field(default_factory=MotionConfig)
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
     assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
-    common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
+    contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
     check_stamps: bool = True
+    find_causes: bool = True

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.robust import RobustKernel
+from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.motion_start import MotionStartConfig, motion_starts
 from sst_graph.problem.drive import Drive, Progress
@@ -43,7 +44,7 @@ VAGUE_DEG, VAGUE_S = 5.0, 0.03
 
 
 @dataclass(frozen=True)
-class MotionConfig:
+class MotionConfig(Settings):
     """Hand-eye calibration.
 
     Attributes:
@@ -68,16 +69,16 @@ class MotionConfig:
     priors: HandEyePriors = field(default_factory=HandEyePriors)
     errors: HandEyeErrors = field(default_factory=HandEyeErrors)
     kernel: RobustKernel = field(default_factory=lambda: RobustKernel("cauchy", 3.0))
-    max_rotation_sigma_rad: float = 0.02
-    min_pairs: int = 5
-    max_outer: int = 20
-    heat_outer: int = 4
-    full_steps: int = 6
-    settled: float = 0.1
-    inner_iterations: int = 10
-    least_scale: float = 0.3
-    max_disagreement: float = 40.0
-    rival_chi2: float = 9.0
+    max_rotation_sigma_rad: float = setting(0.02, at_least=1e-6, at_most=10.0)
+    min_pairs: int = setting(5, at_least=2, at_most=1_000_000)
+    max_outer: int = setting(20, at_least=1, at_most=1000)
+    heat_outer: int = setting(4, at_least=1, at_most=1000)
+    full_steps: int = setting(6, at_least=0, at_most=1000)
+    settled: float = setting(0.1, at_least=0.0, at_most=10.0)
+    inner_iterations: int = setting(10, at_least=1, at_most=1000)
+    least_scale: float = setting(0.3, at_least=0.001, at_most=10.0)
+    max_disagreement: float = setting(40.0, at_least=0.0, at_most=1e6)
+    rival_chi2: float = setting(9.0, at_least=0.0, at_most=1e6)
 
 
 @dataclass(frozen=True)

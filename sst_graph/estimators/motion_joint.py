@@ -14,14 +14,31 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.joint import JointSolution, solve_joint
 from sst_graph.estimators.motion import difference, solve_motion
+from sst_graph.estimators.parts import SolvedPart
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.uncertainty.contradiction import Difference, PartAnswer, name_step
 
 FloatArray = NDArray[np.float64]
 
 _UNLIKELY_CHI2 = 14.07
 """95 % quantile of chi-squared with 7 degrees of freedom."""
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the labels alone say.
+
+    Attributes:
+        solution: of the joint graph.
+        covariance: (7, 7) of it.
+        stretches: of the drives, each solved by itself; steps are from the solution.
+    """
+
+    solution: JointSolution
+    covariance: FloatArray
+    stretches: Sequence[SolvedPart] = ()
 
 
 @dataclass(frozen=True)
@@ -34,19 +51,20 @@ class WithMotion:
         inflation: of the covariance of what both say together: 1 where they agree as their covariances
             claim, else the chi-squared of their difference over its dimension (Birge's ratio, squared).
         diagnostics: JSON-able numbers.
+        remarks: a sentence where the motion was left out for a stretch of a drive that contradicts it.
     """
 
     solution: JointSolution
     doubts: tuple[str, ...] = ()
     inflation: float = 1.0
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
 
 
 def with_motion(
     drives: Sequence[Drive],
     tracks: Tracks,
-    solution: JointSolution,
-    covariance: FloatArray,
+    labels: Labels,
     guess: State,
     config: CalibrationConfig,
     progress: Progress | None = None,
@@ -58,22 +76,28 @@ def with_motion(
     independent here.
 
     Args:
-        covariance: (7, 7) of the joint solution.
+        labels: what they say alone.
         guess: what the weak priors are centred on.
     """
     # 1. The hand-eye solution from the joint one.
-    state = solution.state
+    solution, state = labels.solution, labels.solution.state
     try:
         motion = solve_motion(drives, state.cTl, state.offsets_s[0], config.motion, progress)[0]
     except EstimationError as error:
         return WithMotion(solution, diagnostics={"left_out": str(error)})
     # 2. Do they agree?
     step = difference(state, motion.state)
-    apart = float(step @ np.linalg.solve(covariance + motion.covariance, step))
+    apart = float(step @ np.linalg.solve(labels.covariance + motion.covariance, step))
     sigmas = np.sqrt(np.diag(motion.covariance))
     facts = {"chi2_of_7": apart, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
     if apart > config.motion.max_disagreement or not motion.converged:
         return WithMotion(solution, _contradiction(step, apart, motion.converged), diagnostics=facts)
+    worst = _worst_stretch(labels.stretches, PartAnswer(step, motion.covariance))
+    if worst is not None:
+        facts["stretch_p_value"] = worst[1].p_value * len(labels.stretches)
+        if facts["stretch_p_value"] < config.contradictions.false_alarm:
+            said = _of_stretch(drives, worst, state)
+            return WithMotion(solution, diagnostics={"left_out": said, **facts}, remarks=(said,))
     # 3. Silhouettes once more, the motion among the factors.
     belief = belief_factor(motion.state, motion.covariance)
     last_scale = replace(config.joint, kernel_px=config.joint.kernel_px[-1:])
@@ -91,6 +115,24 @@ def belief_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainer
     point.insert(EXTRINSIC, state.cTl)
     point.insert(delay_key(), np.array(state.offsets_s[:1]))
     return gtsam.LinearContainerFactor(linear, point)
+
+
+def _worst_stretch(
+    stretches: Sequence[SolvedPart], motion: PartAnswer
+) -> tuple[SolvedPart, Difference] | None:
+    """The stretch whose labels contradict the motion most; None without stretches."""
+    compared = [(stretch, Difference.of(stretch.answer, motion)) for stretch in stretches]
+    return min(compared, key=lambda pair: pair[1].rank, default=None)
+
+
+def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], state: State) -> str:
+    part, difference = worst[0].part, worst[1]
+    scans = drives[part.drive].scans
+    return (
+        f"the motion was left out, for it contradicts the labels of {drives[part.drive].name}, frames "
+        f"{scans[part.scans[0]].index} to {scans[part.scans[-1]].index}: it differs from them in "
+        f"{name_step(difference, state.cTl).sentence}"
+    )
 
 
 def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:

@@ -9,16 +9,19 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.problem.hand_eye import CameraStep, MotionPair, pair_motions
 from sst_graph.problem.path import SensorPath
 
 FloatArray = NDArray[np.float64]
 
 _ROUNDS = 6
+_MOST_STEPS = 200
+"""Most offsets tried to either side: each takes some 10 ms."""
 
 
 @dataclass(frozen=True)
-class MotionStartConfig:
+class MotionStartConfig(Settings):
     """The grid of time offsets and what counts in it.
 
     Attributes:
@@ -32,14 +35,17 @@ class MotionStartConfig:
         guess_rad: sigma of the guess's rotation [rad].
     """
 
-    max_offset_s: float = 0.5
-    step_s: float = 0.02
-    contenders: int = 4
-    max_pairs: int = 150
-    least_share: float = 0.4
-    lever_m: float = 0.4
-    truncation: float = 5.0
-    guess_rad: float = 1.0
+    max_offset_s: float = setting(0.5, at_least=0.0, at_most=10.0)
+    step_s: float = setting(0.02, at_least=0.001, at_most=1.0)
+    contenders: int = setting(4, at_least=1, at_most=100)
+    max_pairs: int = setting(150, at_least=2, at_most=2000)
+    least_share: float = setting(0.4, at_least=0.0, at_most=1.0)
+    lever_m: float = setting(0.4, at_least=0.0, at_most=100.0)
+    truncation: float = setting(5.0, at_least=0.1, at_most=1000.0)
+    guess_rad: float = setting(1.0, at_least=0.001, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("max_offset_s", _MOST_STEPS * self.step_s, f"{_MOST_STEPS} step_s")
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import beta_regularizer
-from sst_graph.errors import EstimationError
+from sst_graph.config import Settings, setting
+from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.rematch import (
     Calibration,
     FramePair,
@@ -36,7 +37,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class PaperConfig:
+class PaperConfig(Settings):
     """Both stages, with the paper's numbers.
 
     Attributes:
@@ -50,24 +51,26 @@ class PaperConfig:
         seed: of the sample of pixels.
     """
 
-    static_weights: tuple[float, ...] = (20.0, 1.0, 0.02)
-    static_iterations: tuple[int, ...] = (20, 30, 10)
-    joint_weight: float = 5.0
-    joint_iterations: int = 20
-    lambda_t: float = 1e6
-    lambda_r: float = 1e9
-    pixel_share: float = 0.02
-    static_frames: int = 5
-    joint_frames: int = 20
-    velocity_every: int = 5
+    static_weights: tuple[float, ...] = setting((20.0, 1.0, 0.02), at_least=0.0, at_most=1e6, length=(1, 20))
+    static_iterations: tuple[int, ...] = setting((20, 30, 10), at_least=1, at_most=1000, length=(1, 20))
+    joint_weight: float = setting(5.0, at_least=0.0, at_most=1e6)
+    joint_iterations: int = setting(20, at_least=1, at_most=1000)
+    lambda_t: float = setting(1e6, at_least=1e-6, at_most=1e15)
+    lambda_r: float = setting(1e9, at_least=1e-6, at_most=1e15)
+    pixel_share: float = setting(0.02, at_least=0.0001, at_most=1.0)
+    static_frames: int = setting(5, at_least=1, at_most=1000)
+    joint_frames: int = setting(20, at_least=1, at_most=1000)
+    velocity_every: int = setting(5, at_least=1, at_most=1000)
     standing: StandingConfig = field(default_factory=StandingConfig)
-    seed: int = 0
+    seed: int = setting(0, at_least=0, at_most=10**15)
 
     def __post_init__(self) -> None:
-        if len(self.static_weights) != len(self.static_iterations):
-            raise ValueError("static_weights and static_iterations: expected as many of one as of the other")
-        if not 0.0 < self.pixel_share <= 1.0:
-            raise ValueError(f"pixel_share: found {self.pixel_share}, expected more than 0 and at most 1")
+        weights, iterations = len(self.static_weights), len(self.static_iterations)
+        if weights != iterations:
+            raise ConfigError(
+                f"static_weights: found {weights} of them, expected {iterations}, one for each of "
+                "static_iterations"
+            )
 
 
 @dataclass(frozen=True)

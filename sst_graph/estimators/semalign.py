@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from factors import PinholeCamera
+from sst_graph.config import Settings, setting
 from sst_graph.estimators.paper import NearestSolution, PaperConfig, still_frames
 from sst_graph.estimators.rematch import Calibration, MatchFrame, frozen_covariance, step_once
 from sst_graph.odometry import VisualOdometryConfig
@@ -27,7 +28,7 @@ _CHUNK = 100
 
 
 @dataclass(frozen=True)
-class SemAlignConfig:
+class SemAlignConfig(Settings):
     """Sampled starts and their refinement.
 
     Attributes:
@@ -39,17 +40,13 @@ class SemAlignConfig:
         seed: of the samples.
     """
 
-    starts: int = 5000
-    box_deg: float = 10.0
-    box_m: float = 0.1
-    truncation_px: float = 50.0
-    points: int = 200
-    iterations: int = 60
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.starts < 1 or self.points < 1:
-            raise ValueError("starts and points: expected 1 or more")
+    starts: int = setting(5000, at_least=1, at_most=100_000)
+    box_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
+    box_m: float = setting(0.1, at_least=0.0, at_most=100.0)
+    truncation_px: float = setting(50.0, at_least=1.0, at_most=10_000.0)
+    points: int = setting(200, at_least=1, at_most=10_000)
+    iterations: int = setting(60, at_least=1, at_most=1000)
+    seed: int = setting(0, at_least=0, at_most=10**15)
 
 
 def solve_semalign(

@@ -14,6 +14,7 @@ from factors.camera import PinholeCamera
 from sst_graph.association.pairing import pair_by_time
 from sst_graph.association.search import Candidate, SearchConfig, search_start
 from sst_graph.association.votes import SearchFrame, States, Votes
+from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
@@ -25,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class StartConfig:
+class StartConfig(Settings):
     """Whether and how the start is searched.
 
     Attributes:
@@ -58,25 +59,25 @@ class StartConfig:
 
     search: SearchConfig = field(default_factory=SearchConfig)
     enabled: bool = True
-    population: int = 16
-    rounds: int = 1
-    contenders: int = 320
-    free_contenders: int = 1280
-    contest_scans: int = 10
-    heat_points: int = 500
-    survival: float = 0.4
-    survivors: int = 16
-    settling: int = 6
-    leads: int = 3
-    finalists: int = 2
-    finalist_ratio: float = 0.7
-    label_blur_px: float = 10.0
-    min_object_share: float = 0.3
-    rival_ratio: float = 0.9
-    min_explained: float = 0.2
-    min_explained_vague: float = 0.45
-    min_concentration: float = 0.6
-    min_class_points: int = 30
+    population: int = setting(16, at_least=1, at_most=1000)
+    rounds: int = setting(1, at_least=0, at_most=50)
+    contenders: int = setting(320, at_least=1, at_most=2000)
+    free_contenders: int = setting(1280, at_least=1, at_most=5000)
+    contest_scans: int = setting(10, at_least=1, at_most=100)
+    heat_points: int = setting(500, at_least=1, at_most=5000)
+    survival: float = setting(0.4, at_least=0.0, at_most=1.0)
+    survivors: int = setting(16, at_least=1, at_most=500)
+    settling: int = setting(6, at_least=0, at_most=100)
+    leads: int = setting(3, at_least=1, at_most=20)
+    finalists: int = setting(2, at_least=1, at_most=20)
+    finalist_ratio: float = setting(0.7, at_least=0.0, at_most=0.99)
+    label_blur_px: float = setting(10.0, at_least=0.5, at_most=500.0)
+    min_object_share: float = setting(0.3, at_least=0.0, at_most=1.0)
+    rival_ratio: float = setting(0.9, at_least=0.0, at_most=1.0)
+    min_explained: float = setting(0.2, at_least=0.0, at_most=1.0)
+    min_explained_vague: float = setting(0.45, at_least=0.0, at_most=1.0)
+    min_concentration: float = setting(0.6, at_least=0.0, at_most=1.0)
+    min_class_points: int = setting(30, at_least=1, at_most=1_000_000)
 
 
 def find_start(

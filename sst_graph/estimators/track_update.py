@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.result import WeakDirection
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
 
 
-@dataclass(frozen=True)
-class TrackUpdate:
+@dataclass(frozen=True, eq=False)
+class TrackUpdate(ByValue):
     """The estimate after a frame. Signs and order: :mod:`factors`.
 
     Attributes:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from sst_graph.config import Settings, setting
 from sst_graph.estimators.config import CalibrationConfig
 
 
 @dataclass(frozen=True)
-class DriftConfig:
+class DriftConfig(Settings):
     """Extrinsic and time offset as random walks.
 
     Attributes:
@@ -21,18 +22,15 @@ class DriftConfig:
     """
 
     enabled: bool = False
-    epoch_s: float = 1.0
-    rotation_deg: float = 0.005
-    translation_m: float = 0.0005
-    offset_s: float = 0.0001
-    history: int = 5000
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "epoch_s", "rotation_deg", "translation_m", "offset_s", "history")
+    epoch_s: float = setting(1.0, at_least=0.01, at_most=100_000.0)
+    rotation_deg: float = setting(0.005, at_least=1e-6, at_most=10.0)
+    translation_m: float = setting(0.0005, at_least=1e-7, at_most=10.0)
+    offset_s: float = setting(0.0001, at_least=1e-8, at_most=10.0)
+    history: int = setting(5000, at_least=1, at_most=100_000)
 
 
 @dataclass(frozen=True)
-class AlarmConfig:
+class AlarmConfig(Settings):
     """When the calibration counts as changed.
 
     Attributes:
@@ -69,36 +67,31 @@ class AlarmConfig:
     """
 
     enabled: bool = True
-    kernel_px: float = 12.0
-    frames: int = 4
-    chi2: float = 25.0
-    confirmations: int = 3
-    others: float = 0.2
-    alone: float = 4.0
-    patience: int = 20
-    lost: int = 8
-    lost_share: float = 0.12
-    shown_deg: float = 0.25
-    shown_s: float = 0.01
-    confirm_s: float = 1.0
-    confirm_offset_s: float = 3.0
-    confirm_mps: float = 3.0
+    kernel_px: float = setting(12.0, at_least=0.1, at_most=1000.0)
+    frames: int = setting(4, at_least=1, at_most=1000)
+    chi2: float = setting(25.0, at_least=0.1, at_most=1e9)
+    confirmations: int = setting(3, at_least=1, at_most=1000)
+    others: float = setting(0.2, at_least=0.0, at_most=1.0)
+    alone: float = setting(4.0, at_least=0.01, at_most=1000.0)
+    patience: int = setting(20, at_least=1, at_most=10_000)
+    lost: int = setting(8, at_least=1, at_most=10_000)
+    lost_share: float = setting(0.12, at_least=0.0, at_most=1.0)
+    shown_deg: float = setting(0.25, at_least=0.001, at_most=180.0)
+    shown_s: float = setting(0.01, at_least=1e-5, at_most=10.0)
+    confirm_s: float = setting(1.0, at_least=0.001, at_most=1e6)
+    confirm_offset_s: float = setting(3.0, at_least=0.001, at_most=1e6)
+    confirm_mps: float = setting(3.0, at_least=0.0, at_most=1000.0)
     stamps: bool = True
-    baseline: int = 300
-    start_chi2: float = 15.0
-    warm_up: int = 15
+    baseline: int = setting(300, at_least=1, at_most=1_000_000)
+    start_chi2: float = setting(15.0, at_least=0.1, at_most=1e9)
+    warm_up: int = setting(15, at_least=0, at_most=1_000_000)
 
     def __post_init__(self) -> None:
-        _require_positive(
-            self, "kernel_px", "frames", "chi2", "start_chi2", "alone", "confirmations", "lost", "baseline"
-        )
-        _require_positive(self, "shown_deg", "shown_s", "confirm_s", "confirm_offset_s")
-        if self.patience < max(self.frames, self.confirmations):
-            raise ValueError(f"patience {self.patience}: expected at least frames and confirmations")
+        self.expect_at_least("patience", max(self.frames, self.confirmations), "frames and confirmations")
 
 
 @dataclass(frozen=True)
-class AdoptionConfig:
+class AdoptionConfig(Settings):
     """When a candidate may replace the calibration in use.
 
     Attributes:
@@ -106,15 +99,12 @@ class AdoptionConfig:
         margin: the candidate's held-out cost may exceed that of the one in use by this fraction.
     """
 
-    held_out: int = 10
-    margin: float = 0.02
-
-    def __post_init__(self) -> None:
-        _require_positive(self, "held_out")
+    held_out: int = setting(10, at_least=1, at_most=10_000)
+    margin: float = setting(0.02, at_least=0.0, at_most=100.0)
 
 
 @dataclass(frozen=True)
-class TrackerConfig:
+class TrackerConfig(Settings):
     """What the tracker does with each frame.
 
     Attributes:
@@ -138,31 +128,23 @@ class TrackerConfig:
     """
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    window: int = 60
-    renew: int = 1
-    renew_most: int = 4
-    stale_sigmas: float = 0.3
-    settle_scans: int = 5
-    start_scans: int = 12
-    restart_scans: int = 8
-    start_attempts: int = 2
-    start_share: float = 0.7
-    start_gain: float = 0.1
-    start_offset_step_s: float = 0.005
-    min_frame_matches: int = 8
-    late_s: float = 1.5
+    window: int = setting(60, at_least=2, at_most=1000)
+    renew: int = setting(1, at_least=0, at_most=1000)
+    renew_most: int = setting(4, at_least=0, at_most=1000)
+    stale_sigmas: float = setting(0.3, at_least=0.0, at_most=1000.0)
+    settle_scans: int = setting(5, at_least=1, at_most=1000)
+    start_scans: int = setting(12, at_least=1, at_most=1000)
+    restart_scans: int = setting(8, at_least=1, at_most=1000)
+    start_attempts: int = setting(2, at_least=1, at_most=1000)
+    start_share: float = setting(0.7, at_least=0.0, at_most=1.0)
+    start_gain: float = setting(0.1, at_least=0.0, at_most=1.0)
+    start_offset_step_s: float = setting(0.005, at_least=1e-6, at_most=10.0)
+    min_frame_matches: int = setting(8, at_least=1, at_most=1_000_000)
+    late_s: float = setting(1.5, at_least=0.001, at_most=60.0)
     drift: DriftConfig = field(default_factory=DriftConfig)
     alarm: AlarmConfig = field(default_factory=AlarmConfig)
     adoption: AdoptionConfig = field(default_factory=AdoptionConfig)
 
     def __post_init__(self) -> None:
-        _require_positive(self, "window", "start_scans", "restart_scans", "min_frame_matches", "late_s")
-        _require_positive(self, "settle_scans")
-        if self.window < max(self.start_scans, self.restart_scans):
-            raise ValueError(f"window {self.window}: expected at least start_scans and restart_scans")
-
-
-def _require_positive(config: object, *names: str) -> None:
-    for name in names:
-        if getattr(config, name) <= 0:
-            raise ValueError(f"{name} {getattr(config, name)}: expected a value above 0")
+        scans = max(self.start_scans, self.restart_scans)
+        self.expect_at_least("window", scans, "start_scans and restart_scans")

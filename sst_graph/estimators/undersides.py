@@ -14,6 +14,7 @@ from typing import Literal
 
 from factors.robust import RobustKernel
 from sst_graph.association.silhouettes import BOTTOM
+from sst_graph.config import Settings, setting
 from sst_graph.estimators.contest import solve_all
 from sst_graph.estimators.joint import (
     CONCENTRATION_SCALES,
@@ -28,7 +29,7 @@ from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
-class UndersideConfig:
+class UndersideConfig(Settings):
     """When edges towards the ground are matched.
 
     Attributes:
@@ -40,9 +41,9 @@ class UndersideConfig:
     """
 
     use: Literal["auto", "always", "never"] = "auto"
-    min_concentration: float = 0.7
-    min_support: float = 30.0
-    kernel_px: tuple[float, ...] = (5.0, 4.0, 3.0)
+    min_concentration: float = setting(0.7, at_least=0.0, at_most=1.0)
+    min_support: float = setting(30.0, at_least=0.001, at_most=1e9)
+    kernel_px: tuple[float, ...] = setting((5.0, 4.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100))
 
 
 def without_undersides(prepare: PrepareConfig) -> PrepareConfig:

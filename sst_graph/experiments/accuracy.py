@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
@@ -66,7 +67,7 @@ SCENARIOS: Mapping[str, Scenario] = {
 
 
 @dataclass(frozen=True)
-class AccuracyConfig:
+class AccuracyConfig(Settings):
     """Streets, starts and scenarios.
 
     Attributes:
@@ -79,19 +80,14 @@ class AccuracyConfig:
         calibration: settings of the method.
     """
 
-    streets: int = 10
-    seed: int = 100
-    scenarios: tuple[str, ...] = tuple(SCENARIOS)
-    start_deg: float = 20.0
-    start_m: float = 0.1
-    failed_deg: float = 1.0
-    label_noise: float = 1.0
+    streets: int = setting(10, at_least=1, at_most=10_000)
+    seed: int = setting(100, at_least=0, at_most=10**15)
+    scenarios: tuple[str, ...] = setting(tuple(SCENARIOS), length=(1, 100), choices=SCENARIOS)
+    start_deg: float = setting(20.0, at_least=0.0, at_most=180.0)
+    start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
+    failed_deg: float = setting(1.0, at_least=0.0, at_most=180.0)
+    label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.scenarios if name not in SCENARIOS]
-        if unknown or not self.scenarios or self.streets < 1:
-            raise ValueError(f"scenarios: found {unknown or 'none'}, expected some of {', '.join(SCENARIOS)}")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
@@ -27,7 +28,7 @@ DRIVES: Mapping[str, tuple[str, Mapping[str, Any]]] = {
 
 
 @dataclass(frozen=True)
-class ConsistencyConfig:
+class ConsistencyConfig(Settings):
     """Streets and starts; every run has a street of its own.
 
     Attributes:
@@ -40,19 +41,14 @@ class ConsistencyConfig:
         calibration: settings of the method.
     """
 
-    runs: int = 100
-    drives: tuple[str, ...] = tuple(DRIVES)
-    seed: int = 1000
-    start_deg: float = 10.0
-    start_m: float = 0.1
-    lost_deg: float = 2.0
-    label_noise: float = 1.0
+    runs: int = setting(100, at_least=2, at_most=100_000)
+    drives: tuple[str, ...] = setting(tuple(DRIVES), length=(1, 100), choices=DRIVES)
+    seed: int = setting(1000, at_least=0, at_most=10**15)
+    start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
+    start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
+    lost_deg: float = setting(2.0, at_least=0.0, at_most=180.0)
+    label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.drives if name not in DRIVES]
-        if unknown or not self.drives or self.runs < 2:
-            raise ValueError(f"drives: found {unknown or 'none'}, expected some of {', '.join(DRIVES)}")
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
@@ -22,7 +23,7 @@ from sst_graph.types import GroundTruth, Source
 
 
 @dataclass(frozen=True)
-class DrivesConfig:
+class DrivesConfig(Settings):
     """Drives, image shifts and starts.
 
     Attributes:
@@ -35,13 +36,13 @@ class DrivesConfig:
         calibration: settings of the method.
     """
 
-    data: tuple[str, ...] = ()
+    data: tuple[str, ...] = setting((), length=(0, 1000))
     together: bool = True
-    shifts: tuple[int, ...] = (0, 1, 2, 3)
-    starts: int = 5
-    seed: int = 0
-    start_deg: float = 10.0
-    start_m: float = 0.1
+    shifts: tuple[int, ...] = setting((0, 1, 2, 3), at_least=-1000, at_most=1000, length=(1, 100))
+    starts: int = setting(5, at_least=1, at_most=10_000)
+    seed: int = setting(0, at_least=0, at_most=10**15)
+    start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
+    start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
 

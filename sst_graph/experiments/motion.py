@@ -9,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
@@ -33,7 +35,7 @@ RUNS: Mapping[str, tuple[bool, Mapping[str, Any]]] = {
 
 
 @dataclass(frozen=True)
-class MotionTableConfig:
+class MotionTableConfig(Settings):
     """Streets, drives and starts.
 
     Attributes:
@@ -47,20 +49,23 @@ class MotionTableConfig:
         calibration: settings of the methods.
     """
 
-    streets: int = 4
-    seed: int = 300
-    drives: tuple[str, ...] = tuple(DRIVES)
-    frames: int = 40
-    delay_s: float = 0.1
-    start_deg: float = 10.0
-    start_m: float = 0.1
-    label_noise: float = 1.0
+    streets: int = setting(4, at_least=1, at_most=10_000)
+    seed: int = setting(300, at_least=0, at_most=10**15)
+    drives: tuple[str, ...] = setting(tuple(DRIVES), length=(1, 100), choices=DRIVES)
+    frames: int = setting(40, at_least=1, at_most=10_000)
+    delay_s: float = setting(0.1, at_least=-0.5, at_most=0.5)
+    start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
+    start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
+    label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.drives if name not in DRIVES]
-        if unknown or not self.drives or self.streets < 1:
-            raise ValueError(f"drives: found {unknown or 'none'}, expected some of {', '.join(DRIVES)}")
+        latest_s = self.delay_s + 0.25 * (self.streets - 1) * SimulationConfig().period_s
+        if latest_s > 0.5:
+            raise ConfigError(
+                f"streets: found {self.streets}, whose time offsets grow from delay_s {self.delay_s:g} to "
+                f"{latest_s:.3g} s, expected offsets of at most 0.5 s"
+            )
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
 from sst_graph.estimators.config import Method
@@ -26,7 +27,7 @@ PUBLISHED = (
 
 
 @dataclass(frozen=True)
-class PaperTableConfig:
+class PaperTableConfig(Settings):
     """Streets, starts and methods.
 
     Attributes:
@@ -41,21 +42,17 @@ class PaperTableConfig:
         calibration: settings of every method.
     """
 
-    streets: int = 20
-    seed: int = 0
-    methods: tuple[Method, ...] = ("paper", "static", "semalign", "joint")
-    frames: int = 60
-    images_late: int = 1
-    start_deg: float = 10.0
-    start_m: float = 0.1
-    failed_deg: float = 5.0
-    failed_m: float = 0.5
-    label_noise: float = 1.0
+    streets: int = setting(20, at_least=1, at_most=10_000)
+    seed: int = setting(0, at_least=0, at_most=10**15)
+    methods: tuple[Method, ...] = setting(("paper", "static", "semalign", "joint"), length=(1, 100))
+    frames: int = setting(60, at_least=1, at_most=10_000)
+    images_late: int = setting(1, at_least=-4, at_most=4)
+    start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
+    start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
+    failed_deg: float = setting(5.0, at_least=0.0, at_most=180.0)
+    failed_m: float = setting(0.5, at_least=0.0, at_most=100.0)
+    label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-
-    def __post_init__(self) -> None:
-        if self.streets < 1 or not self.methods:
-            raise ValueError("streets and methods: expected one or more")
 
     def street(self, number: int) -> SimulationConfig:
         """The simulation of a street."""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import PictureConfig
+from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared
 from sst_graph.experiments.slam_graph import (
     DELAY,
@@ -57,7 +57,7 @@ def _as_drawn() -> CalibrationConfig:
 
 
 @dataclass(frozen=True)
-class SlamConfig:
+class SlamConfig(Settings):
     """Streets and settings.
 
     Attributes:
@@ -72,11 +72,11 @@ class SlamConfig:
         calibration: of the calibration alone, from whose answer both together start.
     """
 
-    streets: int = 5
-    seed: int = 1
-    weathers: tuple[str, ...] = tuple(WEATHERS)
-    frames: int = 60
-    delay_s: float = 0.05
+    streets: int = setting(5, at_least=1, at_most=10_000)
+    seed: int = setting(1, at_least=0, at_most=10**15)
+    weathers: tuple[str, ...] = setting(tuple(WEATHERS), length=(1, 100), choices=WEATHERS)
+    frames: int = setting(60, at_least=2, at_most=10_000)
+    delay_s: float = setting(0.05, at_least=-0.5, at_most=0.5)
     street: SimulationConfig = field(
         default_factory=lambda: SimulationConfig(
             width=621,
@@ -92,12 +92,6 @@ class SlamConfig:
     loops: LoopConfig = field(default_factory=LoopConfig)
     camera: CameraGraphConfig = field(default_factory=CameraGraphConfig)
     calibration: CalibrationConfig = field(default_factory=_as_drawn)
-
-    def __post_init__(self) -> None:
-        unknown = [name for name in self.weathers if name not in WEATHERS]
-        if unknown or not self.weathers or self.streets < 1:
-            found = f"{unknown or 'none'} and {self.streets} streets"
-            raise ConfigError(f"weathers: found {found}, expected some of {', '.join(WEATHERS)} and streets")
 
 
 @dataclass(frozen=True)

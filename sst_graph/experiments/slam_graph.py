@@ -19,6 +19,7 @@ from factors import (
     pose_alignment_factor,
 )
 from sst_graph.association.silhouettes import MatchConfig
+from sst_graph.config import Settings, setting
 from sst_graph.odometry import LoopClosure, metric_motions
 from sst_graph.problem.align import align_frame
 from sst_graph.problem.drive import Drive
@@ -34,7 +35,7 @@ VEHICLE = SemanticClass.VEHICLE
 
 
 @dataclass(frozen=True)
-class CameraGraphConfig:
+class CameraGraphConfig(Settings):
     """What the camera adds to a pose graph.
 
     Attributes:
@@ -49,15 +50,17 @@ class CameraGraphConfig:
         silhouettes, visual_odometry: which of the camera's factors there are.
     """
 
-    kernel_px: tuple[float, ...] = (5.0, 4.0, 3.0, 3.0, 3.0)
+    kernel_px: tuple[float, ...] = setting(
+        (5.0, 4.0, 3.0, 3.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100)
+    )
     match: MatchConfig = field(default_factory=MatchConfig)
-    bias_sigma_px: float = 3.0
-    object_bias_sigma_px: float = 0.5
-    nominal_rad: float = 0.2
-    nominal_m: float = 0.5
-    delay_sigma_s: float = 1.0
-    between_rad: float = 3.5e-4
-    between_m: float = 4e-3
+    bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
+    object_bias_sigma_px: float = setting(0.5, at_least=0.001, at_most=1000.0)
+    nominal_rad: float = setting(0.2, at_least=1e-5, at_most=100.0)
+    nominal_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
+    delay_sigma_s: float = setting(1.0, at_least=1e-6, at_most=100.0)
+    between_rad: float = setting(3.5e-4, at_least=0.0, at_most=10.0)
+    between_m: float = setting(4e-3, at_least=0.0, at_most=100.0)
     silhouettes: bool = True
     visual_odometry: bool = True
 

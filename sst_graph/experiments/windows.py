@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate
@@ -23,7 +24,7 @@ PARTS = (slice(0, 3), slice(3, 6), slice(6, 7))
 
 
 @dataclass(frozen=True)
-class WindowsConfig:
+class WindowsConfig(Settings):
     """Drives and how they are cut.
 
     Attributes:
@@ -34,14 +35,10 @@ class WindowsConfig:
         calibration: settings of the method.
     """
 
-    data: tuple[str, ...] = ()
-    windows: tuple[int, ...] = (2, 3, 4)
-    shift: int = 0
+    data: tuple[str, ...] = setting((), length=(0, 1000))
+    windows: tuple[int, ...] = setting((2, 3, 4), at_least=2, at_most=1000, length=(1, 100))
+    shift: int = setting(0, at_least=-1000, at_most=1000)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-
-    def __post_init__(self) -> None:
-        if not self.windows or min(self.windows) < 2:
-            raise ValueError(f"windows: found {list(self.windows)}, expected numbers from 2 on")
 
 
 def run(config: WindowsConfig, progress: Progress | None = None) -> str:

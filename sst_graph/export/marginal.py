@@ -21,12 +21,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.result import CalibrationResult, checked_pose
+from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
+from sst_graph.input_files import MARGINAL, parse_json, read_text
+from sst_graph.json_table import JsonTable, json_table
+from sst_graph.result import CalibrationResult
+from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
 
 FORMAT = "sst-graph/marginal"
 VERSION = 1
+
+MAX_INFORMATION = 1e24
+"""Of a sigma of 1e-12 rad, m or s."""
 
 EXTRINSIC = int(gtsam.symbol("E", 0))
 """Default key of the extrinsic cTl (Pose3)."""
@@ -36,8 +43,8 @@ DELAY = int(gtsam.symbol("D", 0))
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
 
 
-@dataclass(frozen=True)
-class CalibrationMarginal:
+@dataclass(frozen=True, eq=False)
+class CalibrationMarginal(ByValue):
     """A quadratic cost on extrinsic and time offset; the equation is the module's.
 
     Attributes:
@@ -114,22 +121,44 @@ class CalibrationMarginal:
         Raises:
             DataError: no such file's text.
         """
-        try:
-            document = json.loads(text)
-            found = (document["format"], document["version"])
-            if found != (FORMAT, VERSION):
-                raise DataError(place, f"{found[0]!r} version {found[1]!r}", f"{FORMAT!r} version {VERSION}")
-            point = document["linearization_point"]
-            pose = checked_pose(_array(point["T_camera_lidar"], (4, 4)), f"{place}: T_camera_lidar")
-            return CalibrationMarginal(
-                pose,
-                float(point["time_offset_s"]),
-                _array(document["information"], (7, 7)),
-                _array(document["vector"], (7,)),
-                float(document["constant"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise DataError(place, f"no marginal ({error!r})", f"JSON of format {FORMAT!r}") from error
+        table = json_table(parse_json(text, place, MARGINAL.name), place, FORMAT, VERSION)
+        point = table.table("linearization_point")
+        return CalibrationMarginal(
+            point.pose("T_camera_lidar"),
+            point.offset_s("time_offset_s"),
+            _information(table),
+            table.matrix("vector", (7,)),
+            table.number("constant"),
+        )
+
+
+def read_marginal(path: str | Path) -> CalibrationMarginal:
+    """The marginal in a file.
+
+    Raises:
+        DataError: missing, unreadable or no such file.
+    """
+    return CalibrationMarginal.from_json(read_text(path, MARGINAL), path)
+
+
+def _information(table: JsonTable) -> FloatArray:
+    """(7, 7) symmetric, positive semi-definite but for rounding."""
+    place = f"{table.place}: information"
+    L = table.matrix("information", (7, 7))
+    if np.abs(L).max() > MAX_INFORMATION:
+        raise DataError(place, f"{np.abs(L).max():.3g}", f"entries of at most {MAX_INFORMATION:g}")
+    diagonal = np.diag(L)
+    if (diagonal < 0.0).any():
+        raise DataError(place, f"{diagonal.min():.3g} on the diagonal", "at least 0")
+    # Of a direction that nothing tells there is no information: rounding is measured by the largest entry.
+    scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
+    unit = L / scale[:, None] / scale
+    if (np.abs(unit - unit.T) > 1e-6).any():
+        raise DataError(place, "a matrix that is not symmetric", "an information matrix")
+    least = float(np.linalg.eigvalsh(unit)[0])
+    if least < -1e-6:
+        raise DataError(place, f"the eigenvalue {least:.3g} (scaled)", "a positive semi-definite matrix")
+    return L
 
 
 def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
@@ -220,6 +249,7 @@ def fuse_graphs(
     *,
     tolerance_sigmas: float = 1e-4,
     max_rounds: int = 20,
+    significance: float = SIGNIFICANCE,
 ) -> tuple[CalibrationMarginal, list[CalibrationMarginal]]:
     """Drives fused through their marginals until that equals one graph of all of them.
 
@@ -233,49 +263,78 @@ def fuse_graphs(
         E_key, D_key: keys of extrinsic and time offset, the same in all.
         tolerance_sigmas: the fused estimate stands still when it moves by less [sigma].
         max_rounds: most rounds.
+        significance: as in :func:`fuse_marginals`. It holds for graphs whose noise models hold: one that
+            takes matches which err together for independent contradicts others too easily.
 
     Returns:
         The fused marginal, and those of the drives about the fused estimate.
 
     Raises:
+        ContradictionError: the drives contradict one another.
         EstimationError: a direction that no drive tells, or no standstill.
     """
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
-    fused = fuse_marginals(parts)
+    fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
         point = fused.cTl, fused.offset_s
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
-        fused = fuse_marginals(parts)
+        fused = fuse_marginals(parts, significance=significance)
         step = np.append(fused.cTl.localCoordinates(point[0]), fused.offset_s - point[1])
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
     raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
 
 
-def fuse_marginals(marginals: Sequence[CalibrationMarginal]) -> CalibrationMarginal:
+def fuse_marginals(
+    marginals: Sequence[CalibrationMarginal],
+    *,
+    names: Sequence[str] = (),
+    significance: float = SIGNIFICANCE,
+) -> CalibrationMarginal:
     """What several calibrations of the same pair of sensors know together; linearized at the optimum.
 
     Exact where all marginals share their linearization point. Otherwise each is carried to the common
     point by its first derivative, which holds while the points differ by little (a degree, a decimetre).
+    By how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
+    chi-squared, and so is what each differs from the others by: both are tested.
+
+    Args:
+        names: of the marginals, for the error; numbers from 0 where none are given.
+        significance: probability of an error where the marginals agree and their covariances hold; 0 fuses
+            whatever is given.
 
     Raises:
-        EstimationError: none given, or a direction that none of them tells.
+        ContradictionError: they contradict one another; the message names the worst and its step.
+        EstimationError: none given, a direction that none of them tells, or no optimum.
     """
     if not marginals:
         raise EstimationError("no marginal to fuse")
+    if names and len(names) != len(marginals):
+        raise EstimationError(f"found {len(names)} names, expected {len(marginals)}, one a marginal")
     fused = marginals[0]
-    for _ in range(3):  # the point moves towards the optimum; the second round already stands still
+    for _ in range(_MAX_ROUNDS):
         parts = [_carried(marginal, fused.cTl, fused.offset_s) for marginal in marginals]
-        fused = CalibrationMarginal(
+        total = CalibrationMarginal(
             fused.cTl,
             fused.offset_s,
             sum((part.information for part in parts), np.zeros((7, 7))),
             sum((part.vector for part in parts), np.zeros(7)),
             sum(part.constant for part in parts),
         )
-        cTl, offset_s = fused.best()
-        fused = _carried(fused, cTl, offset_s)
+        step = total.covariance() @ total.vector
+        fused = _carried(total, *total.best())
+        if np.sqrt(max(float(step @ total.vector), 0.0)) < _STANDSTILL_SIGMAS:
+            break
+    else:
+        raise EstimationError(
+            f"fusion of {len(marginals)} marginals: still moving after {_MAX_ROUNDS} rounds"
+        )
+    check_agreement([(part.information, part.vector) for part in parts], fused.cTl, names, significance)
     return fused
+
+
+_MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6
+"""Most rounds of a fusion, which ends when its optimum moves by less than so many sigmas."""
 
 
 def _carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> CalibrationMarginal:
@@ -330,10 +389,3 @@ def _dump(document: dict[str, Any]) -> str:
             text = f"[\n  {rows}\n ]"
         lines.append(f" {json.dumps(key)}: {text}")
     return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def _array(value: Any, shape: tuple[int, ...]) -> FloatArray:
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"an array of shape {array.shape}, expected {shape}, all finite")
-    return array

@@ -6,6 +6,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
+from sst_graph.errors import DataError
 from sst_graph.types import Scan
 
 FloatArray = NDArray[np.float64]
@@ -96,7 +97,13 @@ _COARSER = 2.0
 
 
 def surfaces(points: FloatArray, neighbours: int) -> small_gicp.PointCloud:
-    """Points (n, 3) or homogeneous (n, 4) [m] with the covariance of the surface around each."""
+    """Points (n, 3) or homogeneous (n, 4) [m] with the covariance of the surface around each.
+
+    Raises:
+        DataError: another shape, or NaN or inf, on which small_gicp ends the process.
+    """
+    if points.ndim != 2 or points.shape[1] not in (3, 4) or not np.isfinite(points).all():
+        raise DataError("points to register", f"an array {points.shape} or NaN", "(n, 3) or (n, 4), finite")
     cloud = small_gicp.PointCloud(points)
     small_gicp.estimate_normals_covariances(cloud, num_neighbors=neighbours, num_threads=1)
     return cloud

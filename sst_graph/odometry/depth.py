@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from factors.camera import PinholeCamera
+from sst_graph.config import Settings, setting
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class DepthConfig:
+class DepthConfig(Settings):
     """When LiDAR points around a feature tell its depth.
 
     Attributes:
@@ -27,12 +28,12 @@ class DepthConfig:
         range_sigma: relative sigma of a depth that even a perfect plane keeps.
     """
 
-    neighbours: int = 8
-    radius_px: float = 16.0
-    max_spread: float = 1.3
-    max_residual: float = 0.02
-    max_leverage: float = 0.7
-    range_sigma: float = 0.005
+    neighbours: int = setting(8, at_least=3, at_most=100)
+    radius_px: float = setting(16.0, at_least=1.0, at_most=500.0)
+    max_spread: float = setting(1.3, at_least=1.0, at_most=100.0)
+    max_residual: float = setting(0.02, at_least=0.0001, at_most=10.0)
+    max_leverage: float = setting(0.7, at_least=0.01, at_most=100.0)
+    range_sigma: float = setting(0.005, at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)

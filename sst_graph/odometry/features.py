@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -24,7 +25,7 @@ UNTRACKED_CLASSES = (
 
 
 @dataclass(frozen=True)
-class FeatureConfig:
+class FeatureConfig(Settings):
     """Which corners are tracked, and when a track counts.
 
     Attributes:
@@ -37,13 +38,13 @@ class FeatureConfig:
         max_round_trip_px: largest distance between a corner and its track there and back [px].
     """
 
-    threshold: int = 12
-    cell_px: int = 32
-    per_cell: int = 2
-    mask_margin_px: int = 5
-    window_px: int = 17
-    levels: int = 4
-    max_round_trip_px: float = 0.5
+    threshold: int = setting(12, at_least=1, at_most=255)
+    cell_px: int = setting(32, at_least=4, at_most=1000)
+    per_cell: int = setting(2, at_least=1, at_most=1000)
+    mask_margin_px: int = setting(5, at_least=0, at_most=100)
+    window_px: int = setting(17, at_least=3, at_most=101)
+    levels: int = setting(4, at_least=0, at_most=10)
+    max_round_trip_px: float = setting(0.5, at_least=0.01, at_most=100.0)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ class FeatureTracker:
         self._last: tuple[CameraImage, NDArray[np.uint8]] | None = None
 
     def add(self, image: CameraImage) -> Tracks | None:
-        """Tracks from the image before to this one; None for the first.
+        """Tracks from the image before to this one; None for the first, none where a picture is missing.
 
         Raises:
             DataError: the image is not later than the one before, or of another size.
@@ -84,13 +85,17 @@ class FeatureTracker:
         image_a, gray_a = last
         if image.stamp_ns <= image_a.stamp_ns:
             raise DataError("visual odometry", f"stamp {image.stamp_ns}", f"one after {image_a.stamp_ns} ns")
+        if not (image.has_picture and image_a.has_picture):
+            return Tracks(image_a.stamp_ns, image.stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)))
         if gray.shape != gray_a.shape:
             raise DataError("visual odometry", f"image {gray.shape}", f"the size before, {gray_a.shape}")
         corners = detect_corners(gray_a, trackable_area(image_a, self.config), self.config)
         uv_a, uv_b = _track(gray_a, gray, corners, self.config)
         # A corner that slid on to something that may move is no landmark.
         column, row = np.rint(uv_b).astype(np.intp).T
-        still = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
+        still = np.full(len(uv_b), True)
+        if image.has_mask:
+            still = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
         return Tracks(image_a.stamp_ns, image.stamp_ns, uv_a[still], uv_b[still])
 
 
@@ -132,7 +137,9 @@ def detect_corners(
 
 
 def trackable_area(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
-    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin."""
+    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask."""
+    if not image.has_mask:
+        return np.full(image.mask.shape, 255, np.uint8)
     table = np.zeros(256, np.uint8)
     table[list(UNTRACKED_CLASSES)] = 255
     width = 2 * config.mask_margin_px + 1
@@ -141,7 +148,9 @@ def trackable_area(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint
 
 
 def gray_of(image: CameraImage) -> NDArray[np.uint8]:
-    """(h, w) grey picture."""
+    """(h, w) grey picture; empty without one."""
+    if not image.has_picture:
+        return np.zeros((0, 0), np.uint8)
     return np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
 from sst_graph.odometry.movers import MoverConfig, StandingObjects
@@ -23,12 +24,14 @@ MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TW
 """Classes whose members may move by themselves."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
+_MOST_RINGS = 30
+"""Most rings of shifts that are tried where the speed is unknown: each takes 8 registrations."""
 SETTLED_M = 5e-3
 """Sweep compensation has settled where another pass would move no point farther than this [m]."""
 
 
 @dataclass(frozen=True)
-class LidarOdometryConfig:
+class LidarOdometryConfig(Settings):
     """How scans are thinned, registered and trusted.
 
     Attributes:
@@ -59,34 +62,40 @@ class LidarOdometryConfig:
         failed_rad, failed_m: sigmas of a motion that was only predicted [rad, m].
     """
 
-    voxel_m: float = 0.2
-    min_voxel_m: float = 0.1
-    max_voxel_m: float = 1.0
-    target_points: int = 3000
-    map_voxel_m: float = 0.4
-    map_age: int = 20
-    near_m: float = 1.0
-    far_m: float = 100.0
-    max_points: int = 40_000
-    min_points: int = 200
-    neighbours: int = 6
-    plane_ratio: float = 0.5
-    max_distance_m: float = 1.0
-    max_iterations: int = 30
-    search_m: float = 3.0
-    search_step_m: float = 0.6
-    search_iterations: int = 6
-    rest_m: float = 0.02
-    rest_inlier_ratio: float = 0.65
-    missed_cost: float = 1.0
-    min_inlier_ratio: float = 0.3
-    compensations: int = 3
+    voxel_m: float = setting(0.2, at_least=0.02, at_most=10.0)
+    min_voxel_m: float = setting(0.1, at_least=0.02, at_most=10.0)
+    max_voxel_m: float = setting(1.0, at_least=0.02, at_most=10.0)
+    target_points: int = setting(3000, at_least=10, at_most=1_000_000)
+    map_voxel_m: float = setting(0.4, at_least=0.02, at_most=10.0)
+    map_age: int = setting(20, at_least=1, at_most=1000)
+    near_m: float = setting(1.0, at_least=0.0, at_most=100.0)
+    far_m: float = setting(100.0, at_least=1.0, at_most=300.0)
+    max_points: int = setting(40_000, at_least=10, at_most=10_000_000)
+    min_points: int = setting(200, at_least=10, at_most=1_000_000)
+    neighbours: int = setting(6, at_least=5, at_most=100)
+    plane_ratio: float = setting(0.5, at_least=0.0, at_most=1000.0)
+    max_distance_m: float = setting(1.0, at_least=0.01, at_most=100.0)
+    max_iterations: int = setting(30, at_least=1, at_most=1000)
+    search_m: float = setting(3.0, at_least=0.0, at_most=100.0)
+    search_step_m: float = setting(0.6, at_least=0.05, at_most=10.0)
+    search_iterations: int = setting(6, at_least=1, at_most=100)
+    rest_m: float = setting(0.02, at_least=0.0, at_most=10.0)
+    rest_inlier_ratio: float = setting(0.65, at_least=0.0, at_most=1.0)
+    missed_cost: float = setting(1.0, at_least=0.0, at_most=1e6)
+    min_inlier_ratio: float = setting(0.3, at_least=0.0, at_most=1.0)
+    compensations: int = setting(3, at_least=1, at_most=20)
     movers: MoverConfig = field(default_factory=MoverConfig)
-    inflation: float = 2.0
-    floor_rad: float = 1e-4
-    floor_m: float = 2e-3
-    failed_rad: float = 0.1
-    failed_m: float = 2.0
+    inflation: float = setting(2.0, at_least=0.01, at_most=1000.0)
+    floor_rad: float = setting(1e-4, at_least=0.0, at_most=10.0)
+    floor_m: float = setting(2e-3, at_least=0.0, at_most=100.0)
+    failed_rad: float = setting(0.1, at_least=0.0001, at_most=100.0)
+    failed_m: float = setting(2.0, at_least=0.0001, at_most=1000.0)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("min_voxel_m", self.max_voxel_m, "max_voxel_m")
+        self.expect_at_most("near_m", self.far_m, "far_m")
+        self.expect_at_most("min_points", self.max_points, "max_points")
+        self.expect_at_most("search_m", _MOST_RINGS * self.search_step_m, f"{_MOST_RINGS} search_step_m")
 
 
 class LidarOdometry:

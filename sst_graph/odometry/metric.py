@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.depth import DepthConfig, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import DirectionMotion, huber_weights, rays, skew
@@ -25,7 +26,7 @@ PAIR_KNEE, PAIR_GATE = 2.0, 4.5
 
 
 @dataclass(frozen=True)
-class MetricConfig:
+class MetricConfig(Settings):
     """How metric motion is estimated from tracks and depth.
 
     Attributes:
@@ -43,17 +44,17 @@ class MetricConfig:
     """
 
     depth: DepthConfig = field(default_factory=DepthConfig)
-    min_depths: int = 10
-    min_noise_px: float = 0.05
-    nearest_m: float = 1.0
-    prior_inverse_m: float = 0.05
-    prior_sigma_inverse_m: float = 0.1
-    iterations: int = 15
-    scale_sigma: float = 0.006
-    floor_rad: float = 1e-4
-    floor_m: float = 2e-3
-    failed_rad: float = 0.1
-    failed_m: float = 3.0
+    min_depths: int = setting(10, at_least=3, at_most=100_000)
+    min_noise_px: float = setting(0.05, at_least=0.001, at_most=10.0)
+    nearest_m: float = setting(1.0, at_least=0.01, at_most=100.0)
+    prior_inverse_m: float = setting(0.05, at_least=0.0, at_most=10.0)
+    prior_sigma_inverse_m: float = setting(0.1, at_least=0.0001, at_most=10.0)
+    iterations: int = setting(15, at_least=1, at_most=100)
+    scale_sigma: float = setting(0.006, at_least=0.0, at_most=1.0)
+    floor_rad: float = setting(1e-4, at_least=0.0, at_most=10.0)
+    floor_m: float = setting(2e-3, at_least=0.0, at_most=100.0)
+    failed_rad: float = setting(0.1, at_least=0.0001, at_most=100.0)
+    failed_m: float = setting(3.0, at_least=0.0001, at_most=1000.0)
 
 
 def metric_motion(

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.config import Settings, setting
+
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class MoverConfig:
+class MoverConfig(Settings):
     """When an object of a movable class counts as standing.
 
     Attributes:
@@ -26,11 +28,11 @@ class MoverConfig:
         share: part of an object's points that must lie within it.
     """
 
-    memory_s: float = 0.6
-    cell_m: float = 0.4
-    voxel_m: float = 0.15
-    slack_m: float = 0.15
-    share: float = 0.75
+    memory_s: float = setting(0.6, at_least=0.0, at_most=30.0)
+    cell_m: float = setting(0.4, at_least=0.1, at_most=10.0)
+    voxel_m: float = setting(0.15, at_least=0.02, at_most=5.0)
+    slack_m: float = setting(0.15, at_least=0.001, at_most=10.0)
+    share: float = setting(0.75, at_least=0.0, at_most=1.0)
 
 
 class StandingObjects:

@@ -15,6 +15,7 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import registration_cloud, usable_points
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
@@ -24,7 +25,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class RegistrationConfig:
+class RegistrationConfig(Settings):
     """How two scans are registered and trusted.
 
     Attributes:
@@ -42,25 +43,28 @@ class RegistrationConfig:
         failed_rad, failed_m: sigmas of a motion that was only guessed [rad, m].
     """
 
-    voxel_m: float = 0.3
-    near_m: float = 1.0
-    far_m: float = 100.0
-    max_points: int = 60_000
-    min_points: int = 200
-    neighbours: int = 10
-    plane_ratio: float = 0.5
-    max_distance_m: float = 1.0
-    max_iterations: int = 40
-    min_inlier_ratio: float = 0.3
-    inflation: float = 2.0
-    floor_rad: float = 1e-4
-    floor_m: float = 2e-3
-    failed_rad: float = 0.1
-    failed_m: float = 2.0
+    voxel_m: float = setting(0.3, at_least=0.02, at_most=10.0)
+    near_m: float = setting(1.0, at_least=0.0, at_most=100.0)
+    far_m: float = setting(100.0, at_least=1.0, at_most=300.0)
+    max_points: int = setting(60_000, at_least=10, at_most=10_000_000)
+    min_points: int = setting(200, at_least=10, at_most=1_000_000)
+    neighbours: int = setting(10, at_least=5, at_most=100)
+    plane_ratio: float = setting(0.5, at_least=0.0, at_most=1000.0)
+    max_distance_m: float = setting(1.0, at_least=0.01, at_most=100.0)
+    max_iterations: int = setting(40, at_least=1, at_most=1000)
+    min_inlier_ratio: float = setting(0.3, at_least=0.0, at_most=1.0)
+    inflation: float = setting(2.0, at_least=0.01, at_most=1000.0)
+    floor_rad: float = setting(1e-4, at_least=0.0, at_most=10.0)
+    floor_m: float = setting(2e-3, at_least=0.0, at_most=100.0)
+    failed_rad: float = setting(0.1, at_least=0.0001, at_most=100.0)
+    failed_m: float = setting(2.0, at_least=0.0001, at_most=1000.0)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("near_m", self.far_m, "far_m")
 
 
 @dataclass(frozen=True)
-class LoopConfig:
+class LoopConfig(Settings):
     """Which scans are tried as loop closures.
 
     Attributes:
@@ -70,10 +74,10 @@ class LoopConfig:
         min_inlier_ratio: a closure needs this fraction of its points paired.
     """
 
-    every: int = 4
-    min_seconds: float = 2.0
-    max_distance_m: float = 4.0
-    min_inlier_ratio: float = 0.5
+    every: int = setting(4, at_least=1, at_most=100_000)
+    min_seconds: float = setting(2.0, at_least=0.001, at_most=1e6)
+    max_distance_m: float = setting(4.0, at_least=0.0, at_most=1000.0)
+    min_inlier_ratio: float = setting(0.5, at_least=0.0, at_most=1.0)
 
 
 @dataclass(frozen=True)

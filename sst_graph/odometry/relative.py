@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.features import Tracks
 
 FloatArray = NDArray[np.float64]
@@ -20,7 +21,7 @@ EPIPOLE_PX = 40.0
 
 
 @dataclass(frozen=True)
-class RelativeConfig:
+class RelativeConfig(Settings):
     """How the epipolar geometry of two images is found.
 
     Attributes:
@@ -32,12 +33,12 @@ class RelativeConfig:
         iterations: Gauss-Newton steps of the refinement.
     """
 
-    threshold_px: float = 1.0
-    confidence: float = 0.999
-    min_tracks: int = 20
-    min_noise_px: float = 0.05
-    min_parallax_ratio: float = 4.0
-    iterations: int = 8
+    threshold_px: float = setting(1.0, at_least=0.01, at_most=100.0)
+    confidence: float = setting(0.999, at_least=0.1, at_most=0.999999)
+    min_tracks: int = setting(20, at_least=6, at_most=100_000)
+    min_noise_px: float = setting(0.05, at_least=0.001, at_most=10.0)
+    min_parallax_ratio: float = setting(4.0, at_least=0.0, at_most=1000.0)
+    iterations: int = setting(8, at_least=1, at_most=100)
 
 
 @dataclass(frozen=True)

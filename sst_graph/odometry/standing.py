@@ -9,11 +9,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.types import RelativeMotion
 
 
 @dataclass(frozen=True)
-class StandingConfig:
+class StandingConfig(Settings):
     """What counts as standing.
 
     Attributes:
@@ -26,13 +27,13 @@ class StandingConfig:
             seem to move.
     """
 
-    max_speed_mps: float = 0.07
-    max_turn_radps: float = 0.03
-    certainty: float = 2.0
-    min_motions: int = 2
-    longest_stretch: int = 4
-    rest_sigma_rad: float = 2e-5
-    rest_sigma_m: float = 2e-4
+    max_speed_mps: float = setting(0.07, at_least=0.0, at_most=10.0)
+    max_turn_radps: float = setting(0.03, at_least=0.0, at_most=10.0)
+    certainty: float = setting(2.0, at_least=0.0, at_most=100.0)
+    min_motions: int = setting(2, at_least=1, at_most=1000)
+    longest_stretch: int = setting(4, at_least=1, at_most=50)
+    rest_sigma_rad: float = setting(2e-5, at_least=1e-7, at_most=1.0)
+    rest_sigma_m: float = setting(2e-4, at_least=1e-7, at_most=1.0)
 
 
 def standing_frames(

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
+from sst_graph.config import Settings
 from sst_graph.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from sst_graph.odometry.metric import MetricConfig, metric_motion
 from sst_graph.odometry.relative import DirectionMotion, RelativeConfig, relative_pose
@@ -26,7 +27,7 @@ DepthProvider = Callable[[int], FloatArray]
 
 
 @dataclass(frozen=True)
-class VisualOdometryConfig:
+class VisualOdometryConfig(Settings):
     """The stages of visual odometry.
 
     Attributes:

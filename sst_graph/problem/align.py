@@ -44,11 +44,13 @@ class FrameAlignments:
         alignments: for :func:`factors.frame_factor` or :func:`factors.pose_alignment_factor`.
         objects: of each alignment, (n,) number of the object within its scan that each match lies on, for
             mask biases by object (:class:`factors.GroupedBias`).
+        sides: of each alignment, (n,) side of the object: 0 left, 1 right, 2 top, 3 bottom.
     """
 
     classes: tuple[SemanticClass, ...]
     alignments: tuple[Alignment, ...]
     objects: tuple[NDArray[np.intp], ...]
+    sides: tuple[NDArray[np.intp], ...] = ()
 
     def __len__(self) -> int:
         """Number of matches."""
@@ -98,8 +100,7 @@ def align_frame(
         DataError: one of ``lTs`` and ``from_ns``, or both with velocities; arrays of a wrong shape.
     """
     _check_time(lTs, from_ns, l_velocities)
-    points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
-    contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
+    points, contours = features_of(scan, image, classes)
     boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
     found = match_silhouettes(
         boundaries,
@@ -115,6 +116,15 @@ def align_frame(
         velocities_of_points(_velocities(l_velocities or {}), boundaries),
     )
     return _frame_alignments(found)
+
+
+def features_of(
+    scan: Scan | ScanFeatures, image: CameraImage | ImageFeatures, classes: Sequence[SemanticClass]
+) -> tuple[ScanFeatures, ImageFeatures]:
+    """What :func:`align_frame` needs of a scan and an image."""
+    points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
+    contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
+    return points, contours
 
 
 def _check_time(
@@ -133,6 +143,7 @@ def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> Frame
         tuple(found),
         tuple(matches.alignment for matches in found.values()),
         tuple(matches.objects for matches in found.values()),
+        tuple(matches.sides for matches in found.values()),
     )
 
 

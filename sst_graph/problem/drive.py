@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,14 +14,18 @@ from factors.camera import PinholeCamera
 from sst_graph.association.boundary import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.association.contour import ContourMap
 from sst_graph.association.picture_edges import PictureConfig
+from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.chains import ChainTracker, FeatureChain
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
-from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
+
+_LOG = logging.getLogger(__name__)
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -28,7 +33,7 @@ Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)
-class PrepareConfig:
+class PrepareConfig(Settings):
     """What is taken from every frame.
 
     Attributes:
@@ -45,7 +50,7 @@ class PrepareConfig:
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
     use_visual_odometry: bool = True
-    sample_points: int = 3000
+    sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
 
 
 @dataclass(frozen=True)
@@ -96,6 +101,42 @@ class ImageFeatures:
             object.__setattr__(self, name, value)
 
 
+@dataclass
+class LeftOut:
+    """What a drive lacked, counted while it was read; the rest of it was used.
+
+    Attributes:
+        points: that were NaN or inf.
+        scans_with_such_points: scans that held some.
+        scans_without_labels: these show motion only.
+        images_without_mask: nothing is associated with these.
+        images_without_picture: these have no image features, and contours that follow the mask alone.
+    """
+
+    points: int = 0
+    scans_with_such_points: int = 0
+    scans_without_labels: int = 0
+    images_without_mask: int = 0
+    images_without_picture: int = 0
+
+    def add(self, frame: Frame) -> None:
+        """Count what a frame lacks; a scan without points lacks nothing."""
+        if frame.scan is not None:
+            self.points += frame.scan.left_out
+            self.scans_with_such_points += frame.scan.left_out > 0
+            self.scans_without_labels += len(frame.scan.points) > 0 and not frame.scan.has_labels
+        if frame.image is not None:
+            self.images_without_mask += not frame.image.has_mask
+            self.images_without_picture += not frame.image.has_picture
+
+    def counts(self) -> dict[str, int]:
+        """What was found missing at least once, by name."""
+        return {name: int(count) for name, count in vars(self).items() if count}
+
+    def __str__(self) -> str:
+        return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items())
+
+
 @dataclass(frozen=True)
 class Drive:
     """A drive, reduced to what calibration needs.
@@ -106,6 +147,8 @@ class Drive:
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
+        left_out: what the data lacked.
+        survey: what the raw frames show, for the search for causes; None where nobody looked.
         chains: corners followed through several images, where image features are tracked.
     """
 
@@ -115,6 +158,8 @@ class Drive:
     images: tuple[ImageFeatures, ...]
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
+    left_out: LeftOut = field(default_factory=LeftOut)
+    survey: Survey | None = None
     chains: tuple[FeatureChain, ...] = ()
 
     @property
@@ -130,6 +175,10 @@ class Drive:
         """Median interval between images [s]; 0.1 for a single one."""
         stamps = self.image_stamps_ns
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def part(self, scans: Sequence[int]) -> Drive:
+        """The drive with some of its scans only, by position, rising; all images and motions stay."""
+        return replace(self, scans=tuple(self.scans[position] for position in scans))
 
     @property
     def scan_period_s(self) -> float:
@@ -162,7 +211,10 @@ def prepare_drive(
     tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
+    left_out, surveyor = LeftOut(), Surveyor(source.name, source.camera, total)
     for position, frame in enumerate(source):
+        left_out.add(frame)
+        surveyor.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
@@ -181,6 +233,8 @@ def prepare_drive(
     if not scans or not images:
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
+    if left_out.counts():
+        _LOG.warning("%s: left out: %s", source.name, left_out)
     return Drive(
         source.name,
         source.camera,
@@ -188,6 +242,8 @@ def prepare_drive(
         tuple(images),
         tuple(motions),
         tuple(pairs),
+        left_out,
+        surveyor.survey(),
         follower.chains(),
     )
 

@@ -23,9 +23,19 @@ from sst_graph.association.silhouettes import (
 )
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.assumptions.model import Scene
+from sst_graph.config import Settings, setting
+from sst_graph.errors import ConfigError
 from sst_graph.problem.drive import Drive, outlines
 from sst_graph.problem.nuisances import deviation_of, moved_twist, residual_columns
-from sst_graph.problem.objects import Mover, ObjectId, moving_objects, numbers_in, of_each, standing_share
+from sst_graph.problem.objects import (
+    Mover,
+    ObjectId,
+    moving_objects,
+    numbers_in,
+    of_each,
+    standing_share,
+    tracks_of_scans,
+)
 from sst_graph.problem.state import (
     EXTRINSIC,
     State,
@@ -47,7 +57,7 @@ _Share = Callable[[SemanticClass, NDArray[np.intp]], FloatArray | None]
 
 
 @dataclass(frozen=True)
-class GraphConfig:
+class GraphConfig(Settings):
     """Priors and limits of the joint graph.
 
     Attributes:
@@ -71,16 +81,22 @@ class GraphConfig:
 
     match: MatchConfig = field(default_factory=MatchConfig)
     undersides: tuple[SemanticClass, ...] = ()
-    max_interval_periods: float = 1.0
-    bias_sigma_px: float = 3.0
-    object_bias_sigma_px: float = 0.5
-    underside_bias_sigma_px: float = 2.0
-    delay_sigma_s: float = 0.3
-    rest_sigma_rad: float = 1.0
-    rest_sigma_m: float = 0.5
-    mover_reach_m: float = 0.003
-    still_sigma: tuple[float, float] = (0.05, 0.5)
-    estimate: Mapping[str, float] = field(default_factory=dict)
+    max_interval_periods: float = setting(1.0, at_least=0.01, at_most=20.0)
+    bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
+    object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
+    underside_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
+    delay_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
+    rest_sigma_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
+    rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
+    mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
+    still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
+    estimate: tuple[tuple[str, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if 0.0 < self.object_bias_sigma_px < 0.001:
+            raise ConfigError(
+                f"object_bias_sigma_px: found {self.object_bias_sigma_px:g}, expected 0 or at least 0.001 px"
+            )
 
 
 @dataclass(frozen=True)
@@ -145,6 +161,16 @@ class Tracks:
         """The same twists of one drive, with other object tracks and moving objects."""
         other = Tracks([])
         other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
+        return other
+
+    def part(self, drive: int, scans: Sequence[int]) -> Tracks:
+        """Of :meth:`Drive.part <sst_graph.problem.drive.Drive.part>` of one drive, which becomes drive 0."""
+        other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
+        other._tracks = [self._tracks[drive]]
+        if self.objects is not None:
+            other.objects = [tracks_of_scans(self.objects[drive], scans)]
+            moving = self._movers[drive]
+            other._movers = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
     def movers(self, drive: int, scan: int) -> Movers:
@@ -218,7 +244,7 @@ def associate(
                 )
                 at = state.cTl, offset_s, motion.c_twist
                 terms = {
-                    c: residual_columns(m.alignment, scene, pair.base_tau_s, at, config.estimate)
+                    c: residual_columns(m.alignment, scene, pair.base_tau_s, at, dict(config.estimate))
                     for c, m in matches.items()
                     if config.estimate
                 }
@@ -356,7 +382,7 @@ def _add_nuisances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
 ) -> None:
     """The parameters that are estimated, with what is known of them beforehand."""
-    for name, sigma in config.estimate.items():
+    for name, sigma in config.estimate:
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.PriorFactorVector(nuisance_key(name), np.zeros(1), noise))
         values.insert(nuisance_key(name), np.array([state.nuisances.get(name, 0.0)]))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from factors import delay_prior, hand_eye_factor, rotation_hand_eye
 from factors.robust import RobustKernel
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.relative import DirectionMotion
 from sst_graph.odometry.standing import StandingConfig, at_rest
 from sst_graph.problem.drive import Drive
@@ -69,7 +70,7 @@ class NoiseScales:
 
 
 @dataclass(frozen=True)
-class HandEyePriors:
+class HandEyePriors(Settings):
     """Deviations from the guess: so wide that they matter only where the motion says nothing.
 
     Attributes:
@@ -77,9 +78,9 @@ class HandEyePriors:
         offset_s: of the time offset.
     """
 
-    rotation_rad: float = 1.0
-    translation_m: float = 0.5
-    offset_s: float = 0.3
+    rotation_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
+    translation_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
+    offset_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
 
 
 def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list[CameraStep]:

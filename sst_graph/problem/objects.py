@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.boundary import Boundaries
+from sst_graph.config import Settings, setting
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.persistence import ObjectName, Persistence
 from sst_graph.problem.velocity import ObjectVelocity, Velocities
@@ -33,7 +34,7 @@ _REACH_M = 2.0
 
 
 @dataclass(frozen=True)
-class MovingConfig:
+class MovingConfig(Settings):
     """What counts as an object that moves by itself.
 
     Attributes:
@@ -44,11 +45,11 @@ class MovingConfig:
         max_scatter: largest rms distance from a steady motion, as a share of the way.
     """
 
-    window_s: float = 0.8
-    min_sightings: int = 4
-    min_speed_mps: float = 1.0
-    min_travel_m: float = 0.8
-    max_scatter: float = 0.1
+    window_s: float = setting(0.8, at_least=0.01, at_most=60.0)
+    min_sightings: int = setting(4, at_least=2, at_most=1000)
+    min_speed_mps: float = setting(1.0, at_least=0.0, at_most=100.0)
+    min_travel_m: float = setting(0.8, at_least=0.0, at_most=1000.0)
+    max_scatter: float = setting(0.1, at_least=0.0, at_most=10.0)
 
 
 class ObjectTracker:
@@ -117,6 +118,12 @@ def object_tracks(drive: Drive) -> dict[ObjectId, int]:
         for (c, number), track in tracker.add(drive.scans[position].boundaries, wTl).items():
             tracks[position, c, number] = track
     return tracks
+
+
+def tracks_of_scans(tracks: Mapping[ObjectId, int], scans: Sequence[int]) -> dict[ObjectId, int]:
+    """Tracks of the objects of some scans (positions, rising), which are numbered anew from 0."""
+    place = {position: k for k, position in enumerate(scans)}
+    return {(place[scan], c, n): track for (scan, c, n), track in tracks.items() if scan in place}
 
 
 @dataclass(frozen=True)

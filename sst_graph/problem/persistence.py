@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.problem.drive import ScanFeatures
 from sst_graph.types import SemanticClass
@@ -27,7 +28,7 @@ ObjectName = tuple[SemanticClass, int]
 
 
 @dataclass(frozen=True)
-class PersistenceConfig:
+class PersistenceConfig(Settings):
     """When an object stays where it is.
 
     Attributes:
@@ -41,13 +42,18 @@ class PersistenceConfig:
         most_inside: points of a class, beside its outlines, among which they are (about).
     """
 
-    horizons_s: tuple[float, ...] = (0.1, 0.3)
-    reach_m: float = 0.2
-    reach_ratio: float = 0.008
-    lost: float = 0.35
-    kept: float = 0.55
-    most_points: int = 48
-    most_inside: int = 1000
+    horizons_s: tuple[float, ...] = setting(
+        (0.1, 0.3), at_least=0.01, at_most=10.0, length=(1, 5), order="increasing"
+    )
+    reach_m: float = setting(0.2, at_least=0.001, at_most=10.0)
+    reach_ratio: float = setting(0.008, at_least=0.0, at_most=1.0)
+    lost: float = setting(0.35, at_least=0.0, at_most=1.0)
+    kept: float = setting(0.55, at_least=0.0, at_most=1.0)
+    most_points: int = setting(48, at_least=1, at_most=10_000)
+    most_inside: int = setting(1000, at_least=1, at_most=1_000_000)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("lost", self.kept, "kept")
 
 
 _SPEED = 0.6

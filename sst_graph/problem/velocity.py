@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from sst_graph.association.boundary import Boundaries, Edge
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.problem.drive import ScanFeatures
 from sst_graph.problem.persistence import ObjectName
@@ -25,7 +26,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class VelocityConfig:
+class VelocityConfig(Settings):
     """When an object is followed well enough.
 
     Attributes:
@@ -46,19 +47,19 @@ class VelocityConfig:
             along with the LiDAR, and the rest of the outline does not.
     """
 
-    window_s: float = 0.35
-    min_sightings: int = 4
-    least_mps: float = 1.0
-    least_sigmas: float = 3.0
-    least_points: int = 8
-    end: float = 0.02
-    max_scatter_m: float = 0.25
-    acceleration_mps2: float = 1.0
-    floor_mps: float = 0.03
-    memory_s: float = 0.8
-    reach_m: float = 0.2
-    kept: float = 0.4
-    gained: float = 0.2
+    window_s: float = setting(0.35, at_least=0.01, at_most=10.0)
+    min_sightings: int = setting(4, at_least=2, at_most=1000)
+    least_mps: float = setting(1.0, at_least=0.0, at_most=100.0)
+    least_sigmas: float = setting(3.0, at_least=0.0, at_most=100.0)
+    least_points: int = setting(8, at_least=1, at_most=10_000)
+    end: float = setting(0.02, at_least=0.0, at_most=0.5)
+    max_scatter_m: float = setting(0.25, at_least=0.0, at_most=10.0)
+    acceleration_mps2: float = setting(1.0, at_least=0.0, at_most=100.0)
+    floor_mps: float = setting(0.03, at_least=0.0001, at_most=10.0)
+    memory_s: float = setting(0.8, at_least=0.0, at_most=10.0)
+    reach_m: float = setting(0.2, at_least=0.001, at_most=10.0)
+    kept: float = setting(0.4, at_least=0.0, at_most=1.0)
+    gained: float = setting(0.2, at_least=-1.0, at_most=1.0)
 
 
 @dataclass(frozen=True)
@@ -222,8 +223,10 @@ class _Seen:
     def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _Seen:
         outlines = {}
         for c in MOVABLE_CLASSES:
-            if (points := scan.boundaries.get(c)) is not None and len(points):
-                points = points.take(np.flatnonzero(points.edges == Edge.SIDE))
+            if (points := scan.boundaries.get(c)) is None:
+                continue
+            points = points.take(np.flatnonzero(points.edges == Edge.SIDE))
+            if len(points):
                 wPs = points.lPs @ wTl.rotation().matrix()[:2].T + wTl.translation()[:2]
                 order = np.argsort(points.objects, kind="stable")
                 numbers, starts = np.unique(points.objects[order], return_index=True)

@@ -11,60 +11,95 @@ the solve itself claims,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, make_dataclass, replace
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError
-from sst_graph.problem.graph import PairMatches
+from sst_graph.problem.graph import GraphConfig, PairMatches, joint_graph
 from sst_graph.problem.nuisances import residual_columns
 from sst_graph.problem.state import State, twist_key
 from sst_graph.uncertainty.covariance import MatchTable, RobustCovariance
+from sst_graph.uncertainty.marginal import marginal_covariance
 
 FloatArray = NDArray[np.float64]
 
+BUDGET = "sigma_budget"
+"""Key of :func:`budget` among a result's diagnostics."""
+
+
+_Sigmas = make_dataclass(
+    "_Sigmas",
+    [
+        (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
+        for name, each in ASSUMPTIONS.items()
+    ],
+    bases=(Settings,),
+    frozen=True,
+)
+if TYPE_CHECKING:
+
+    class AssumptionSigmas(Settings):
+        """Deviation of each assumption's parameter, by its name, in its unit; 0: it holds exactly."""
+else:
+    AssumptionSigmas = _Sigmas
+
 
 @dataclass(frozen=True)
-class AssumptionConfig:
+class AssumptionConfig(Settings):
     """What is taken for granted, and how far it may be wrong.
 
     Attributes:
-        sigmas: deviation of an assumption's parameter, by its name, in its unit; 0: it holds exactly. What is
-            not named has the deviation that a careful set-up leaves (``sst_graph.assumptions``).
-        estimate: assumptions whose parameters are variables of the answer, with the deviation of each from 0
-            beforehand, in its unit.
+        sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
+            what a careful set-up leaves (``sst_graph.assumptions`` names their sources).
+        estimate: assumptions whose parameters are variables of the answer: ``name``, or ``name=sigma`` with
+            the deviation from 0 beforehand, in its unit.
         test: test the assumptions against the data.
         threshold: an estimate of a parameter farther from 0 than this many of its deviations contradicts
             the assumption; with ten tests, 3.3 gives one false alarm in a hundred drives.
     """
 
-    sigmas: Mapping[str, float] = field(default_factory=dict)
-    estimate: Mapping[str, float] = field(default_factory=dict)
+    sigmas: AssumptionSigmas = field(default_factory=AssumptionSigmas)
+    estimate: tuple[str, ...] = ()
     test: bool = True
-    threshold: float = 3.3
+    threshold: float = setting(3.3, at_least=1.0, at_most=100.0)
 
     def __post_init__(self) -> None:
-        for part, least in ((self.sigmas, "0 or more"), (self.estimate, "more than 0")):
-            check_names(part)
-            for name, sigma in part.items():
-                if not 0.0 <= sigma < np.inf or (part is self.estimate and sigma == 0.0):
-                    raise ValueError(f"{name} {sigma:g}: expected {least}")
-        if not 1.0 <= self.threshold < np.inf:
-            raise ValueError(f"threshold {self.threshold:g}: expected 1 or more")
+        names = [name for name, _ in self.estimated]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"estimate: found {', '.join(names)}, expected each name once")
 
     def sigma(self, name: str) -> float:
         """Deviation of an assumption's parameter."""
-        return self.sigmas.get(name, ASSUMPTIONS[name].sigma)
+        return float(getattr(self.sigmas, name))
+
+    @property
+    def estimated(self) -> tuple[tuple[str, float], ...]:
+        """Assumptions whose parameters are variables, with the deviation of each beforehand."""
+        return tuple(_named_sigma(text) for text in self.estimate)
 
 
-def check_names(names: Sequence[str] | Mapping[str, float]) -> None:
-    """Raises ConfigError: a name is no assumption's."""
-    for name in names:
-        if name not in ASSUMPTIONS:
-            raise ConfigError(f"assumption '{name}': expected one of {', '.join(ASSUMPTIONS)}")
+def _named_sigma(text: str) -> tuple[str, float]:
+    """Name and deviation from ``name`` or ``name=sigma``."""
+    name, equals, number = (part.strip() for part in text.partition("="))
+    if name not in ASSUMPTIONS:
+        raise ConfigError(f"estimate: found {name!r:.60}, expected one of {', '.join(ASSUMPTIONS)}")
+    span = ASSUMPTIONS[name].span
+    if not equals:
+        return name, span
+    try:
+        sigma = float(number)
+    except ValueError:
+        sigma = np.nan
+    if not 1e-6 * span <= sigma <= 100.0 * span:
+        expected = f"{1e-6 * span:g} to {100.0 * span:g} {ASSUMPTIONS[name].unit}".rstrip()
+        raise ConfigError(f"estimate: {name}: found {number!r:.60}, expected {expected}")
+    return name, sigma
 
 
 @dataclass(frozen=True)
@@ -119,17 +154,48 @@ def consider(
     values: gtsam.Values,
     state: State,
     config: AssumptionConfig,
-    estimated: Sequence[str] = (),
 ) -> Considered:
     """How an answer follows every assumption that is not estimated beside it.
 
     Args:
         robust: its covariance and matches.
         pairs, values, state: its last frozen problem.
-        estimated: assumptions whose parameters are unknowns of the answer.
     """
-    names = [name for name in ASSUMPTIONS if name not in estimated]
+    names = [name for name in ASSUMPTIONS if name not in dict(config.estimated)]
     columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
     size = 6 + len(state.offsets_s)
     steps = -(robust.bread @ (robust.table.J.T @ columns))[:size]
     return Considered(dict(zip(names, steps.T, strict=True)), {name: config.sigma(name) for name in names})
+
+
+def motion_covariance(
+    robust: RobustCovariance, pairs: Sequence[PairMatches], state: State, config: GraphConfig
+) -> FloatArray:
+    """(n, n) part of the covariance that is there because the LiDAR's motion is measured, not known.
+
+    The difference to the same problem with a motion a thousand times as well known.
+    """
+    known = [
+        replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
+        if pair.l_twist is not None
+        else pair
+        for pair in pairs
+    ]
+    graph, values = joint_graph(known, state, config)
+    return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
+
+
+def budget(
+    covariance: FloatArray, motion: FloatArray, considered: Considered
+) -> dict[str, list[float]]:
+    """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
+
+    Args:
+        covariance: (n, n) of matches and motion.
+        motion: (n, n) part of it, by :func:`motion_covariance`.
+        considered: by the assumptions.
+    """
+    moved = np.clip(np.diag(motion)[:7], 0.0, np.diag(covariance)[:7])
+    parts = {"matches": np.diag(covariance)[:7] - moved, "motion": moved}
+    parts |= {name: np.diag(considered.part(name))[:7] for name in considered.sigmas}
+    return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, printable
 from sst_graph.result import CalibrationResult, FrameId
 
 FloatArray = NDArray[np.float64]
@@ -23,6 +23,9 @@ KEY = "frame_information"
 
 DIGITS = 4
 """Significant digits that are kept."""
+
+MAX_NUMBER = 1e18
+"""Of any quantity that is kept: information of a sigma of 1e-9 [rad, m, s], and far beyond all others."""
 
 _UPPER = np.triu_indices(6)
 
@@ -137,7 +140,7 @@ def from_document(document: Any, place: str = f"diagnostics.{KEY}") -> tuple[Fra
     }
     return tuple(
         FrameInformation(
-            FrameId(str(names[k]), int(column["frame"][k])),
+            FrameId(printable(names[k]), int(column["frame"][k])),
             float(column["bits"][k]),
             column["without"][k],
             column["so_far"][k],
@@ -157,8 +160,9 @@ def _column(document: Mapping[str, Any], name: str, shape: tuple[int, ...], plac
         array = np.array(document[name], dtype=np.float64).reshape(shape)
     except (KeyError, TypeError, ValueError):
         raise DataError(f"{place}.{name}", "no such numbers", f"shape {shape}") from None
-    if not np.isfinite(array).all():
-        raise DataError(f"{place}.{name}", "a value that is not finite", "finite numbers")
+    if not (np.abs(array) <= MAX_NUMBER).all():
+        expected = f"finite numbers of at most {MAX_NUMBER:g}"
+        raise DataError(f"{place}.{name}", "a value that is not finite, or huge", expected)
     return array
 
 

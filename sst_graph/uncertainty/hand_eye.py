@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.problem.hand_eye import HandEyePriors, HandEyeTerm
 from sst_graph.problem.state import EXTRINSIC, delay_key
 
@@ -32,7 +33,7 @@ LEAST_GENUINE = 1e-3
 
 
 @dataclass(frozen=True)
-class HandEyeErrors:
+class HandEyeErrors(Settings):
     """Sigmas of what all pairs share, and how far neighbours go together.
 
     Attributes:
@@ -41,9 +42,9 @@ class HandEyeErrors:
         lags: neighbours up to this far apart go together.
     """
 
-    direction_deg: float = 0.03
-    turn_rate_deg_s: float = 0.02
-    lags: int = 3
+    direction_deg: float = setting(0.03, at_least=0.0, at_most=90.0)
+    turn_rate_deg_s: float = setting(0.02, at_least=0.0, at_most=90.0)
+    lags: int = setting(3, at_least=0, at_most=1000)
 
 
 def hand_eye_covariance(

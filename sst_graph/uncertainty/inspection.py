@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
 from sst_graph.uncertainty.frame_information import FrameInformation, frames_of
 from sst_graph.uncertainty.gained import Gained, gained_of
@@ -31,7 +32,7 @@ RANGES_M = (5.0, 20.0, 50.0)
 
 
 @dataclass(frozen=True)
-class InspectConfig:
+class InspectConfig(Settings):
     """What is told, and from where on.
 
     Attributes:
@@ -40,9 +41,9 @@ class InspectConfig:
         next_frames: frames that the predictions add.
     """
 
-    strong: float = 0.6
-    redundant: float = 0.01
-    next_frames: int = 10
+    strong: float = setting(0.6, at_least=0.0, at_most=1.0)
+    redundant: float = setting(0.01, at_least=0.0, at_most=10.0)
+    next_frames: int = setting(10, at_least=1, at_most=1_000_000)
 
 
 @dataclass(frozen=True)

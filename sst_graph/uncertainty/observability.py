@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.result import DIRECTION_SCALES, WeakDirection
 
 FloatArray = NDArray[np.float64]
@@ -48,7 +49,7 @@ MOTION = Advice(
 
 
 @dataclass(frozen=True)
-class ObservabilityConfig:
+class ObservabilityConfig(Settings):
     """Largest standard deviations of an answer that may be called ok.
 
     Attributes:
@@ -60,11 +61,11 @@ class ObservabilityConfig:
         pair_share: ... and must tell them to this share of the limits.
     """
 
-    rotation_deg: float = 0.5
-    translation_m: float = 0.05
-    offset_s: float = 0.01
-    pair_correlation: float = 0.98
-    pair_share: float = 0.5
+    rotation_deg: float = setting(0.5, at_least=1e-6, at_most=180.0)
+    translation_m: float = setting(0.05, at_least=1e-6, at_most=1000.0)
+    offset_s: float = setting(0.01, at_least=1e-9, at_most=1000.0)
+    pair_correlation: float = setting(0.98, at_least=0.0, at_most=2.0)
+    pair_share: float = setting(0.5, at_least=0.001, at_most=1.0)
 
 
 def weak_directions(
@@ -124,6 +125,11 @@ def inseparable_directions(
     )
 
 
+def involves_offset(direction: WeakDirection) -> bool:
+    """Whether the time offset takes part in a weak direction."""
+    return abs(float(direction.vector[6])) > _TAKES_PART
+
+
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
@@ -134,8 +140,12 @@ def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> F
 
 def _paired(covariance: FloatArray) -> float:
     """Multiple correlation of the time offset with the translation, 0 to 1."""
-    cross = covariance[3:6, 6]
-    explained = float(cross @ np.linalg.solve(covariance[3:6, 3:6], cross)) / float(covariance[6, 6])
+    sigmas = np.sqrt(np.maximum(np.diag(covariance)[3:], 0.0))
+    if not (sigmas > 0.0).all():
+        return 0.0
+    correlation = covariance[3:, 3:] / np.outer(sigmas, sigmas)
+    cross = correlation[:3, 3]
+    explained = float(cross @ np.linalg.lstsq(correlation[:3, :3], cross)[0])
     return float(np.sqrt(min(max(explained, 0.0), 1.0)))
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.config import Settings, setting
 from sst_graph.problem.graph import PairMatches
 from sst_graph.problem.state import State
 
@@ -20,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class UnknownMotionConfig:
+class UnknownMotionConfig(Settings):
     """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood.
 
     Attributes:
@@ -28,13 +29,8 @@ class UnknownMotionConfig:
         turn_deg_per_s: of its rate of turning about each axis [deg/s].
     """
 
-    speed_mps: float = 10.0
-    turn_deg_per_s: float = 6.0
-
-    def __post_init__(self) -> None:
-        for name in ("speed_mps", "turn_deg_per_s"):
-            if not 0.0 <= getattr(self, name) < np.inf:
-                raise ValueError(f"{name} {getattr(self, name):g}: expected 0 or more")
+    speed_mps: float = setting(10.0, at_least=0.0, at_most=200.0)
+    turn_deg_per_s: float = setting(6.0, at_least=0.0, at_most=360.0)
 
 
 def unknown_motion_covariance(

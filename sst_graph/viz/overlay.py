@@ -121,7 +121,7 @@ def _both(frame: Frame, camera: PinholeCamera) -> tuple[Scan, CameraImage]:
     if frame.scan is None or frame.image is None:
         missing = "scan" if frame.scan is None else "image"
         raise DataError(f"frame {frame.index}", f"no {missing}", "a scan and an image to draw")
-    height, width = frame.image.pixels.shape[:2]
+    height, width = frame.image.mask.shape
     if (width, height) != (camera.width, camera.height):
         raise DataError(
             f"frame {frame.index}", f"an image of {width}x{height}", f"{camera.width}x{camera.height}"
@@ -167,7 +167,9 @@ def _transformed(aTb: gtsam.Pose3, bPs: FloatArray) -> FloatArray:
 
 
 def _backdrop(image: CameraImage) -> Picture:
-    """The picture at 70 % brightness and half its colour, so that the points stand out."""
+    """The picture at 70 % brightness and half its colour, so that the points stand out; grey without one."""
+    if not image.has_picture:
+        return np.full((*image.mask.shape, 3), 60, np.uint8)
     grey = cv2.cvtColor(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), cv2.COLOR_GRAY2BGR)
     return np.asarray(cv2.addWeighted(image.pixels, 0.35, grey, 0.35, 0.0), dtype=np.uint8)
 

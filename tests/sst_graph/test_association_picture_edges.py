@@ -168,7 +168,7 @@ def test_an_object_that_the_border_cuts() -> None:
 
 @pytest.mark.parametrize("setting", [{"reach_px": 0.0}, {"mask_sigma_px": 0.0}, {"along_px": 1}])
 def test_settings_out_of_range(setting: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=f"{next(iter(setting))} .*: expected .* or more"):
+    with pytest.raises(ConfigError, match=f"^{next(iter(setting))}: found .* expected at least"):
         from_dict(PictureConfig, setting)
 
 

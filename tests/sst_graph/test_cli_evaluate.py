@@ -104,6 +104,10 @@ def test_overlay_replaces_only_when_told(
     command = ["overlay", str(result_file), str(kitti_drive), "--out", str(out)]
     assert main(command) == 2
     assert "--overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
+    assert main([*command, "--overwrite"]) == 2
+    assert "expected a PNG to overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
+    out.unlink()
+    assert main(command) == 0
     assert main([*command, "--overwrite", "--before", "dataset"]) == 0
     assert out.read_bytes() != b"mine"
 

@@ -86,7 +86,7 @@ def test_replaces_only_when_told(
         (["--to", "autocad"], "invalid choice: 'autocad'"),
         ([], "--to"),
         (["--to", "urdf", "--calib", "calib.txt"], "--calib goes with --to kitti"),
-        (["--to", "kitti", "--calib", "nowhere.txt"], "nowhere.txt: found no file"),
+        (["--to", "kitti", "--calib", "nowhere.txt"], "nowhere.txt: found no such file"),
         (["--to", "urdf", "--camera-frame", "a b"], "frame name 'a b'"),
     ],
 )

@@ -90,19 +90,24 @@ def test_json_is_one_strict_object(
     assert len(document["frames"]) == 9
 
 
+def shown_in(folder: Path) -> set[str]:
+    """Names in a folder that are not hidden."""
+    return {path.name for path in folder.iterdir() if not path.name.startswith(".")}
+
+
 def test_plots(tmp_path: Path, result: CalibrationResult, capsys: pytest.CaptureFixture[str]) -> None:
     plots = tmp_path / "plots"
     assert main(["inspect", written(tmp_path, result), "--plots", str(plots)]) == 0
-    assert {path.name for path in plots.iterdir()} == OF_COVARIANCE | OF_FRAMES
+    assert shown_in(plots) == OF_COVARIANCE | OF_FRAMES
     assert f"wrote {plots}: ellipses.png, " in capsys.readouterr().out
-    for path in plots.iterdir():
+    for path in plots.glob("[!.]*"):
         picture = cv2.imread(str(path))
         assert min(picture.shape[:2]) > 400 and len(np.unique(picture[::4, ::4].reshape(-1, 3), axis=0)) > 20
     (plots / "mine.txt").write_text("mine")
     assert main(["inspect", str(tmp_path), "--plots", str(plots)]) == 2
     assert (plots / "mine.txt").exists()
     assert main(["inspect", str(tmp_path), "--plots", str(plots), "--overwrite"]) == 0
-    assert not (plots / "mine.txt").exists()
+    assert (plots / "mine.txt").read_text() == "mine"
 
 
 def test_another_folder_is_not_replaced(
@@ -110,7 +115,12 @@ def test_another_folder_is_not_replaced(
 ) -> None:
     written(tmp_path, result)
     assert main(["inspect", str(tmp_path), "--plots", str(tmp_path), "--overwrite"]) == 2
-    assert "ellipses.png" in capsys.readouterr().err and (tmp_path / "calibration.json").exists()
+    assert "is read as RESULT and would be replaced" in capsys.readouterr().err
+    other = tmp_path.with_name("other")
+    other.mkdir()
+    (other / "thesis.tex").write_text("dear")
+    assert main(["inspect", str(tmp_path), "--plots", str(other), "--overwrite"]) == 2
+    assert "not from sst-graph" in capsys.readouterr().err and (tmp_path / "calibration.json").exists()
 
 
 @pytest.mark.parametrize("count", [1, 2])
@@ -124,7 +134,7 @@ def test_plots_of_few_frames(tmp_path: Path, result: CalibrationResult, count: i
     )
     assert main(["inspect", written(tmp_path, few), "--plots", str(tmp_path / "plots")]) == 0
     expected = OF_FRAMES if count > 1 else {"record_next.png"}
-    assert {path.name for path in (tmp_path / "plots").iterdir()} == OF_COVARIANCE | expected
+    assert shown_in(tmp_path / "plots") == OF_COVARIANCE | expected
 
 
 def test_a_result_of_another_method(
@@ -134,7 +144,7 @@ def test_a_result_of_another_method(
     assert main(["inspect", written(tmp_path, foreign), "--plots", str(tmp_path / "plots")]) == 0
     out = capsys.readouterr().out
     assert "what each frame brought cannot be told" in out and "what to record next:" not in out
-    assert {path.name for path in (tmp_path / "plots").iterdir()} == OF_COVARIANCE
+    assert shown_in(tmp_path / "plots") == OF_COVARIANCE
 
 
 def test_without_matplotlib(

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from sst_graph.config import (
-    MAX_FILE_BYTES,
     Range,
     Settings,
     from_dict,
@@ -25,6 +24,7 @@ from sst_graph.config import (
     with_overrides,
 )
 from sst_graph.errors import ConfigError, DataError, SstGraphError
+from sst_graph.input_files import SETTINGS
 from sst_graph.types import SemanticClass
 
 
@@ -225,18 +225,18 @@ def test_files(tmp_path: Path) -> None:
         ("a.json", b"\xff\xfe", DataError, "a.json"),
         ("a.toml", b"title = '\xff'", DataError, "a.toml"),
         ("a.json", b"[1]", DataError, "found list, expected a table"),
-        ("a.json", b'{"title": "\\ud800"}', ConfigError, "title: found .* in UTF-8"),
-        ("a.json", b'{"\\ud800": 3}', ConfigError, r"unknown setting '\\ud800'"),
-        ("a.json", b'{"limit_m": 1e999999999}', ConfigError, "limit_m: found inf"),
+        ("a.json", b'{"title": "\\ud800"}', DataError, "a.json: found"),
+        ("a.json", b'{"\\ud800": 3}', DataError, "a.json: found"),
+        ("a.json", b'{"limit_m": 1e999999999}', DataError, "a.json: found"),
         ("a.json", b'{"limit_m": 1' + b"0" * 5000 + b"}", DataError, "a.json"),
         ("a.toml", b"limit_m = 1" + b"0" * 5000, DataError, "a.toml"),
-        ("a.toml", b"limit_m = 1" + b"0" * 400, ConfigError, "limit_m: found an integer of 1329 bits"),
+        ("a.toml", b"limit_m = 1" + b"0" * 400, DataError, "a.toml: found"),
         ("a.toml", b"limit_m = 1979-05-27", ConfigError, "limit_m: found .* expected a number"),
-        ("a.json", b'{"inner":' * 100_000, DataError, "a.json: found tables or lists nested too deep"),
+        ("a.json", b'{"inner":' * 10_000, DataError, "a.json: found .* nested too deep"),
         ("a.json", b'{"window": ' + b"[" * 100_000, DataError, "a.json: found .* nested too deep"),
         ("a.toml", b"window = " + b"[" * 100_000, DataError, "a.toml: found .* nested too deep"),
-        ("a.json", b'{"window": ' + b"[" * 900 + b"]" * 900 + b"}", ConfigError, "window: found"),
-        ("a.json", b" " * (MAX_FILE_BYTES + 1), DataError, "found 1000001 bytes, expected settings of at"),
+        ("a.json", b'{"window": ' + b"[" * 900 + b"]" * 900 + b"}", DataError, "nested too deep"),
+        ("a.json", b" " * (SETTINGS.max_bytes + 1), DataError, "a.json: found 262145 bytes"),
         ("a.toml", b"x = = 3", DataError, "a.toml"),
         ("a.toml", b"iteration = 3", ConfigError, "a.toml: unknown setting 'iteration'"),
     ],
@@ -248,10 +248,10 @@ def test_bad_file(tmp_path: Path, name: str, content: bytes, kind: type[Exceptio
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400 + len(str(tmp_path))
 
 
-@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_what_is_no_file_is_refused(tmp_path: Path, make: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize(("make", "kind"), [(os.mkfifo, "a FIFO"), (os.mkdir, "a folder")])
+def test_what_is_no_file_is_refused(tmp_path: Path, make: Callable[[Path], None], kind: str) -> None:
     make(tmp_path / "a.json")
-    with pytest.raises(DataError, match="no regular file"):
+    with pytest.raises(DataError, match=f"a.json: found {kind}"):
         read_config(Outer, tmp_path / "a.json")
 
 

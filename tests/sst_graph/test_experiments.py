@@ -72,7 +72,7 @@ def test_the_command_writes_a_table(tmp_path: Path, capsys: pytest.CaptureFixtur
     [
         (["magic"], "expected one of accuracy"),
         (["paper-table", "--methods", "papre"], "papre"),
-        (["paper-table", "--streets", "0"], "expected one or more"),
+        (["paper-table", "--streets", "0"], "streets: found 0, expected at least 1"),
         (["paper-table", "--set", "strets=3"], "did you mean 'streets'"),
     ],
 )

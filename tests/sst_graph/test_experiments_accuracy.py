@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -23,9 +24,19 @@ def outcome(qad_deg: float, atd_m: float, time_s: float, status: str, failed: bo
     return Outcome(CalibrationErrors(qad_deg, 0.5 * qad_deg, atd_m, time_s, nees), status, failed)
 
 
-@pytest.mark.parametrize("changes", [{"scenarios": ("standng",)}, {"scenarios": ()}, {"streets": 0}])
-def test_bad_settings(changes: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected some of standing"):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"scenarios": ("standng",)},
+            r"scenarios\[0\]: found 'standng', expected one of standing, standing-none",
+        ),
+        ({"scenarios": ()}, "scenarios: found .* expected a list of 1 to 100 values"),
+        ({"streets": 0}, "streets: found 0, expected at least 1"),
+    ],
+)
+def test_bad_settings(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         AccuracyConfig(**changes)
 
 

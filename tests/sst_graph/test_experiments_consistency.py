@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig
 from sst_graph.experiments import consistency
 from sst_graph.experiments.consistency import ConsistencyConfig, Run
 
 
-@pytest.mark.parametrize("changes", [{"drives": ("sitting",)}, {"drives": ()}, {"runs": 1}])
-def test_bad_settings(changes: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="expected some of standing"):
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"drives": ("sitting",)}, r"drives\[0\]: found 'sitting', expected one of standing, stop"),
+        ({"drives": ()}, "drives: found .* expected a list of 1 to 100 values"),
+        ({"runs": 1}, "runs: found 1, expected at least 2"),
+    ],
+)
+def test_bad_settings(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         ConsistencyConfig(**changes)
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
+from sst_graph.errors import ConfigError
 from sst_graph.experiments import motion
 from sst_graph.experiments.motion import MotionTableConfig, Outcome
 from sst_graph.experiments.registry import EXPERIMENTS
@@ -44,9 +47,20 @@ def test_every_drive_and_run_has_its_row(monkeypatch: pytest.MonkeyPatch) -> Non
     assert {line.count("|") for line in table.splitlines()} == {9}
 
 
-@pytest.mark.parametrize("wrong", [{"drives": ("flying",)}, {"drives": ()}, {"streets": 0}])
-def test_settings_that_make_no_sense(wrong: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="drives"):
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"drives": ("flying",)}, r"drives\[0\]: found 'flying', expected one of turning"),
+        ({"drives": ()}, "drives: found .* expected a list of 1 to 100 values"),
+        ({"streets": 0}, "streets: found 0, expected at least 1"),
+        (
+            {"streets": 40},
+            "streets: found 40, whose time offsets grow from delay_s .* expected offsets of at most 0.5 s",
+        ),
+    ],
+)
+def test_settings_that_make_no_sense(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         MotionTableConfig(**wrong)
 
 

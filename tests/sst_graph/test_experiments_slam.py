@@ -64,5 +64,5 @@ def test_refuses_weathers_that_it_does_not_know() -> None:
     assert experiment("slam").config == SlamConfig()
     with pytest.raises(ConfigError, match="hail"):
         SlamConfig(weathers=("hail",))
-    with pytest.raises(ConfigError, match="0 streets"):
+    with pytest.raises(ConfigError, match="streets: found 0, expected at least 1"):
         SlamConfig(streets=0)

@@ -16,7 +16,7 @@ import pytest
 from factors import Alignment, RobustKernel, delay_prior, frame_factor, residuals
 from factors.camera import PinholeCamera
 from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.errors import DataError, EstimationError
+from sst_graph.errors import ContradictionError, DataError, EstimationError
 from sst_graph.export import (
     DELAY,
     EXTRINSIC,
@@ -325,3 +325,80 @@ def test_refuses_what_is_not_determined() -> None:
     graph.add(gtsam.PriorFactorVector(99, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1e300)))
     with pytest.raises(EstimationError, match="to eliminate"):
         marginal_of_graph(graph, values, EXTRINSIC, DELAY)
+
+
+def knocked(found: CalibrationMarginal, column: int, size: float) -> CalibrationMarginal:
+    """The same about another optimum."""
+    d = np.zeros(7)
+    d[column] = size
+    return replace(found, cTl=found.cTl.retract(d[:6]), offset_s=found.offset_s + float(d[6]))
+
+
+def agreeing(seed: int) -> CalibrationMarginal:
+    """A calibration that errs as its covariance says, its sigmas those of a good one."""
+    sigmas = np.array([0.0005] * 3 + [0.005] * 3 + [0.001])
+    d = sigmas * np.random.default_rng(seed).normal(size=7)
+    result = CalibrationResult(TRUE.retract(d[:6]), OFFSET_S + d[6], np.diag(sigmas**2), "ok", CAMERA)
+    return marginal_of_result(result)
+
+
+def test_marginals_that_agree_are_fused_and_their_constant_is_chi_squared() -> None:
+    constants = [fuse_marginals([agreeing(2 * seed), agreeing(2 * seed + 1)]).constant for seed in range(200)]
+    assert np.mean(constants) == pytest.approx(7.0, rel=0.1)
+    assert np.var(constants) == pytest.approx(14.0, rel=0.4)
+
+
+@pytest.mark.parametrize(
+    ("column", "size", "words"),
+    [
+        (1, -np.radians(1.1), r"rotation by 1\.\d+° .*\(pitch\)"),
+        (6, 0.1, r"time offset by \+(9[789]|10[0-3]) ms"),
+    ],
+)
+def test_marginals_that_contradict_one_another_are_refused(column: int, size: float, words: str) -> None:
+    parts = [agreeing(1), agreeing(2), knocked(agreeing(3), column, size)]
+    with pytest.raises(ContradictionError, match=f"of 14.*'c' differs from the others in {words}"):
+        fuse_marginals(parts, names=("a", "b", "c"))
+    with pytest.raises(EstimationError, match="number 2"):
+        fuse_marginals(parts)
+    fused = fuse_marginals(parts, significance=0.0)
+    assert fused.constant > 1000.0
+
+
+def test_one_of_many_marginals_is_found() -> None:
+    """Six sigmas of one in twenty: the sum's chi-squared of 133 would hardly show it."""
+    parts = [agreeing(seed) for seed in range(20)]
+    fuse_marginals(parts)
+    with pytest.raises(ContradictionError, match="number 7"):
+        fuse_marginals([*parts[:7], knocked(agreeing(7), 0, 8.0 * 0.0005), *parts[8:]])
+
+
+def test_a_direction_that_one_marginal_does_not_tell_contradicts_nothing() -> None:
+    vague = agreeing(4)
+    information = vague.information.copy()
+    information[6] = information[:, 6] = 0.0
+    vague = replace(vague, information=information, offset_s=vague.offset_s + 0.3)
+    fused = fuse_marginals([agreeing(5), vague])
+    assert fused.offset_s == pytest.approx(OFFSET_S, abs=0.005)
+
+
+def test_fusion_ends_at_the_optimum_also_from_far_apart() -> None:
+    one, other = agreeing(1), knocked(agreeing(2), 0, np.radians(3.0))
+    fused = fuse_marginals([one, other], significance=0.0)
+    again = fuse_marginals([other, one], significance=0.0)
+    assert in_sigmas(fused, again.cTl, again.offset_s) < 1e-4
+
+
+def test_graphs_of_drives_with_two_mounts_are_refused() -> None:
+    (one, at_one), (two, start) = drive(3, 20), drive(4, 20)
+    moved = gtsam.NonlinearFactorGraph(two)
+    there = TRUE.retract(np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0]))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([1e-4, 1e-2], 3))
+    moved.add(gtsam.PriorFactorPose3(EXTRINSIC, there, noise))
+    graphs = [(one, _optimum(one, at_one)), (moved, _optimum(moved, start))]
+    with pytest.raises(ContradictionError, match="2 marginals contradict one another"):
+        fuse_graphs(graphs)
+    fused, _ = fuse_graphs(graphs, significance=0.0)
+    assert in_sigmas(fused, *_batch(graphs)) < 1e-3
+    with pytest.raises(EstimationError, match="found 1 names, expected 2"):
+        fuse_marginals([agreeing(1), agreeing(2)], names=("a",))

@@ -1,7 +1,9 @@
-"""Whole or not at all: exceptions, kills, and what stood there before."""
+"""Whole or not at all: exceptions, kills, second writers, and what stood there before."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import os
 import signal
 import stat
@@ -12,26 +14,76 @@ from pathlib import Path
 import pytest
 
 from sst_graph.errors import ConfigError
-from sst_graph.files import atomic_directory, atomic_write_bytes, atomic_write_text, check_writable_target
+from sst_graph.files import (
+    MANIFEST,
+    FileKind,
+    OutputKind,
+    atomic_directory,
+    atomic_write_bytes,
+    atomic_write_text,
+    check_file_target,
+    check_folder_target,
+    output_file,
+)
 
-KILLED_FILE = """
+KIND = OutputKind("thing")
+CLOSED = OutputKind("thing", exclusive=("own",))
+
+REPLACE = """
 import os, signal, sys
-import sst_graph.files as files
-os.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)
-files.atomic_write_text(sys.argv[1], "new" * 100000)
+from sst_graph.files import OutputKind, atomic_directory
+from sst_graph.files import output, staging
+%s
+with atomic_directory(sys.argv[1], True, OutputKind("thing")) as folder:
+    (folder / "own").mkdir()
+    (folder / "own" / "a").write_text("new")
+    (folder / "b").write_text("new")
 """
-
-KILLED_FOLDER = """
+KILL = "os.kill(os.getpid(), signal.SIGKILL)"
+KILLED_FILE = f"""
 import os, signal, sys
-from sst_graph.files import atomic_directory
-with atomic_directory(sys.argv[1], overwrite=True) as folder:
-    (folder / "half.txt").write_text("half")
-    os.kill(os.getpid(), signal.SIGKILL)
+from sst_graph.files import atomic_write_text
+os.replace = lambda *_: {KILL}
+atomic_write_text(sys.argv[1], "new" * 100000)
+"""
+KILLED_AT = {
+    "while writing": f"output.write_manifest = lambda *_: {KILL}",
+    "before it is flushed": f"output._sync_tree = lambda *_: {KILL}",
+    "while notes are carried over": f"output.carry_over = lambda *_: {KILL}",
+    "before the exchange": f"output._exchange = lambda *_: {KILL}",
+    "after the exchange": f"real = output._exchange; output._exchange = lambda a, b: (real(a, b), {KILL})",
+    "while notes are given back": f"output.give_back = lambda *_: {KILL}",
+    "while the old one is removed": f"staging.remove = lambda *_: {KILL}",
+}
+NO_EXCHANGE = "output._exchange = lambda *_: False"
+KILLED_BETWEEN_RENAMES = f"""
+real = os.rename
+def rename(a, b):
+    if str(b) == os.path.realpath(sys.argv[1]) and str(a).endswith("/new") and not os.path.exists(b):
+        {KILL}
+    real(a, b)
+os.rename = rename
 """
 
 
 def tree(folder: Path) -> dict[str, str]:
-    return {str(p.relative_to(folder)): p.read_text() for p in sorted(folder.rglob("*")) if p.is_file()}
+    """Content of all files below a folder but manifests."""
+    return {
+        str(path.relative_to(folder)): path.read_text()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != MANIFEST
+    }
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def write(target: Path, files: dict[str, str], overwrite: bool = False, kind: OutputKind = KIND) -> None:
+    with atomic_directory(target, overwrite, kind) as folder:
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
 
 
 def run_killed(script: str, target: Path) -> None:
@@ -50,12 +102,12 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     former = os.umask(0o027)
     try:
         atomic_write_text(tmp_path / "a", "x")
-        with atomic_directory(tmp_path / "d"):
-            pass
+        write(tmp_path / "d", {})
+        with output_file(tmp_path / "b", False) as out:
+            out.write_text("x")
     finally:
         os.umask(former)
-    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
-    assert stat.S_IMODE((tmp_path / "d").stat().st_mode) == 0o750
+    assert [stat.S_IMODE((tmp_path / name).stat().st_mode) for name in "adb"] == [0o640, 0o750, 0o640]
 
 
 def test_link_is_followed_not_replaced(tmp_path: Path) -> None:
@@ -63,7 +115,9 @@ def test_link_is_followed_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "link.txt").symlink_to("real.txt")
     atomic_write_text(tmp_path / "link.txt", "new")
     assert (tmp_path / "link.txt").is_symlink()
-    assert (tmp_path / "real.txt").read_text() == "new"
+    with output_file(tmp_path / "link.txt", True) as out:
+        out.write_text("newer")
+    assert (tmp_path / "link.txt").is_symlink() and (tmp_path / "real.txt").read_text() == "newer"
 
 
 def test_failed_replacement_leaves_old_file_and_no_rest(
@@ -72,77 +126,242 @@ def test_failed_replacement_leaves_old_file_and_no_rest(
     (tmp_path / "a").write_text("old")
 
     def fail(*_: object) -> None:
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="No space left") as caught:
         atomic_write_text(tmp_path / "a", "new")
-    assert tree(tmp_path) == {"a": "old"}
+    assert caught.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="No space left") as caught, output_file(tmp_path / "a", True) as out:
+        out.write_text("new")
+    assert caught.value.filename == str(tmp_path / "a")
+    with pytest.raises(OSError, match="No space left") as caught:
+        write(tmp_path / "d", {"x": "new"})
+    assert caught.value.filename == str(tmp_path / "d")
+    assert tree(tmp_path) == {"a": "old"} and names(tmp_path) == {"a"}
 
 
-def test_killed_write_leaves_old_file(tmp_path: Path) -> None:
+def test_an_error_inside_names_the_output(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OSError, match="No such file") as caught,
+        atomic_directory(tmp_path / "d", False, KIND) as d,
+    ):
+        (d / "missing" / "a").write_text("x")
+    assert caught.value.filename == str(tmp_path / "d" / "missing" / "a")
+
+
+def test_killed_write_leaves_old_file_and_is_cleaned_up(tmp_path: Path) -> None:
     (tmp_path / "a").write_text("old")
     run_killed(KILLED_FILE, tmp_path / "a")
-    assert (tmp_path / "a").read_text() == "old"
+    assert (tmp_path / "a").read_text() == "old" and len(names(tmp_path)) == 2
+    with output_file(tmp_path / "a", True) as out:
+        out.write_text("new")
+    assert tree(tmp_path) == {"a": "new"}
 
 
-def test_killed_folder_leaves_old_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "kept.txt").write_text("old")
-    run_killed(KILLED_FOLDER, tmp_path / "out")
-    assert tree(tmp_path / "out") == {"kept.txt": "old"}
-    run_killed(KILLED_FOLDER, tmp_path / "new")
-    assert not (tmp_path / "new").exists()
+@pytest.mark.parametrize("moment", KILLED_AT)
+def test_killed_replacement_leaves_the_old_or_the_new(tmp_path: Path, moment: str) -> None:
+    out = tmp_path / "out"
+    write(out, {"own/a": "old", "b": "old"})
+    (out / "notes.txt").write_text("dear")
+    run_killed(REPLACE % KILLED_AT[moment], out)
+    old = {"own/a": "old", "b": "old", "notes.txt": "dear"}
+    new = {"own/a": "new", "b": "new", "notes.txt": "dear"}
+    done = moment in ("after the exchange", "while notes are given back", "while the old one is removed")
+    assert tree(out) == (new if done else old)
+    write(out, {"b": "third"}, overwrite=True)
+    assert tree(out) == {"b": "third", "notes.txt": "dear"} and names(tmp_path) == {"out"}
+
+
+def test_without_an_exchange_the_next_run_puts_the_old_folder_back(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, {"b": "old"})
+    (out / "notes.txt").write_text("dear")
+    run_killed(REPLACE % (NO_EXCHANGE + KILLED_BETWEEN_RENAMES), out)
+    assert not out.exists()
+    with pytest.raises(RuntimeError, match="stop"), atomic_directory(out, False, KIND):
+        raise RuntimeError("stop")
+    assert tree(out) == {"b": "old", "notes.txt": "dear"} and names(tmp_path) == {"out"}
+
+
+def test_without_an_exchange_a_folder_is_replaced_as_well(tmp_path: Path) -> None:
+    write(tmp_path / "out", {"b": "old"})
+    script = REPLACE % NO_EXCHANGE
+    subprocess.run([sys.executable, "-c", script, str(tmp_path / "out")], check=True, timeout=60)
+    assert tree(tmp_path) == {"out/own/a": "new", "out/b": "new"} and names(tmp_path) == {"out"}
 
 
 def test_folder_appears_at_the_end_only(tmp_path: Path) -> None:
     target = tmp_path / "deep" / "out"
-    with atomic_directory(target) as folder:
+    with atomic_directory(target, False, KIND) as folder:
         (folder / "sub").mkdir()
         (folder / "sub" / "a").write_text("1")
         assert not target.exists()
-    assert tree(tmp_path) == {"deep/out/sub/a": "1"}
+    assert tree(tmp_path) == {"deep/out/sub/a": "1"} and names(target.parent) == {"out"}
 
 
 def test_exception_leaves_nothing(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match="stop"), atomic_directory(tmp_path / "out") as folder:
-        (folder / "a").write_text("1")
+    with (
+        pytest.raises(RuntimeError, match="stop"),
+        atomic_directory(tmp_path / "deep/out", False, KIND) as new,
+    ):
+        (new / "a").write_text("1")
+        raise RuntimeError("stop")
+    with pytest.raises(RuntimeError, match="stop"), output_file(tmp_path / "deep/a", False):
         raise RuntimeError("stop")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_overwrite_replaces_the_whole_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "old").write_text("old")
-    with atomic_directory(tmp_path / "out", overwrite=True) as folder:
-        (folder / "new").write_text("new")
-    assert tree(tmp_path) == {"out/new": "new"}
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
 def test_exception_while_overwriting_keeps_the_old_folder(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "old").write_text("old")
-    with pytest.raises(KeyboardInterrupt), atomic_directory(tmp_path / "out", overwrite=True):
+    write(tmp_path / "out", {"old": "old"})
+    with pytest.raises(KeyboardInterrupt), atomic_directory(tmp_path / "out", True, KIND):
         raise KeyboardInterrupt
     assert tree(tmp_path) == {"out/old": "old"}
 
 
-def test_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "out").mkdir()
-    check_writable_target(tmp_path / "out", overwrite=False)
-    (tmp_path / "out" / "thesis.tex").write_text("dear")
-    with pytest.raises(ConfigError, match="not empty"), atomic_directory(tmp_path / "out"):
+def test_what_others_keep_in_a_folder_survives(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, {"report.md": "old", "own/a": "old", "gone": "old"})
+    (out / "report.md").write_text("old, and my remarks")
+    (out / "own" / "photo").write_text("mine")
+    (out / "link").symlink_to("report.md")
+    (out / "empty").mkdir()
+    write(out, {"report.md": "new", "own": "now a file"}, overwrite=True)
+    assert tree(out) == {
+        "report.md": "new",
+        "report.md.kept": "old, and my remarks",
+        "own": "now a file",
+        "own_photo": "mine",
+        "link": "new",
+    }
+    assert (out / "link").is_symlink() and (out / "empty").is_dir() and names(tmp_path) == {"out"}
+
+
+def test_notes_saved_while_the_folder_is_replaced_survive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    write(out, {"a": "old"})
+    (out / "notes.txt").write_text("first")
+    exchange = __import__("sst_graph.files.output", fromlist=["_exchange"])._exchange
+
+    def late(new: Path, target: Path) -> bool:
+        (target / "late.txt").write_text("late")
+        (target / "saved").write_text("second")
+        os.replace(target / "saved", target / "notes.txt")
+        os.utime(target / "notes.txt", ns=(1 << 62, 1 << 62))
+        return bool(exchange(new, target))
+
+    monkeypatch.setattr("sst_graph.files.output._exchange", late)
+    write(out, {"a": "new"}, overwrite=True)
+    assert tree(out) == {"a": "new", "late.txt": "late", "notes.txt": "second"}
+
+
+def test_a_folder_that_is_not_ours_is_refused(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    check_folder_target(out, False, KIND)
+    (out / "thesis.tex").write_text("dear")
+    with pytest.raises(ConfigError, match="not empty"), atomic_directory(out, False, KIND):
         pytest.fail("the block must not run")
-    with pytest.raises(ConfigError, match=r"without calibration\.json"):
-        check_writable_target(tmp_path / "out", overwrite=True, owned_by="calibration.json")
+    with pytest.raises(ConfigError, match="not from sst-graph"):
+        check_folder_target(out, True, KIND)
     with pytest.raises(ConfigError, match="found a file"):
-        check_writable_target(tmp_path / "out" / "thesis.tex", overwrite=True)
+        check_folder_target(out / "thesis.tex", True, KIND)
     assert tree(tmp_path) == {"out/thesis.tex": "dear"}
 
 
-def test_folder_filled_meanwhile_is_not_lost(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="not empty"), atomic_directory(tmp_path / "out"):
+def test_a_folder_of_another_kind_is_refused(tmp_path: Path) -> None:
+    write(tmp_path / "out", {"a": "1"})
+    with pytest.raises(ConfigError, match="found a thing, expected a drive to overwrite"):
+        check_folder_target(tmp_path / "out", True, OutputKind("drive"))
+
+
+@pytest.mark.parametrize("stranger", ["own/b", "own/a"])
+def test_a_folder_with_strangers_among_ours_is_refused(tmp_path: Path, stranger: str) -> None:
+    write(tmp_path / "out", {"own/a": "1"}, kind=CLOSED)
+    (tmp_path / "out" / "notes.txt").write_text("mine")
+    check_folder_target(tmp_path / "out", True, CLOSED)
+    (tmp_path / "out" / stranger).write_text("2")
+    with pytest.raises(ConfigError, match=f"found {stranger}, which is not as sst-graph wrote it"):
+        check_folder_target(tmp_path / "out", True, CLOSED)
+
+
+def test_what_appears_meanwhile_is_not_replaced_and_the_work_not_lost(tmp_path: Path) -> None:
+    beside = pytest.raises(ConfigError, match=r"the output stands in .*/out-2")
+    with beside, atomic_directory(tmp_path / "out", False, KIND) as folder:
+        (folder / "a").write_text("ours")
         (tmp_path / "out").mkdir()
         (tmp_path / "out" / "other").write_text("theirs")
-    assert tree(tmp_path) == {"out/other": "theirs"}
+    beside = pytest.raises(ConfigError, match=r"the output stands in .*/a-2\.json")
+    with beside, output_file(tmp_path / "a.json", False) as out:
+        (tmp_path / "a.json").write_text("theirs")
+        out.write_text("ours")
+    assert tree(tmp_path) == {
+        "out/other": "theirs",
+        "out-2/a": "ours",
+        "a.json": "theirs",
+        "a-2.json": "ours",
+    }
+
+
+def test_a_second_writer_is_refused_before_its_work(tmp_path: Path) -> None:
+    script = (
+        "import sys\nfrom sst_graph.files import OutputKind, atomic_directory\n"
+        "with atomic_directory(sys.argv[1], True, OutputKind('thing')):\n    sys.exit('ran')"
+    )
+    with atomic_directory(tmp_path / "out", False, KIND) as folder:
+        (folder / "a").write_text("first")
+        second = subprocess.run(
+            [sys.executable, "-c", script, str(tmp_path / "out")], capture_output=True, text=True, timeout=60
+        )
+        assert second.returncode == 1 and f"(process {os.getpid()})" in second.stderr, second.stderr
+        with pytest.raises(ConfigError, match="another run"), output_file(tmp_path / "out", False):
+            pass
+    assert tree(tmp_path) == {"out/a": "first"}
+
+
+def test_a_living_temporary_is_left_alone(tmp_path: Path) -> None:
+    living = tmp_path / f".a.{'0' * 16}.sst-graph-partial"
+    named_alike = tmp_path / ".a.notes.sst-graph-partial"
+    named_alike.write_text("mine")
+    with open(living, "wb") as stream:
+        fcntl.flock(stream.fileno(), fcntl.LOCK_EX)
+        with output_file(tmp_path / "a", False) as out:
+            out.write_text("x")
+        assert living.exists()
+    with output_file(tmp_path / "a", True) as out:
+        out.write_text("y")
+    assert names(tmp_path) == {"a", named_alike.name}
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
+    kind = FileKind("a song", lambda head: head.startswith(b"la"))
+    (tmp_path / "a").write_text("thesis")
+    with pytest.raises(ConfigError, match="found a file, expected none"):
+        check_file_target(tmp_path / "a", False, kind)
+    with pytest.raises(ConfigError, match="expected a song to overwrite"):
+        check_file_target(tmp_path / "a", True, kind)
+    (tmp_path / "a").write_text("la la")
+    check_file_target(tmp_path / "a", True, kind)
+    with pytest.raises(ConfigError, match="found a folder"):
+        check_file_target(tmp_path, True, kind)
+    with pytest.raises(ConfigError, match="found a device"):
+        check_file_target("/dev/null", True, kind)
+
+
+@pytest.mark.parametrize("name", ["/proc/x", "/proc/1/deep/x", "/dev/null/x", "x" * 300])
+def test_a_place_that_cannot_be_written_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ConfigError, match="x: "), atomic_directory(tmp_path / name, False, KIND):
+        pytest.fail("the block must not run")
+    with pytest.raises(ConfigError, match="x: "), output_file(tmp_path / name, False):
+        pytest.fail("the block must not run")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_long_and_strange_names_are_fine(tmp_path: Path) -> None:
+    for name in ("n" * 255, os.fsdecode(b"stra\xdfe"), "a b\nc", ".hidden", "*[a]?"):
+        for text in ("old", "new"):
+            write(tmp_path / name, {"a": text}, overwrite=True)
+        assert tree(tmp_path / name) == {"a": "new"}
+    assert len(names(tmp_path)) == 5

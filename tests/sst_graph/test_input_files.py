@@ -45,7 +45,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path, monkeypatch:
         for name, found in [
             (tmp_path / "fifo", "a FIFO"),
             (tmp_path / "loop", "an unreadable file"),
-            (tmp_path / "dangling", "no file"),
+            (tmp_path / "dangling", "no such file"),
             (tmp_path / "folder", "a folder"),
             (tmp_path / "socket", "a socket"),
             (Path("/dev/zero"), "a character device"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,8 @@ import pytest
 
 from sst_graph.data import Loader, loader_names, open_source, register_loader
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.problem.drive import prepare_drive
+from sst_graph.types import SemanticClass
 
 FRAMES, POINTS, WIDTH, HEIGHT = 5, 12, 8, 6
 Damage = Callable[[Path], object]
@@ -85,21 +88,16 @@ def flip_a_byte_of_the_image(drive: Path) -> None:
     path.write_bytes(data)
 
 
-PARTNER = "found no file for frame {}, expected a partner of .*"
 SCAN, MASK, PICTURE = "velodyne/000002.bin", "semantic_2/000002.png", "image_2/000002.png"
 BAD = [
-    (unlink("calib.txt"), r"calib\.txt: found no file"),
-    (unlink("times.txt"), r"times\.txt: found no file"),
+    (unlink("calib.txt"), r"calib\.txt: found no such file"),
+    (unlink("times.txt"), r"times\.txt: found no such file"),
     (remove("velodyne"), r"velodyne: found no folder"),
     (remove("labels"), r"labels: found no folder"),
     (remove("image_2"), r"image_2: found no folder"),
     (remove("semantic_2"), r"semantic_2: found no folder"),
     (emptied("velodyne"), r"velodyne: found no file that is named by its number"),
     (emptied("image_2"), r"image_2: found no file that is named"),
-    (unlink("velodyne/000002.bin"), r"velodyne: " + PARTNER.format(2) + r"000002\.label"),
-    (unlink("labels/000002.label"), r"labels: " + PARTNER.format(2) + r"000002\.bin"),
-    (unlink("image_2/000004.png"), r"image_2: " + PARTNER.format(4) + r"semantic_2"),
-    (unlink("semantic_2/000000.png"), r"semantic_2: " + PARTNER.format(0) + r"image_2"),
     (text("times.txt", "0\n0.1\n0.2\n0.3\n"), r"times\.txt: found 4 stamps, expected 5, as there are frames"),
     (text("times.txt", "0\n1\n2\n3\n4\n5\n"), r"times\.txt: found 6 stamps, expected 5"),
     (text("times.txt", "0\n0.1\n0.1\n0.3\n0.4\n"), r"times\.txt: found equal stamps 1 and 2"),
@@ -112,8 +110,6 @@ BAD = [
     (cut("labels/000002.label", 44), r"000002\.label: found 11 labels, expected 12"),
     (labels(np.full(POINTS, 10, "<u2")), r"found 6 labels, expected 12"),
     (labels(np.full(POINTS, 7, "<u4")), r"000002\.label: found label 7 \(12 times\)"),
-    (coordinate(5, np.nan), r"found 1 points with NaN or inf, first at index 5"),
-    (coordinate(0, -np.inf), r"found 1 points with NaN or inf, first at index 0"),
     (coordinate(3, 1e20), r"a coordinate of 1e\+20 m at index 3"),
     (points_in_doubles, r"000002\.(bin|label): found"),
     (cut("image_2/000002.png", 60), r"000002\.png: found a PNG file truncated at byte 60"),
@@ -212,10 +208,13 @@ def test_names_of_loaders_are_unique() -> None:
     [
         ("{", "no JSON"),
         ("[1]", "a JSON list"),
-        ('{"time_offset_s": 0}', "no numeric T_camera_lidar"),
+        ('{"time_offset_s": 0}', "no 'T_camera_lidar'"),
         ('{"T_camera_lidar": [[1, 2], [3, 4]]}', r"shape \(2, 2\)"),
         ('{"T_camera_lidar": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "expected a rotation"),
-        ('{"T_camera_lidar": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "time_offset_s": "x"}', "time_offset_s 'x'"),
+        (
+            '{"T_camera_lidar": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "time_offset_s": "x"}',
+            "time_offset_s: found 'x'",
+        ),
     ],
 )
 def test_bad_ground_truth_is_refused(drive: Path, content: str, message: str) -> None:
@@ -230,3 +229,105 @@ def test_bad_ground_truth_is_refused(drive: Path, content: str, message: str) ->
 def test_bad_ranges_are_refused(drive: Path, frames: str | slice) -> None:
     with pytest.raises(ConfigError, match=r"^frames .*(the drive has frames 0:5|expected)"):
         open_source(drive, frames=frames)
+
+
+# --- what is missing is left out and counted --------------------------------------------------------------
+
+
+def test_missing_labels_masks_and_pictures_are_left_out_and_counted(
+    drive: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (drive / "labels/000001.label").unlink()
+    (drive / "semantic_2/000002.png").unlink()
+    (drive / "image_2/000003.png").unlink()
+    (drive / "image_2/000004.png").unlink()
+    (drive / "semantic_2/000004.png").unlink()
+    (drive / "velodyne/000000.bin").unlink()
+    source = open_source(drive)
+    frames = list(source)
+    assert [frame.scan is None for frame in frames] == [True, False, False, False, False]
+    assert [frame.image is None for frame in frames] == [False, False, False, False, True]
+    unlabelled, bare, blind = frames[1].scan, frames[2].image, frames[3].image
+    assert unlabelled is not None and not unlabelled.has_labels and len(unlabelled.points) == POINTS
+    assert bare is not None and not bare.has_mask and bare.has_picture
+    assert blind is not None and blind.has_mask and not blind.has_picture
+    with caplog.at_level("WARNING", "sst_graph"):
+        found = prepare_drive(source, (SemanticClass.VEHICLE,))
+    assert found.left_out.counts() == {
+        "scans_without_labels": 1,
+        "images_without_mask": 1,
+        "images_without_picture": 1,
+    }
+    assert len(found.image_pairs) == len(found.images) - 1
+    assert [record.getMessage() for record in caplog.records] == [
+        "kitti/00: left out: 1 scans without labels, 1 images without mask, 1 images without picture"
+    ]
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_points_that_are_no_numbers_are_left_out_with_their_labels_and_times(
+    drive: Path, value: float
+) -> None:
+    (drive / "velodyne_times").mkdir()
+    times = np.linspace(-0.05, 0.05, POINTS).astype("<f4")
+    for k in range(FRAMES):
+        times.tofile(drive / f"velodyne_times/{k:06d}.bin")
+    coordinate(1, value)(drive)
+    coordinate(7, value)(drive)
+    bad = times.copy()
+    bad[[1, 7]] = np.nan  # nobody asks for the time of a point that is not there
+    bad.tofile(drive / "velodyne_times/000002.bin")
+    labels = np.fromfile(drive / "labels/000002.label", "<u4")
+    labels[7] = 7  # nor for its class
+    labels.tofile(drive / "labels/000002.label")
+    whole = np.fromfile(drive / "velodyne/000002.bin", "<f4").reshape(-1, 4)[:, :3]
+    scan = open_source(drive)[2].scan
+    assert scan is not None and scan.left_out == 2 and scan.offsets_s is not None
+    kept = np.delete(np.arange(POINTS), [1, 7])
+    assert np.array_equal(scan.points, whole[kept]) and np.array_equal(scan.offsets_s, times[kept])
+    assert (scan.classes == SemanticClass.VEHICLE).tolist() == [k in (0, 2) for k in kept]
+    drive_ = prepare_drive(open_source(drive), (SemanticClass.VEHICLE,))
+    assert drive_.left_out.counts() == {"points": 2, "scans_with_such_points": 1}
+
+
+def test_nothing_missing_is_nothing_to_say(drive: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "sst_graph"):
+        assert prepare_drive(open_source(drive), (SemanticClass.VEHICLE,)).left_out.counts() == {}
+    assert caplog.records == []
+
+
+def test_folders_without_any_partner_are_refused(drive: Path) -> None:
+    for path in (drive / "semantic_2").iterdir():
+        path.rename(path.with_name(f"{int(path.stem) + 5:06d}.png"))
+    (drive / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(10)))
+    with pytest.raises(DataError, match="semantic_2: found no file with the number of one beside it"):
+        open_source(drive)
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "times.txt", SCAN, "labels/000002.label", PICTURE, MASK])
+def test_what_is_no_regular_file_is_refused_at_once(drive: Path, name: str) -> None:
+    (drive / name).unlink()
+    os.mkfifo(drive / name)
+    with pytest.raises(DataError, match=f"{name}: found a FIFO"):
+        read_all(drive)
+    (drive / name).unlink()
+    (drive / name).symlink_to(Path(name).name)
+    with pytest.raises(DataError, match=f"{name}: found an unreadable file"):
+        read_all(drive)
+
+
+def test_a_folder_in_place_of_the_truth_is_refused(drive: Path) -> None:
+    (drive / "groundtruth.json").mkdir()
+    with pytest.raises(DataError, match=r"groundtruth\.json: found a folder"):
+        open_source(drive)
+
+
+def test_a_name_that_would_write_to_the_terminal_is_shown(drive: Path) -> None:
+    folder = drive.parent.parent
+    evil = folder.with_name("evil\x1b[31m\nname")
+    folder.rename(evil)
+    assert open_source(evil).name == r"evil\x1b[31m\nname/00"
+    (evil / "sequences/00/calib.txt").unlink()
+    with pytest.raises(DataError) as caught:
+        open_source(evil)
+    assert str(caught.value).isprintable()

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_graph.data.calib import pose_from, read_calibration, rotation_from
+from sst_graph.data.calib import pose_from, read_calibration
 from sst_graph.errors import ConfigError, DataError
 
 P0 = "P0: 700 0 600 0 0 710 170 0 0 0 1 0"
@@ -35,7 +35,7 @@ def test_pose_projects_as_the_devkit_does(tmp_path: Path) -> None:
 def test_camera_zero_has_no_shift(tmp_path: Path) -> None:
     calibration = read_calibration(write(tmp_path, P0, P2, TR))
     np.testing.assert_allclose(calibration.cTl("image_0").translation(), [-0.003, -0.075, -0.272])
-    assert calibration.camera("image_0", 10, 20).fy == 710.0
+    assert calibration.camera("image_0", 1242, 375).fy == 710.0
 
 
 def test_rounded_rotation_becomes_exact(tmp_path: Path) -> None:
@@ -52,10 +52,14 @@ def test_rounded_rotation_becomes_exact(tmp_path: Path) -> None:
         ((P0, TR), r"calib\.txt: found no line P2, expected the projection matrix of image_2"),
         ((P2 + " 7", TR), r"calib\.txt:1: found 13 values for P2, expected 12"),
         ((P2, "Tr: 1 2 3"), r"calib\.txt:2: found 3 values for Tr, expected 12"),
-        ((P2, TR.replace("-0.075", "x")), r"calib\.txt:2: found Tr: .*'x', expected 12 numbers"),
+        ((P2, TR.replace("-0.075", "x")), r"calib\.txt:2: found 'x' in Tr, expected 12 numbers"),
         ((P2, TR.replace("-0.075", "nan")), r"calib\.txt:2: found NaN or inf in Tr"),
-        ((P2, TR.replace("0 -1 0", "0 -1.1 0")), r"\(Tr\): found a matrix with \|R\^T R - I\| up to 0\.21"),
-        ((P2, TR.replace("0 -1 0", "0 1 0")), r"\(Tr\): found a reflection"),
+        ((P2, TR.replace("0 -1 0", "0 -1.1 0")), r"\(Tr\): found a 3x3 block with \|R R' - I\| = 0\.21"),
+        ((P2, TR.replace("0 -1 0", "0 1 0")), r"\(Tr\): found a 3x3 block .* det -1, expected a rotation"),
+        ((P2, TR.replace("-0.272", "-272000")), r"found a translation of 2.72e\+05 m"),
+        ((P2.replace("45", "4e9"), TR), r"shift of image_2\): found a translation"),
+        ((P2.replace("700", "1e300"), TR), r"found P2 = .* expected \[fx 0 cx"),
+        ((P2.replace("700", "5e-324"), TR), r"found P2 = .* expected \[fx 0 cx"),
         ((P2.replace("700", "0"), TR), r"found P2 = .* expected \[fx 0 cx"),
         ((P2.replace("P2: 700 0", "P2: 700 3"), TR), r"found P2 = .* expected \[fx 0 cx"),
     ],
@@ -67,10 +71,10 @@ def test_bad_lines_are_named(tmp_path: Path, lines: tuple[str, ...], message: st
 
 
 def test_missing_or_binary_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"calib\.txt: found no file"):
+    with pytest.raises(DataError, match=r"calib\.txt: found no such file"):
         read_calibration(tmp_path / "calib.txt")
     (tmp_path / "calib.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match="unreadable file"):
+    with pytest.raises(DataError, match="no UTF-8 text"):
         read_calibration(tmp_path / "calib.txt")
 
 
@@ -85,9 +89,24 @@ def test_matrices_that_are_no_pose() -> None:
         pose_from(np.eye(3), "x")
     with pytest.raises(DataError, match=r"last row \[0\.0, 0\.0, 0\.0, 2\.0\]"):
         pose_from(np.diag([1.0, 1, 1, 2]), "x")
-    with pytest.raises(DataError, match="NaN or inf"):
-        rotation_from(np.full((3, 3), np.nan), "x")
     translated = np.eye(4)
     translated[0, 3] = np.inf
-    with pytest.raises(DataError, match="NaN or inf"):
+    with pytest.raises(DataError, match="not finite"):
         pose_from(translated, "x")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("700", "1e9", r"fx = 1e\+09 px, expected a focal length of"),
+        ("710", "1e9", r"fy = 1e\+09 px"),
+        ("700", "3", r"fx = 3 px"),
+        ("700", "60000", "differ by a factor of at most 5"),
+        ("600", "9000", r"cx = 9000 px, expected a principal point of -1242 to 2484 px"),
+        ("170", "-400", r"cy = -400 px"),
+    ],
+)
+def test_intrinsics_must_go_with_the_image(tmp_path: Path, old: str, new: str, message: str) -> None:
+    calibration = read_calibration(write(tmp_path, P2.replace(old, new), TR))
+    with pytest.raises(DataError, match=message):
+        calibration.camera("image_2", 1242, 375)

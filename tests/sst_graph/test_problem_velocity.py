@@ -137,3 +137,12 @@ def test_what_is_known_grows_with_the_scans_around_and_is_forgotten() -> None:
     assert velocities.of(9, NAME) is late and velocities.speeds(10)[NAME] == pytest.approx(9 / 1.0)
     velocities.forget(12)
     assert not (velocities._scans or velocities._sightings or velocities.found)
+
+
+def test_a_scan_whose_objects_show_no_side_tells_nothing() -> None:
+    """Roofs alone, as where all sides are hidden or too far from the next beam."""
+    scan = _scan(0, gtsam.Pose3(), _seen_corners(np.array([20.0, 3.0]), np.zeros(2)))
+    roofs = scan.boundaries[VEHICLE].take(np.flatnonzero(scan.boundaries[VEHICLE].edges == Edge.TOP))
+    velocities = Velocities()
+    velocities.add(0, dataclasses.replace(scan, boundaries={VEHICLE: roofs}), {NAME: 7}, gtsam.Pose3())
+    assert velocities.of(0, NAME) is None and velocities.speeds(0) == {}

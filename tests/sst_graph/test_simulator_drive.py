@@ -207,3 +207,16 @@ def test_the_number_of_moving_vehicles_follows_the_configuration() -> None:
 def test_bad_configurations_are_refused(name: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=name):
         SimulationConfig(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"width": 8192, "height": 4096}, r"width: found 8192, expected at most 2441.*\(10000000 px in all"),
+        ({"frames": 10_000, "motion": "standing"}, r"frames: .* at most 9650 \(1000 s at frame_rate_hz\)"),
+        ({"frames": 9000}, r"frames: found 9000, expected at most 5676.* \(5000 m at speed_mps"),
+    ],
+)
+def test_drives_that_would_fill_the_memory_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        SimulationConfig(**settings)

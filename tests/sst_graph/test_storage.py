@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import resource
+import zlib
 from collections import deque
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gtsam
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from factors.robust import RobustKernel
+from sst_graph.estimators.checkpoint import checkpoint_classes
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.odometry import LidarOdometry
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import image_features
 from sst_graph.storage import restored, stored
+from sst_graph.typed import wrong_fields
 from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
+CLASSES = checkpoint_classes()
 
 
 def _again(value: object) -> Any:
     node, data = stored(value)
-    return restored(json.loads(json.dumps(node)), data)
+    return restored(json.loads(json.dumps(node, allow_nan=False)), data, CLASSES)
 
 
 def test_plain_values_and_containers() -> None:
@@ -113,12 +120,43 @@ def test_strangers_are_not_stored(value: object) -> None:
         ["object", "sst_graph.files:Path", ["dict", [], 1], 0],
         ["object", "sst_graph.nothing:Nothing", ["dict", [], 1], 0],
         ["object", "sst_graph.cli.__main__:main", ["dict", [], 1], 0],
+        ["object", "sst_graph.types:SemanticClass", ["dict", [], 1], 0],
+        ["object", "factors.robust:RobustKernel", ["dict", [["kind", "huber"], ["scale", "wide"]], 1], 0],
+        ["object", "factors.robust:RobustKernel", ["dict", [["kind", "huber"], ["scale", -1.0]], 1], 0],
+        ["object", "factors.robust:RobustKernel", ["list", [], 1], 0],
+        ["object", "factors.robust:RobustKernel.__init__", ["dict", [], 1], 0],
+        ["object", "sst_graph.odometry.smoothing:MotionSmoother", ["dict", [["__class__", 1]], 1], 0],
+        ["object", "sst_graph.odometry.smoothing:MotionSmoother", ["dict", [["smoothed", 1]], 1], 0],
+        ["enum", "sst_graph.odometry.smoothing:MotionSmoother", 1],
+        ["enum", "sst_graph.estimators.incremental:Tracker", 1],
+        ["enum", "sst_graph.types:SemanticClass", True],
+        ["_object", "factors.robust:RobustKernel", ["dict", [], 1], 0],
+        ["__init__", [], 0],
+        ["value", 3],
         ["object", "factors.robust:RobustKernel", ["dict", [["scale", 1.0]], 1], 0],
         ["enum", "sst_graph.types:SemanticClass", 999],
         ["array", "<f8", [3], "C", False, [0, 24], 0],
         ["array", "<f8", [2], "C", False, [0, 8], 0],
         ["array", "|O", [1], "C", False, [0, 8], 0],
         ["array", "|u1", [8], "C", True, [0, 8], 0],
+        ["array", "|u1", [10**13], "C", True, [0, 8], 0],
+        ["array", "<f8", [10**13], "C", False, [0, 8], 0],
+        ["array", "|u1", [2**62, 2**62], "C", False, [0, 0], 0],
+        ["array", "|u1", [-1], "C", False, [0, 8], 0],
+        ["array", "|u1", [8.0], "C", False, [0, 8], 0],
+        ["array", "|S8", [1], "C", False, [0, 8], 0],
+        ["array", "<f8", [1], "C", False, [0, 8]],
+        ["array", "<f8", [1], "C", False, [0.0, 8], 0],
+        ["tuple", [["array", "<f8", [1], "C", False, [0, 8], 0], ["list", [], 0]], 1],
+        ["pose", ["array", "<f8", [1], "C", False, [0, 8], 0], 1],
+        ["tree", ["list", [1.0], 0], 1],
+        ["deque", [1, 2, 3], 2, 0],
+        ["deque", [], -1, 0],
+        ["set", [["list", [], 0]], 1],
+        ["float", "1.0"],
+        ["float", 1],
+        ["list", [["same", 0]], "0"],
+        {"a": 1},
         ["same", 3],
         ["anything", []],
         ["init__", []],
@@ -128,4 +166,63 @@ def test_strangers_are_not_stored(value: object) -> None:
 )
 def test_what_is_no_stored_value_is_refused(node: Any) -> None:
     with pytest.raises(ValueError, match=r"\w"):
-        restored(node, bytes(8))
+        restored(node, bytes(8), CLASSES)
+
+
+def test_what_unpacks_to_more_than_it_says_takes_no_memory() -> None:
+    bomb = zlib.compress(bytes(300_000_000), 1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for size in (1000, 2**40):
+        with pytest.raises(ValueError, match="bytes"):
+            restored(["array", "|u1", [size], "C", True, [0, len(bomb)], 0], bomb, CLASSES)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+
+
+def test_many_arrays_of_the_same_bytes_are_counted_each() -> None:
+    block = bytes(1 << 20)
+    nodes = [["array", "|u1", [1 << 30], "C", True, [0, 1 << 20], number] for number in range(2)]
+    with pytest.raises(ValueError, match="arrays of more than 536870912 bytes"):
+        restored(["list", nodes, 600], block, CLASSES)
+
+
+def test_only_listed_classes_are_written() -> None:
+    with pytest.raises(TypeError, match="RobustKernel, expected"):
+        stored(RobustKernel("huber", 2.0), {})
+
+
+def test_deep_nodes_are_refused() -> None:
+    node: Any = 1
+    for number in range(5000):
+        node = ["list", [node], number]
+    with pytest.raises(ValueError, match="RecursionError"):
+        restored(node, b"", CLASSES)
+
+
+@dataclass
+class _Fields:
+    number: float
+    count: int
+    names: tuple[str, ...]
+    table: dict[SemanticClass, NDArray[np.float64]]
+    either: int | None
+    kind: Literal["a", "b"]
+
+
+GOOD = _Fields(1.0, 2, ("a",), {VEHICLE: np.zeros(3)}, None, "a")
+
+
+def test_declared_types_are_checked_in_the_items_too() -> None:
+    assert wrong_fields(GOOD) == []
+    assert wrong_fields(dataclasses.replace(GOOD, number=3, count=np.int64(4), either=5)) == []
+    wrong = {
+        "number": ["1.0", True, None],
+        "count": [1.5, True, "1"],
+        "names": [["a"], ("a", 1), "a"],
+        "table": [{VEHICLE: np.zeros(3, int)}, {1: np.zeros(3)}, {VEHICLE: [0.0]}, []],
+        "either": [1.5, "a"],
+        "kind": ["c", 1],
+    }
+    for name, values in wrong.items():
+        for value in values:
+            changed: Any = {name: value}
+            assert wrong_fields(dataclasses.replace(GOOD, **changed)) == [name]

@@ -25,9 +25,28 @@ def test_seconds_become_exact_nanoseconds(text: str, nanoseconds: int) -> None:
     assert parse_seconds(text, "times.txt") == nanoseconds
 
 
-@pytest.mark.parametrize("text", ["", "abc", "0.1 0.2", "nan", "inf", "1e30", "0,5"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "abc",
+        "0.1 0.2",
+        "nan",
+        "inf",
+        "1e30",
+        "0,5",
+        "1e999999999",
+        "-1e999999999",
+        "1e99999999999",
+        "1" * 400,
+        "0." + "1" * 400,
+        "1_0",
+        "٣",
+        "0x1p3",
+    ],
+)
 def test_what_is_no_time_is_refused(text: str) -> None:
-    with pytest.raises(DataError, match=r"^times\.txt:3: found .* seconds$"):
+    with pytest.raises(DataError, match=r"^times\.txt:3: found .*, expected .*seconds"):
         parse_seconds(text, "times.txt:3")
 
 
@@ -64,7 +83,7 @@ def test_times_file(tmp_path: Path) -> None:
         (b"0.0\n\n0.2\n", "times.txt:2: found ''"),
         (b"0.0\n0.1x\n", "times.txt:2: found '0.1x'"),
         (b"0.0\n0.2\n0.1\n", "falling stamps 1 and 2"),
-        (b"\xff\xfe0\x00", "unreadable file"),
+        (b"\xff\xfe0\x00", "no UTF-8 text"),
     ],
 )
 def test_bad_times_file_is_refused(tmp_path: Path, content: bytes, message: str) -> None:
@@ -75,5 +94,5 @@ def test_bad_times_file_is_refused(tmp_path: Path, content: bytes, message: str)
 
 
 def test_missing_times_file(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"times\.txt: found no file, expected"):
+    with pytest.raises(DataError, match=r"times\.txt: found no such file, expected"):
         read_times(tmp_path / "times.txt")

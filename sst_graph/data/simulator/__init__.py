@@ -4,6 +4,14 @@ from __future__ import annotations
 
 from sst_graph.data.simulator.config import Motion, SimulationConfig
 from sst_graph.data.simulator.drive import SimulatedDrive, simulate
-from sst_graph.data.simulator.write import write_drive
+from sst_graph.data.simulator.write import DRIVE, fill_drive, write_drive
 
-__all__ = ["Motion", "SimulatedDrive", "SimulationConfig", "simulate", "write_drive"]
+__all__ = [
+    "DRIVE",
+    "Motion",
+    "SimulatedDrive",
+    "SimulationConfig",
+    "fill_drive",
+    "simulate",
+    "write_drive",
+]

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
-from sst_graph.errors import ConfigError
+from sst_graph.config import Settings, setting
 
 Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning", "there_and_back"]
 """Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed;
 ``there_and_back`` goes forward for half of the drive and returns in reverse."""
 
+_MOST_PIXELS, _LONGEST_S, _FARTHEST_M = 10_000_000, 1000.0, 5000.0
+"""Larger images take more than 1.5 GB; a longer drive or street takes more than that or a minute to build."""
+
 
 @dataclass(frozen=True)
-class SimulationConfig:
+class SimulationConfig(Settings):
     """A simulated drive; equal configurations give equal drives.
 
     Attributes:
@@ -43,56 +46,36 @@ class SimulationConfig:
         max_range_m: returns beyond this range are lost [m].
     """
 
-    seed: int = 0
-    frames: int = 60
-    width: int = 1242
-    height: int = 375
-    frame_rate_hz: float = 9.65
+    seed: int = setting(0, at_least=0, at_most=2**63 - 1)
+    frames: int = setting(60, at_least=1, at_most=100_000)
+    width: int = setting(1242, at_least=64, at_most=8192)
+    height: int = setting(375, at_least=32, at_most=4096)
+    frame_rate_hz: float = setting(9.65, at_least=1.0, at_most=50.0)
     motion: Motion = "mixed"
-    speed_mps: float = 8.5
-    time_offset_s: float = 0.05
-    rotation_error_deg: float = 1.5
-    translation_error_m: float = 0.05
-    vehicle_density: float = 0.13
-    moving_fraction: float = 0.2
-    truck_fraction: float = 0.08
-    label_noise: float = 1.0
+    speed_mps: float = setting(8.5, at_least=0.0, at_most=40.0)
+    time_offset_s: float = setting(0.05, at_least=-0.5, at_most=0.5)
+    rotation_error_deg: float = setting(1.5, at_least=0.0, at_most=180.0)
+    translation_error_m: float = setting(0.05, at_least=0.0, at_most=10.0)
+    vehicle_density: float = setting(0.13, at_least=0.0, at_most=0.4)
+    moving_fraction: float = setting(0.2, at_least=0.0, at_most=0.8)
+    truck_fraction: float = setting(0.08, at_least=0.0, at_most=1.0)
+    label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     rolling: bool = False
-    azimuth_limit_deg: float = 180.0
-    azimuth_step_deg: float = 0.1728
-    range_noise_m: float = 0.02
-    drop_out: float = 0.03
-    beam_divergence_mrad: float = 2.0
-    max_range_m: float = 90.0
+    azimuth_limit_deg: float = setting(180.0, at_least=1.0, at_most=180.0)
+    azimuth_step_deg: float = setting(0.1728, at_least=0.02, at_most=5.0)
+    range_noise_m: float = setting(0.02, at_least=0.0, at_most=1.0)
+    drop_out: float = setting(0.03, at_least=0.0, at_most=1.0)
+    beam_divergence_mrad: float = setting(2.0, at_least=0.0, at_most=20.0)
+    max_range_m: float = setting(90.0, at_least=5.0, at_most=200.0)
 
     def __post_init__(self) -> None:
-        if self.motion not in get_args(Motion):
-            raise ConfigError(f"motion: found {self.motion!r}, expected one of {', '.join(get_args(Motion))}")
-        limits: dict[str, tuple[float, float]] = {
-            "seed": (0, 2**63 - 1),
-            "frames": (1, 100_000),
-            "width": (64, 8192),
-            "height": (32, 4096),
-            "frame_rate_hz": (1.0, 50.0),
-            "speed_mps": (0.0, 40.0),
-            "time_offset_s": (-0.5, 0.5),
-            "rotation_error_deg": (0.0, 180.0),
-            "translation_error_m": (0.0, 10.0),
-            "vehicle_density": (0.0, 0.4),
-            "moving_fraction": (0.0, 0.8),
-            "truck_fraction": (0.0, 1.0),
-            "label_noise": (0.0, 2.0),
-            "azimuth_limit_deg": (1.0, 180.0),
-            "azimuth_step_deg": (0.02, 5.0),
-            "range_noise_m": (0.0, 1.0),
-            "drop_out": (0.0, 1.0),
-            "beam_divergence_mrad": (0.0, 20.0),
-            "max_range_m": (5.0, 200.0),
-        }
-        for name, (low, high) in limits.items():
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ConfigError(f"{name}: found {value}, expected {low:g} to {high:g}")
+        way_m = 0.0 if self.motion == "standing" else self.speed_mps * self.period_s
+        self.expect_at_most("width", _MOST_PIXELS / self.height, f"{_MOST_PIXELS} px in all, with height")
+        self.expect_at_most("frames", _LONGEST_S / self.period_s, f"{_LONGEST_S:g} s at frame_rate_hz")
+        if way_m > 0.0:
+            self.expect_at_most(
+                "frames", _FARTHEST_M / way_m, f"{_FARTHEST_M:g} m at speed_mps, frame_rate_hz"
+            )
 
     @property
     def period_s(self) -> float:

@@ -13,8 +13,7 @@ import numpy as np
 
 from sst_graph.data.simulator.drive import RawFrame, SimulatedDrive
 from sst_graph.data.simulator.surfaces import CITYSCAPES, SEMANTIC_KITTI
-from sst_graph.errors import DataError
-from sst_graph.files import atomic_directory
+from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.types import FloatArray
 
 CAMERA_SHIFTS_M = (
@@ -26,6 +25,7 @@ CAMERA_SHIFTS_M = (
 """Camera 0's origin in cameras 0 to 3 [m], as in KITTI: P_i = K [I | shift_i]."""
 PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 FOLDERS = ("image_2", "semantic_2", "velodyne", "labels")
+DRIVE = OutputKind("simulated drive", exclusive=("sequences",))
 FRAME_NAME = "{:06d}"
 
 Progress = Callable[[int, int], None]
@@ -44,26 +44,35 @@ def write_drive(
     Args:
         drive: from :func:`simulate`.
         path: folder to be made.
-        overwrite: whether a drive that stands there may be replaced.
+        overwrite: whether a simulated drive that stands there, its files unchanged, may be replaced.
         progress: called with (frames done, frames in all).
 
     Raises:
         ConfigError: ``path`` is there and may not be replaced.
         OSError: it cannot be written.
     """
-    with atomic_directory(path, overwrite, owned_by="sequences") as root:
-        folder = root / "sequences" / "00"
-        for name in (*FOLDERS, *(("velodyne_times",) if drive.config.rolling else ())):
-            (folder / name).mkdir(parents=True)
-        (folder / "calib.txt").write_text(_calibration(drive))
-        (folder / "times.txt").write_text("".join(f"{stamp * 1e-9:.9e}\n" for stamp in drive.stamps_ns))
-        (folder / "poses.txt").write_text(_poses(drive))
-        (folder / "groundtruth.json").write_text(json.dumps(_truth(drive), indent=1) + "\n")
-        for index in range(len(drive)):
-            _write_frame(folder, FRAME_NAME.format(index), drive.raw(index), drive.config.rolling)
-            if progress is not None:
-                progress(index + 1, len(drive))
+    with atomic_directory(path, overwrite, DRIVE) as root:
+        fill_drive(drive, root, progress)
     return Path(path) / "sequences" / "00"
+
+
+def fill_drive(drive: SimulatedDrive, root: Path, progress: Progress | None = None) -> None:
+    """Write the drive's files into ``root``/sequences/00, which must not be there; :func:`write_drive`.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    folder = root / "sequences" / "00"
+    for name in (*FOLDERS, *(("velodyne_times",) if drive.config.rolling else ())):
+        (folder / name).mkdir(parents=True)
+    (folder / "calib.txt").write_text(_calibration(drive))
+    (folder / "times.txt").write_text("".join(f"{stamp * 1e-9:.9e}\n" for stamp in drive.stamps_ns))
+    (folder / "poses.txt").write_text(_poses(drive))
+    (folder / "groundtruth.json").write_text(json.dumps(_truth(drive), indent=1) + "\n")
+    for index in range(len(drive)):
+        _write_frame(folder, FRAME_NAME.format(index), drive.raw(index), drive.config.rolling)
+        if progress is not None:
+            progress(index + 1, len(drive))
 
 
 def _write_frame(folder: Path, name: str, raw: RawFrame, rolling: bool) -> None:
@@ -79,8 +88,9 @@ def _write_frame(folder: Path, name: str, raw: RawFrame, rolling: bool) -> None:
 
 
 def _write_png(path: Path, image: np.typing.NDArray[np.uint8]) -> None:
-    if not cv2.imwrite(str(path), image, PNG_SPEED):
-        raise DataError(path, "a picture that OpenCV could not write", "a writable folder with space left")
+    # OpenCV's own writing says neither what failed nor why.
+    _, data = cv2.imencode(".png", image, PNG_SPEED)
+    path.write_bytes(data.tobytes())
 
 
 def _lidar_in_camera0(drive: SimulatedDrive) -> gtsam.Pose3:

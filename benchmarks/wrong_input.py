@@ -1,0 +1,82 @@
+"""Drives made wrong on purpose, calibrated as a user would: status, named cause, error. Prints a table.
+
+    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --seeds 201 202
+    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --drive DATA --image-shift 1 --lies "Tr inverted" clean
+
+Streets have 30 frames of 621x188 px, and start from the pose that the data bring.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+from wrong_drives import LIES, NAMED, HeldDrive, right_camera
+
+from sst_graph import calibrate, open_source
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.errors import SstGraphError
+from sst_graph.metrics import calibration_errors
+
+CLEAN, RIGHT = "clean", "right camera"
+
+
+def street(seed: int, right: bool = False) -> HeldDrive:
+    """A street of a seed, seen by its own camera or by one beside it."""
+    made = simulate(SimulationConfig(seed=seed, frames=30, width=621, height=188, azimuth_step_deg=0.3))
+    return right_camera(made) if right else HeldDrive.of(made)
+
+
+def row(name: str, drive: HeldDrive) -> tuple[str, bool]:
+    """A line of the table, and whether it is as it should be: a lie named and not ok, clean data silent."""
+    try:
+        result = calibrate(drive, drive.nominal)
+    except SstGraphError as error:
+        return f"refused | {error}", NAMED.get(name, "") in str(error) and name in NAMED
+    first = result.reasons[0] if result.reasons else ""
+    error_text = ""
+    if drive.truth is not None:
+        errors = calibration_errors(
+            result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
+        )
+        error_text = f"{errors.qad_deg:.2f} deg, {100.0 * errors.atd_m:.1f} cm"
+    named = not any(words in first for words in NAMED.values())
+    if name in NAMED:
+        named = NAMED[name] in first and result.status != "ok"
+    return f"{result.status} | {error_text} | {first}", named
+
+
+def drives(args: argparse.Namespace) -> Iterator[tuple[str, HeldDrive, HeldDrive, HeldDrive | None]]:
+    """Name, drive, another drive of the same size, and the drive by the right camera where it can be had."""
+    other = HeldDrive.of(open_source(args.other)) if args.other else None
+    for path in args.drive:
+        drive = HeldDrive.of(open_source(path, image_shift=args.image_shift))
+        yield path.name, drive, other or drive, None
+    for seed in args.seeds:
+        yield str(seed), street(seed), street(seed + 1000), street(seed, right=RIGHT in args.lies)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[])
+    parser.add_argument("--drive", type=Path, nargs="*", default=[])
+    parser.add_argument("--other", type=Path, help="another drive, for masks and images of another drive")
+    parser.add_argument("--image-shift", type=int, default=0)
+    parser.add_argument("--lies", nargs="*", default=[CLEAN, *LIES, RIGHT])
+    args = parser.parse_args()
+    right, total = 0, 0
+    for name, drive, other, beside in drives(args):
+        for lie in args.lies:
+            if lie == RIGHT and beside is None:
+                continue
+            wrong = drive if lie == CLEAN else beside if lie == RIGHT else LIES[lie](drive, other)
+            assert wrong is not None
+            text, as_it_should = row(lie, wrong)
+            right, total = right + as_it_should, total + 1
+            print(f"{name} | {lie} | {'yes' if as_it_should else 'NO'} | {text}", flush=True)
+    print(f"{right} of {total} as they should be")
+
+
+if __name__ == "__main__":
+    main()

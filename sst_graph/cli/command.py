@@ -1,0 +1,73 @@
+"""One command from its arguments to its exit code."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from sst_graph.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_READER_GONE
+from sst_graph.cli.messages import StreamError, complain, flush
+from sst_graph.cli.options import build_parser
+from sst_graph.errors import SstGraphError
+
+
+def run(argv: Sequence[str]) -> int:
+    """Run the command that ``argv`` names; its exit code (:func:`sst_graph.cli.main`)."""
+    try:
+        code = _run(argv)
+        flush()
+        return code
+    except StreamError as error:
+        if error.reader_gone:
+            # The reader of our output has what it wanted: there is nothing to say to it.
+            return EXIT_READER_GONE
+        return _failed(str(error), EXIT_BAD_INPUT)
+    except BrokenPipeError:
+        return EXIT_READER_GONE
+    except KeyboardInterrupt:
+        return _failed("interrupted", EXIT_INTERRUPTED)
+    except OSError as error:
+        return _failed(_sentence(error), EXIT_BAD_INPUT)
+    except SstGraphError as error:
+        return _failed(str(error), EXIT_BAD_INPUT)
+
+
+def _run(argv: Sequence[str]) -> int:
+    args = build_parser().parse_args(argv)
+    _set_up_logging(args.verbose)
+    command = importlib.import_module(f"sst_graph.cli.{args.command}")
+    code: int = command.run(args)
+    return code
+
+
+def _failed(message: str, code: int) -> int:
+    complain(f"error: {message}")
+    return code
+
+
+def _sentence(error: OSError) -> str:
+    """Where it happened, and what."""
+    if error.errno is None:
+        return str(error)
+    what = error.strerror or os.strerror(error.errno)
+    place = error.filename if error.filename is not None else "the operating system"
+    if isinstance(place, bytes):
+        place = os.fsdecode(place)
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    advice = " (free some space, or name another place)" if full else ""
+    return f"{place}: {what}{advice}"
+
+
+def _set_up_logging(verbose: bool) -> None:
+    level = logging.DEBUG if verbose else logging.WARNING
+    # A message that cannot be logged is no reason for a traceback.
+    logging.raiseExceptions = False
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", force=True)
+    for name in ("sst_graph", "factors"):
+        logging.getLogger(name).setLevel(level)
+    if sys.stderr is not None:
+        logging.captureWarnings(True)

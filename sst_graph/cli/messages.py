@@ -1,0 +1,77 @@
+"""What a command says: results on stdout, remarks on stderr, and what it means where that fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from contextlib import suppress
+from typing import TextIO
+
+
+class StreamError(Exception):
+    """stdout does not take what was written to it.
+
+    Attributes:
+        reader_gone: it is a pipe that nobody reads from any more.
+    """
+
+    def __init__(self, error: OSError) -> None:
+        self.reader_gone = error.errno == errno.EPIPE
+        super().__init__(f"stdout: {error.strerror or error}")
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Print what the command was called for.
+
+    Raises:
+        StreamError: it could not be written, so the command has failed.
+    """
+    try:
+        sys.stdout.write(_shown(text + end, sys.stdout))
+        sys.stdout.flush()
+    except OSError as error:
+        raise StreamError(error) from None
+
+
+def mention(text: str) -> None:
+    """Print what was done where the work itself stands in files: it is done, printed or not."""
+    try:
+        say(text)
+    except StreamError as error:
+        _discard_stdout()
+        if not error.reader_gone:
+            complain(f"warning: {error}: the outputs are complete, but could not be listed")
+
+
+def _shown(text: str, stream: TextIO) -> str:
+    """The text with what the stream's encoding has not escaped."""
+    encoding = stream.encoding or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
+def _discard_stdout() -> None:
+    """Let what cannot be written to stdout, and all that follows, vanish."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.stdout.flush()
+
+
+def complain(text: str) -> None:
+    """One line on stderr, whatever the text holds."""
+    # Where nobody can be told, the exit code still tells.
+    with suppress(OSError, ValueError):
+        sys.stderr.write(_shown("sst-graph: " + " ".join(text.split()) + "\n", sys.stderr))
+        sys.stderr.flush()
+
+
+def flush() -> None:
+    """Write out what is printed.
+
+    Raises:
+        StreamError: it could not be.
+    """
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        raise StreamError(error) from None

@@ -1,0 +1,147 @@
+"""How drives are read: as the command line says, and else as the result says that they were.
+
+A calibration holds for the pairs of scans and images that it was made of. How they were read stands in
+calibration.json (``read_as``), so that a later command reads the same drive the same way, or objects.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from sst_graph.cli.messages import complain
+from sst_graph.cli.options import SOURCE_DEFAULTS
+from sst_graph.data import open_source
+from sst_graph.errors import ConfigError, SstGraphError
+from sst_graph.result import CalibrationResult
+from sst_graph.types import Source
+
+PAIRING = ("image_shift", "camera")
+"""Options without which a result means something else: they may not be contradicted."""
+
+MEASUREMENT = ("cloud", "sweep")
+"""Options that change what is measured; another choice is allowed, and said."""
+
+OF_ONE_DRIVE = ("sequence", "frames")
+"""Options that belong to the drives of the result, not to any drive."""
+
+
+def options_of(args: argparse.Namespace) -> dict[str, Any]:
+    """How the command line says that its drives are to be read, defaults filled in; also in ``args``."""
+    options = {name: _given(args, name, default) for name, default in SOURCE_DEFAULTS.items()}
+    for name, value in options.items():
+        setattr(args, name, value)
+    return options
+
+
+def open_drive(args: argparse.Namespace, path: Path) -> Source:
+    """The drive at ``path``, read as the command line says.
+
+    Raises:
+        ConfigError, DataError: an option or the data cannot be used.
+    """
+    return _checked_name(open_source(path, **options_of(args)), path)
+
+
+def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResult, place: Path) -> Source:
+    """The drive at ``path``, read as the drives of ``result`` (of the file ``place``) were.
+
+    Options that are given win; what they change, and what was taken from the result, is said on stderr.
+
+    Raises:
+        ConfigError: an option contradicts the pairs that the result was made of; or as :func:`open_drive`.
+    """
+    stored = {name: value for name, value in result.read_as.items() if name in SOURCE_DEFAULTS}
+    _check_given(args, stored, place)
+    options = dict(SOURCE_DEFAULTS)
+    options |= {name: stored[name] for name in (*PAIRING, *MEASUREMENT) if name in stored}
+    options |= {name: getattr(args, name) for name in SOURCE_DEFAULTS if getattr(args, name) is not None}
+    source, options = _opened_like(args, path, options, stored, {one.drive for one in result.frames_used})
+    for name, value in options.items():
+        if getattr(args, name) is None and value != SOURCE_DEFAULTS[name]:
+            complain(f"note: read with {_flag(name)} {value}, as {place} was made")
+        setattr(args, name, value)
+    return _checked_name(source, path)
+
+
+def warn_of_other_pairs(choice: str, options: Mapping[str, Any]) -> None:
+    """Say so where a start comes from a result of other pairs of scans and images."""
+    stored = _stored_in(Path(choice)).get("image_shift")
+    if isinstance(stored, int) and stored != options["image_shift"]:
+        complain(
+            f"warning: {choice} was made with --image-shift {stored}, found --image-shift "
+            f"{options['image_shift']}: its time offset is that of other pairs"
+        )
+
+
+def reading_words(read_as: Mapping[str, Any]) -> str:
+    """The options that are not the default's, as on a command line; empty where there are none."""
+    return " ".join(
+        f"{_flag(name)} {read_as[name]}"
+        for name, default in SOURCE_DEFAULTS.items()
+        if name in read_as and read_as[name] != default
+    )
+
+
+def _opened_like(
+    args: argparse.Namespace, path: Path, options: dict[str, Any], stored: Mapping[str, Any], drives: set[str]
+) -> tuple[Source, dict[str, Any]]:
+    """The drive; with the result's own sequence and frames if it is one of the result's drives."""
+    own = {
+        name: stored[name]
+        for name in OF_ONE_DRIVE
+        if getattr(args, name) is None and stored.get(name) is not None
+    }
+    if own:
+        try:
+            source = open_source(path, **{**options, **own})
+        except SstGraphError:
+            source = None
+        if source is not None and source.name in drives:
+            return source, {**options, **own}
+    return open_source(path, **options), options
+
+
+def _check_given(args: argparse.Namespace, stored: Mapping[str, Any], place: Path) -> None:
+    for name in (*PAIRING, *MEASUREMENT):
+        given = getattr(args, name)
+        if given is None or name not in stored or given == stored[name]:
+            continue
+        if name in PAIRING:
+            raise ConfigError(
+                f"{_flag(name)} {given}: {place} was made with {_flag(name)} {stored[name]}, "
+                "expected the same"
+            )
+        complain(f"warning: {place} was made with {_flag(name)} {stored[name]}, found {_flag(name)} {given}")
+
+
+def _checked_name(source: Source, path: Path) -> Source:
+    """The drive, if its name can stand in a file."""
+    try:
+        source.name.encode("utf-8")
+    except UnicodeEncodeError:
+        raise ConfigError(f"{path}: found a name that is not UTF-8, expected one that is") from None
+    return source
+
+
+def _stored_in(path: Path) -> Mapping[str, Any]:
+    """``read_as`` of a calibration.json, empty for every other file."""
+    if path.suffix != ".json" or not path.is_file():
+        return {}
+    try:
+        stored = json.loads(path.read_bytes())["read_as"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}  # whatever is wrong with it is said where it is read as a start
+    return stored if isinstance(stored, dict) else {}
+
+
+def _given(args: argparse.Namespace, name: str, default: str | int | None) -> Any:
+    value = getattr(args, name)
+    return default if value is None else value
+
+
+def _flag(name: str) -> str:
+    return "--" + name.replace("_", "-")

@@ -1,0 +1,105 @@
+"""Width and height of a PNG or JPEG file by its header, and whether the file is whole."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+from sst_graph.errors import DataError
+
+PNG = b"\x89PNG\r\n\x1a\n"
+JPEG = b"\xff\xd8\xff"
+
+_START_OF_FRAME = {0xC0, 0xC1, 0xC2, 0xC3, 0xC5, 0xC6, 0xC7, 0xC9, 0xCA, 0xCB, 0xCD, 0xCE, 0xCF}
+_STANDALONE = {0x01, *range(0xD0, 0xD8)}
+_START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
+
+
+def image_size(data: bytes, path: Path) -> tuple[int, int]:
+    """Width and height [px] that a PNG or JPEG file declares.
+
+    Raises:
+        DataError: neither of them, or without a header that says so.
+    """
+    if data.startswith(PNG):
+        width, height = _png_size(data, path)
+    elif data.startswith(JPEG):
+        width, height = _jpeg_size(data, path)
+    else:
+        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", "a PNG or JPEG file")
+    if width == 0 or height == 0:
+        raise DataError(path, f"a size of {width}x{height} px", "a picture with pixels")
+    return width, height
+
+
+def check_whole(data: bytes, path: Path) -> None:
+    """Find truncation and damage that decoders pass over in silence, leaving grey areas.
+
+    Raises:
+        DataError: a PNG chunk that misses its checksum, or a file without its end.
+    """
+    if data.startswith(PNG):
+        _check_png_chunks(data, path)
+    else:
+        _check_jpeg_end(data, path)
+
+
+def _png_size(data: bytes, path: Path) -> tuple[int, int]:
+    if len(data) < 33 or data[12:16] != b"IHDR":
+        raise DataError(path, f"a PNG file truncated at byte {len(data)}", "its header IHDR")
+    width, height = struct.unpack_from(">II", data, 16)
+    return width, height
+
+
+def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
+    for marker, start, end in _jpeg_segments(data):
+        if marker in _START_OF_FRAME and end - start >= 5:
+            height, width = struct.unpack_from(">HH", data, start + 1)
+            return width, height
+    raise DataError(path, "a truncated JPEG file", "a frame header")
+
+
+def _jpeg_segments(data: bytes) -> list[tuple[int, int, int]]:
+    """Markers before the first scan with the range of their contents; that of the scan goes on to the end."""
+    segments = []
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker in _STANDALONE:
+            at += 2
+            continue
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if marker == _START_OF_SCAN:
+            segments.append((marker, at + 4, len(data)))
+            break
+        if length < 2 or at + 2 + length > len(data):
+            break
+        segments.append((marker, at + 4, at + 2 + length))
+        at += 2 + length
+    return segments
+
+
+def _check_jpeg_end(data: bytes, path: Path) -> None:
+    """An end of image behind the first scan: a preview in the header has one of its own."""
+    scans = [start for marker, start, _ in _jpeg_segments(data) if marker == _START_OF_SCAN]
+    if not scans or data.find(bytes((0xFF, _END_OF_IMAGE)), scans[0]) < 0:
+        raise DataError(path, "a truncated JPEG file", "an end-of-image marker")
+
+
+def _check_png_chunks(data: bytes, path: Path) -> None:
+    at = len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 12 + length
+        if end > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            raise DataError(path, f"a damaged PNG chunk at byte {at}", "one that fits its checksum")
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end
+    raise DataError(path, f"a PNG file truncated at byte {len(data)}", "its last chunk IEND")

@@ -1,0 +1,15 @@
+"""Likely causes of wrong results: what users give by mistake, and what in the data says so.
+
+A check is a function of the prepared data that returns a :class:`Finding` or None. :func:`preflight` runs
+those that are certain by themselves, for every calibration; :func:`likely_causes` those that explain a result
+that is doubted already, among them changes of the data that would make the labels agree.
+"""
+
+from __future__ import annotations
+
+from sst_graph.diagnosis.causes import likely_causes, mirror, preflight
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.fit import Fit, Fitter
+from sst_graph.diagnosis.poses import other_camera
+
+__all__ = ["Finding", "Fit", "Fitter", "likely_causes", "mirror", "other_camera", "preflight"]

@@ -1,0 +1,28 @@
+"""Whether pictures and intrinsics are of one camera and one size."""
+
+from __future__ import annotations
+
+from factors.camera import PinholeCamera
+from sst_graph.diagnosis.finding import Finding
+
+_FAR = 1.4
+"""A principal point off the middle by this factor, in both directions alike, is that of another image size:
+lenses and sensors are centred within a few per cent, and a crop seldom cuts width and height alike."""
+_ALIKE = 1.25
+
+
+def image_size(camera: PinholeCamera) -> Finding | None:
+    """Pictures of another size than the intrinsics were made for: the principal point is off the middle by
+    one factor across and down."""
+    across, down = 2.0 * camera.cx / camera.width, 2.0 * camera.cy / camera.height
+    if min(across, down) <= 0.0:
+        return None
+    factor = (across * down) ** 0.5
+    if max(across, down) > _ALIKE * min(across, down) or 1.0 / _FAR < factor < _FAR:
+        return None
+    size = "half" if 1.7 < factor < 2.4 else "twice" if 0.4 < factor < 0.6 else f"{1.0 / factor:.2g} times"
+    return Finding(
+        f"the pictures are {size} the size the intrinsics were made for",
+        f"cx = {camera.cx:.0f} of {camera.width} px, cy = {camera.cy:.0f} of {camera.height} px",
+        f"scale fx, fy, cx and cy by {1.0 / factor:.2g}, or give the pictures and masks at their full size",
+    )

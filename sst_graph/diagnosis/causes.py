@@ -1,0 +1,87 @@
+"""All checks, in the order in which they are believed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import gtsam
+
+from sst_graph.diagnosis import cameras, labels, repeats, units
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
+from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored, numberings
+from sst_graph.diagnosis.poses import wrong_start
+from sst_graph.problem.drive import Drive
+from sst_graph.types import SemanticClass
+
+
+def preflight(
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, classes: Sequence[SemanticClass]
+) -> tuple[Finding, ...]:
+    """What is certainly wrong, whatever the calibration says.
+
+    Args:
+        guess: where the calibration starts, or None.
+        classes: that are aligned; empty where labels are not used.
+    """
+    return tuple(dict.fromkeys(_preflight(drives, guess, classes)))
+
+
+def _preflight(
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, classes: Sequence[SemanticClass]
+) -> Iterator[Finding]:
+    found = [units.start_unit(guess)]
+    for drive in drives:
+        found += [cameras.image_size(drive.camera), units.stamps(drive), repeats.repeats(drive)]
+        if classes:
+            found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
+    if classes:
+        found.append(labels.searched_classes(drives, classes))
+        found.append(labels.shifted_masks(labels.shift(drives)))
+    yield from (finding for finding in found if finding is not None)
+
+
+def likely_causes(
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter
+) -> tuple[Finding, ...]:
+    """Why the labels do not agree, for a result that is missing or doubted; empty where they do agree.
+
+    Args:
+        guess, offset_s: where the calibration started.
+        fit: how well labels agree, by the calibration's own search.
+    """
+    drive = max(drives, key=lambda one: len(one.scans))
+    certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess)
+    if certain is not None:
+        return (certain,)
+    given = fit(drive, guess, offset_s)
+    if given is not None and given.quality > WELL:
+        return ()
+    cause = best_hypothesis(drive, guess, offset_s, fit, given)
+    if cause is None:
+        cause = numberings(drive, guess, offset_s, fit, given)
+    if cause is None and guess is not None:
+        cause = wrong_start(guess, fit(drive, None, offset_s))
+    if cause is None and (given is None or given.quality < LEAST_QUALITY):
+        cause = _nothing_in_common(given)
+    return () if cause is None else (cause,)
+
+
+def mirror(
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter
+) -> tuple[Finding, ...]:
+    """Whether mirrored data would agree better, for a result that nothing else speaks against."""
+    drive = max(drives, key=lambda one: len(one.scans))
+    cause = mirrored(drive, guess, offset_s, fit, fit(drive, guess, offset_s))
+    return () if cause is None else (cause,)
+
+
+def _nothing_in_common(given: Fit | None) -> Finding:
+    found = (
+        "nothing" if given is None else f"a place where {100.0 * given.explained:.0f} % of the outlines meet"
+    )
+    return Finding(
+        "the clouds and the images hardly show the same scene (another drive, or numbers that are far off)",
+        f"the search found {found}, and no start, mirroring, focal length or shift in time does better",
+        "look at a cloud and at the picture of the same number",
+    )

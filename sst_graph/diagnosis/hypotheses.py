@@ -1,0 +1,175 @@
+"""Which simple change of the data would make the labels agree: the change names the cause.
+
+When a calibration fails or is doubted, things that often go wrong are undone one by one, a start is searched
+each time, and how well the labels agree is compared with what they say of the data as given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.fit import LEAST_GAIN, LEAST_QUALITY, WELL, Fit, Fitter
+from sst_graph.diagnosis.poses import start_finding
+from sst_graph.problem.drive import Drive, ScanFeatures
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change that would put the data right.
+
+    Attributes:
+        finding: the cause that it undoes; its evidence is written by the comparison.
+        drive: with the change.
+        guess: to search around; None for anywhere.
+        offset_s: to search around [s].
+        start: as it was given, where it is what was changed.
+    """
+
+    finding: Finding
+    drive: Drive
+    guess: gtsam.Pose3 | None
+    offset_s: float
+    start: gtsam.Pose3 | None = None
+
+
+_MOST_SHIFTS = 4
+"""Windows of time offsets that are searched before and after the first."""
+_WINDOW_S = 0.9
+"""Width of a window [s]: the search reaches half a second either way."""
+
+
+def best_hypothesis(
+    drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
+) -> Finding | None:
+    """The change under which the labels agree, where they clearly do; None where none helps."""
+    return _best(hypotheses(drive, guess, offset_s), fit, given)
+
+
+def numberings(
+    drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
+) -> Finding | None:
+    """Images that are later or earlier than was searched."""
+    return _best(_shifts(drive, guess, offset_s), fit, given)
+
+
+def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Finding | None:
+    base = 0.0 if given is None else given.quality
+    best: tuple[float, Finding] | None = None
+    for hypothesis in tried:
+        found = fit(hypothesis.drive, hypothesis.guess, hypothesis.offset_s)
+        if found is None or found.quality < max(LEAST_QUALITY, LEAST_GAIN * base):
+            continue
+        if best is None or found.quality > best[0]:
+            before = 0.0 if given is None else 100.0 * given.explained
+            evidence = (
+                f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
+            )
+            finding = replace(hypothesis.finding, evidence=evidence)
+            if hypothesis.start is not None:
+                finding = start_finding(hypothesis.start, found, finding)
+            best = found.quality, finding
+        if found.quality > WELL:
+            break
+    return None if best is None else best[1]
+
+
+def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
+    """Time offsets on either side of what was searched, as far as the drive reaches."""
+    period, length = drive.image_period_s, (drive.image_stamps_ns[-1] - drive.image_stamps_ns[0]) * 1e-9
+    windows = min(_MOST_SHIFTS, int(0.6 * length / _WINDOW_S))
+    for window in range(1, windows + 1):
+        for sign in (1.0, -1.0):
+            shift_s = sign * window * _WINDOW_S
+            frames, way = round(abs(shift_s) / period), "late" if shift_s > 0.0 else "early"
+            finding = Finding(
+                f"the images' numbers or stamps are off: about {frames} frames ({abs(shift_s):.1f} s) {way}",
+                "",
+                "compare the first frames of both sensors, or give --image-shift",
+            )
+            yield Hypothesis(finding, drive, guess, offset_s + shift_s)
+
+
+def mirrored(
+    drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
+) -> Finding | None:
+    """Clouds or pictures that are mirrored: of all mistakes the one that an answer may survive."""
+    return _best(_mirrorings(drive, guess, offset_s), fit, given)
+
+
+def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
+    """What often goes wrong, undone."""
+    for name, check, start in _starts(guess):
+        yield Hypothesis(Finding(name, "", check), drive, start, offset_s, guess)
+    yield from _mirrorings(drive, guess, offset_s)
+    for factor, name in ((0.5, "half"), (2.0, "twice")):
+        camera = drive.camera
+        focal = replace(camera, fx=camera.fx / factor, fy=camera.fy / factor)
+        finding = Finding(
+            f"the focal length is {name} the pictures' (intrinsics of another camera or image size)",
+            "",
+            f"compare fx = {camera.fx:.0f} px with the camera that took the pictures",
+        )
+        yield Hypothesis(finding, replace(drive, camera=focal), guess, offset_s)
+
+
+def _mirrorings(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
+    changed = with_points(drive, np.diag([1.0, -1.0, 1.0]))
+    for name, turned in _mirrored_starts(guess):
+        check = "look at a cloud from above and at its picture: is what is left in one left in the other?"
+        yield Hypothesis(Finding(name, "", check), changed, turned, offset_s)
+
+
+def _starts(guess: gtsam.Pose3 | None) -> Iterator[tuple[str, str, gtsam.Pose3]]:
+    if guess is None:
+        return
+    check = "turn the clouds, or correct the start (Tr)"
+    half = np.pi
+    yield "the start (Tr) is inverted", "give T_camera_lidar, from LiDAR to camera", guess.inverse()
+    yield "the clouds are turned by 180 deg about their z axis", check, _turned(guess, gtsam.Rot3.Rz(half))
+    yield "the clouds are upside down", check, _turned(guess, gtsam.Rot3.Rx(half))
+    yield (
+        "the clouds are in the camera's axes (x right, y down, z forward), the start is not",
+        "give clouds in the LiDAR's axes, or a start that is nearly the identity",
+        gtsam.Pose3(gtsam.Rot3(), np.zeros(3)),
+    )
+
+
+def _mirrored_starts(guess: gtsam.Pose3 | None) -> Iterator[tuple[str, gtsam.Pose3 | None]]:
+    if guess is None:
+        yield "the clouds or the pictures are mirrored", None
+        return
+    yield "the clouds' y axis or the pictures are mirrored (left and right exchanged)", guess
+    yield "the clouds' x axis is flipped", _turned(guess, gtsam.Rot3.Rz(np.pi))
+    yield "the clouds' z axis is flipped", _turned(guess, gtsam.Rot3.Rx(np.pi))
+
+
+def _turned(guess: gtsam.Pose3, rotation: gtsam.Rot3) -> gtsam.Pose3:
+    return guess * gtsam.Pose3(rotation, np.zeros(3))
+
+
+def with_points(drive: Drive, M: FloatArray) -> Drive:
+    """The drive with every LiDAR point p replaced by M p, M (3, 3) orthogonal, and its motion with it."""
+
+    def moved(points: FloatArray) -> FloatArray:
+        return np.asarray(points @ M.T)
+
+    def scan(s: ScanFeatures) -> ScanFeatures:
+        edges = {c: replace(b, lPs=moved(b.lPs), outward=moved(b.outward)) for c, b in s.boundaries.items()}
+        return replace(s, boundaries=edges, undersides={}, lPs=moved(s.lPs))
+
+    def motion(pose: gtsam.Pose3) -> gtsam.Pose3:
+        return gtsam.Pose3(gtsam.Rot3.ClosestTo(M @ pose.rotation().matrix() @ M.T), M @ pose.translation())
+
+    return replace(
+        drive,
+        scans=tuple(scan(s) for s in drive.scans),
+        lidar_motions=tuple(replace(m, aTb=motion(m.aTb)) for m in drive.lidar_motions),
+    )

@@ -1,0 +1,123 @@
+"""Whether labels are of these clouds and these pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from sst_graph.association.mask_shift import MaskShift, mask_shift
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.units import FLAT, usual_ground
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.survey import Survey
+from sst_graph.types import SemanticClass
+
+_LEAST_SHIFT_PX = 1.5
+"""Contours follow the picture's edges over a pixel or two by themselves [px]."""
+_SIGMAS = 4.0
+_LEAST_CONTRAST = 1.3
+"""Of masks over their own pictures: 1.6 and more on streets and real drives; over others 0.3 to 1.1 ..."""
+_MOST_RIVAL = 0.75
+"""... and there the second best shift has this share of the best one or more; over their own up to 0.7."""
+_ABOVE = 0.1
+"""Ground whose mean row is higher than the vehicles' or the sky's by this share of the image is no ground."""
+
+
+def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) -> Finding | None:
+    """None of the classes to align in any scan, or in any mask."""
+    surveys = [drive.survey for drive in drives if drive.survey is not None]
+    names = " or ".join(c.name.lower() for c in classes)
+    for what, labelled in (
+        ("point", [scan.labelled for survey in surveys for scan in survey.scans]),
+        ("mask's pixel", [image.labelled for survey in surveys for image in survey.images]),
+    ):
+        present = {c for counts in labelled for c in counts}
+        if labelled and not present & {int(c) for c in classes}:
+            return Finding(
+                f"no {what} is labelled {names}",
+                f"labels found: {_names(present)}",
+                "compare the class numbers of the labels with their table, or name other --classes",
+            )
+    return None
+
+
+def ground_points(drive: Drive) -> Finding | None:
+    """Points labelled ground that do not lie on a plane."""
+    ground = None if drive.survey is None else usual_ground(drive.survey)
+    if ground is None or ground.share >= FLAT:
+        return None
+    return Finding(
+        "the class numbers of the points are mixed up",
+        f"only {100.0 * ground.share:.0f} % of the points labelled ground lie on one plane",
+        "compare the numbers in the label files with their table, and their order with the points'",
+    )
+
+
+def mask_rows(drive: Drive) -> Finding | None:
+    """Masks whose ground is above their sky or their vehicles."""
+    if drive.survey is None:
+        return None
+    rows = {c: _mean_row(drive.survey, c) for c in (SemanticClass.GROUND, *_OVER_GROUND)}
+    ground = rows[SemanticClass.GROUND]
+    for c in _OVER_GROUND:
+        over = rows[c]
+        if ground is not None and over is not None and ground < over - _ABOVE:
+            return Finding(
+                "the class numbers of the masks are mixed up, or the pictures are upside down",
+                f"ground lies {100.0 * (over - ground):.0f} % of the image's height above {c.name.lower()}",
+                "compare the numbers in the masks with their table, and look at an overlay",
+            )
+    return None
+
+
+def shift(drives: Iterable[Drive]) -> MaskShift | None:
+    """The shift of all masks against their pictures."""
+    surveys = [drive.survey for drive in drives if drive.survey is not None]
+    return mask_shift([p for survey in surveys for image in survey.images for p in image.profiles])
+
+
+def shifted_masks(found: MaskShift | None) -> Finding | None:
+    """Masks beside their pictures' edges."""
+    if found is None or _are_foreign(found) or not found.within_reach:
+        return None
+    if found.length_px - _SIGMAS * found.sigma_along_px < _LEAST_SHIFT_PX:
+        return None
+    sideways = abs(found.right_px) > abs(found.down_px)
+    amount, sigma = (found.right_px, found.sigma_px[0]) if sideways else (found.down_px, found.sigma_px[1])
+    way = ("right" if amount > 0.0 else "left") if sideways else ("down" if amount > 0.0 else "up")
+    return Finding(
+        f"the masks are shifted {way} against their pictures",
+        f"by {abs(amount):.1f} +- {sigma:.1f} px, along the contours of {found.objects} objects",
+        "look for a crop, a resize or a padding that only one of them went through",
+    )
+
+
+def foreign_masks(found: MaskShift | None) -> Finding | None:
+    """Masks along whose contours their pictures show no edges."""
+    if found is None or not _are_foreign(found):
+        return None
+    return Finding(
+        "the masks are not those of these pictures (another drive, another order or numbering)",
+        f"the pictures show no more edges along the contours of {found.objects} objects than beside them",
+        "lay a mask over the picture of the same number",
+    )
+
+
+def _are_foreign(found: MaskShift) -> bool:
+    return found.contrast < _LEAST_CONTRAST or found.rival > _MOST_RIVAL
+
+
+_OVER_GROUND = (SemanticClass.SKY, SemanticClass.VEHICLE)
+
+
+def _mean_row(survey: Survey, c: SemanticClass) -> float | None:
+    """Over all pixels of a class, as a share of the height; None for a class that is seldom seen."""
+    weights = [image.labelled.get(int(c), 0) for image in survey.images]
+    total = sum(weights)
+    if total < 0.005 * sum(sum(image.labelled.values()) for image in survey.images) or total == 0:
+        return None
+    rows = [image.rows.get(int(c), 0.0) for image in survey.images]
+    return sum(row * weight for row, weight in zip(rows, weights, strict=True)) / total
+
+
+def _names(present: Iterable[int]) -> str:
+    return ", ".join(SemanticClass(c).name.lower() for c in sorted(present)) or "none"

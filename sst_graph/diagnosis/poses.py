@@ -1,0 +1,120 @@
+"""Where the answer lies against the start."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from itertools import product
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.diagnosis.fit import Fit
+
+FloatArray = NDArray[np.float64]
+
+_SEQUENCES = ("xyz", "zyx", "XYZ", "ZYX", "yxz", "YXZ", "zxy", "ZXY")
+"""Orders in which roll, pitch and yaw are applied."""
+_SEARCHED_DEG = 35.0
+"""A start nearer than this to the answer is good enough for the search [deg]."""
+_FREE_QUALITY = 0.3
+"""Of a pose found among all: more chances agree better than one (foreign images reach 0.2)."""
+_NEAR_DEG, _DESIGN_DEG = 5.0, 15.0
+"""A start within this of a wrong conversion is one; a rig's axes are within this of a right angle [deg]."""
+_BASELINE_M, _ALIGNED_DEG, _SIGMAS = (0.25, 1.5), 3.0, 6.0
+"""Stereo baselines of vehicles [m], how parallel the two cameras are [deg], and the least certainty."""
+_SIDEWAYS = 0.9
+"""Cosine to the camera's x axis."""
+
+
+def wrong_start(guess: gtsam.Pose3, free: Fit | None) -> Finding | None:
+    """A start that is turned farther away from where the labels agree than is searched around it.
+
+    Args:
+        free: what a search without a start finds.
+    """
+    if free is None or free.quality < _FREE_QUALITY:
+        return None
+    turned = _angle_deg(guess.rotation(), free.cTl.rotation())
+    if turned < _SEARCHED_DEG:
+        return None
+    share = 100.0 * free.explained
+    general = Finding(
+        "the start (Tr) is wrong",
+        f"the labels agree {turned:.0f} deg away from it, where {share:.0f} % of the outlines meet",
+        "correct it, or calibrate with --init none",
+    )
+    return start_finding(guess, free, general)
+
+
+def start_finding(guess: gtsam.Pose3, found: Fit, finding: Finding) -> Finding:
+    """The finding, unless the start's angles were just taken in the wrong unit."""
+    for factor, unit, other in (
+        (np.pi / 180.0, "radians", "degrees"),
+        (180.0 / np.pi, "degrees", "radians"),
+    ):
+        if _converted(guess.rotation(), found.cTl.rotation(), factor):
+            cause = f"the angles of the start (Tr) are {unit} that were taken as {other}"
+            return replace(finding, cause=cause, check="convert them before the rotation is made")
+    return finding
+
+
+def other_camera(guess: gtsam.Pose3 | None, answer: gtsam.Pose3, covariance: FloatArray) -> Finding | None:
+    """An answer beside the start by a stereo baseline, and parallel to it: pictures of the other camera.
+
+    Args:
+        covariance: (7, 7) of the answer.
+    """
+    if guess is None or _angle_deg(guess.rotation(), answer.rotation()) > _ALIGNED_DEG:
+        return None
+    way = answer.translation() - guess.translation()
+    length = float(np.linalg.norm(way))
+    if not _BASELINE_M[0] < length < _BASELINE_M[1] or abs(way[0]) < _SIDEWAYS * length:
+        return None
+    across = answer.rotation().matrix()[0]
+    sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across))
+    if abs(way[0]) < _SIGMAS * sigma:
+        return None
+    side = "right" if way[0] < 0.0 else "left"
+    return Finding(
+        f"the pictures are those of another camera, {100.0 * abs(way[0]):.0f} cm to the {side}",
+        f"along the camera's x axis the start is {-100.0 * way[0]:+.0f} +- {100.0 * sigma:.0f} cm off",
+        "compare the folder of the pictures with the camera (P0 to P3) of the calibration",
+    )
+
+
+def _converted(guess: gtsam.Rot3, found: gtsam.Rot3, factor: float) -> bool:
+    """Whether the start's angles are those of the found rotation, times a factor.
+
+    They are angles of a rig as designed, in right angles: in the wrong unit a degree more is a radian more.
+    """
+    wanted = guess.matrix()
+    for inverse, sequence in product((False, True), _SEQUENCES):
+        R = found.matrix().T if inverse else found.matrix()
+        with warnings.catch_warnings():
+            # At a gimbal lock any of the angles will do.
+            warnings.simplefilter("ignore", UserWarning)
+            angles = Rotation.from_matrix(_right_angled(R)).as_euler(sequence)
+        right = 0.5 * np.pi * np.round(angles / (0.5 * np.pi))
+        wrong = Rotation.from_euler(sequence, right * factor).as_matrix()
+        if _angle_deg(gtsam.Rot3(wrong.T if inverse else wrong), gtsam.Rot3(wanted)) < _NEAR_DEG:
+            return True
+    return False
+
+
+def _right_angled(R: FloatArray) -> FloatArray:
+    """The nearest rotation by right angles, if it is near; R itself otherwise."""
+    rounded = np.zeros((3, 3))
+    rows = np.abs(R).argmax(axis=1)
+    rounded[np.arange(3), rows] = np.sign(R[np.arange(3), rows])
+    if len(set(rows.tolist())) < 3 or np.linalg.det(rounded) < 0.0:
+        return R
+    near = _angle_deg(gtsam.Rot3(rounded), gtsam.Rot3.ClosestTo(R)) < _DESIGN_DEG
+    return rounded if near else R
+
+
+def _angle_deg(one: gtsam.Rot3, other: gtsam.Rot3) -> float:
+    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other)))))

@@ -1,0 +1,151 @@
+"""Units and axes of stamps, clouds and the start."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.diagnosis.finding import Finding
+from sst_graph.problem.drive import Drive
+from sst_graph.problem.survey import Ground, Survey
+
+FloatArray = NDArray[np.float64]
+
+_LONGEST_PERIOD_S, _SHORTEST_PERIOD_S = 5.0, 1.0 / 60.0
+"""Scans come 5 to 30 times a second, subsampled ones every few seconds [s]."""
+_USUAL_PERIODS_S = (0.008, 2.0)
+"""Where a period in the right unit lies [s]."""
+_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
+_FASTEST_MPS = 70.0
+"""Faster than any road vehicle that records for calibration [m/s]."""
+_CAR_HEIGHT_M, _HIGHEST_VEHICLE_M = 1.5, 3.6
+"""Most vehicles are cars; the median of a drive among trucks and buses stays below their 4 m."""
+_LOWEST_VEHICLE_M = 0.5
+"""Of the highest quarter: cars that are seen in part still show more [m]."""
+_HIGHEST_LIDAR_M = 4.5
+"""On the roof of a truck [m]."""
+_LEAST_VEHICLES = 5
+_LENGTH_UNITS = {1000.0: "millimetres", 100.0: "centimetres", 1.0 / 0.3048: "feet", 1.0 / 0.0254: "inches"}
+_UPRIGHT = 0.7
+"""Cosine between two directions that are the same one, roughly."""
+_FARTHEST_START_M = 10.0
+"""LiDAR and camera on one vehicle, a truck's length apart [m]."""
+
+
+def stamps(drive: Drive) -> Finding | None:
+    """Stamps in another unit than seconds, or at a rate that the motion contradicts."""
+    if len(drive.scans) < 3:
+        return None
+    steps = np.diff(drive.scan_stamps_ns) * 1e-9
+    period = float(np.median(steps))
+    if period > _LONGEST_PERIOD_S:
+        fitting = [f for f in _TIME_UNITS if _USUAL_PERIODS_S[0] <= period / f <= _USUAL_PERIODS_S[1]]
+        regular = float(np.median(np.abs(steps - period))) < 0.1 * period
+        if not fitting or not regular:
+            return None
+        return Finding(
+            f"the stamps are in {_TIME_UNITS[fitting[0]]}, not seconds",
+            f"{period:.4g} s from scan to scan; in that unit it is {period / fitting[0]:.2g} s",
+            "write times in seconds",
+        )
+    speeds = [np.linalg.norm(m.aTb.translation()) / m.seconds for m in drive.lidar_motions if m.ok]
+    speed = float(np.quantile(speeds, 0.8)) if len(speeds) >= 3 else 0.0
+    sweep = max((scan.sweep_s for scan in drive.survey.scans), default=0.0) if drive.survey else 0.0
+    if period > _SHORTEST_PERIOD_S and speed < _FASTEST_MPS and sweep < 2.0 * period:
+        return None
+    found = [f"{1e3 * period:.3g} ms from scan to scan"]
+    if speed >= _FASTEST_MPS:
+        found.append(f"a speed of {speed:.0f} m/s")
+    if sweep >= 2.0 * period:
+        found.append(f"points of one scan spread over {1e3 * sweep:.0f} ms")
+    return Finding(
+        "the stamps run too slowly (wrong frame rate or unit)",
+        ", ".join(found),
+        "compare the stamps' intervals with the scanner's rate, 5 to 20 turns a second for most",
+    )
+
+
+def clouds(drive: Drive) -> Finding | None:
+    """Clouds in another unit than metres: vehicles and the ground below the LiDAR tell."""
+    if drive.survey is None:
+        return None
+    heights = vehicle_heights(drive.survey)
+    ground = usual_ground(drive.survey)
+    if len(heights) < _LEAST_VEHICLES or (ground is not None and ground.share < FLAT):
+        return None
+    middle, upper = float(np.median(heights)), float(np.quantile(heights, 0.75))
+    if upper > _LOWEST_VEHICLE_M and middle < _HIGHEST_VEHICLE_M:
+        return None
+    scale = middle / _CAR_HEIGHT_M
+    evidence = f"vehicles are {middle:.3g} high in the median of {len(heights)}, a car is 1.5 m"
+    if ground is not None:
+        evidence += f"; the LiDAR is {ground.height:.3g} above the ground"
+        if scale > 1.0 and ground.height < _HIGHEST_LIDAR_M and middle > 5.0 * ground.height:
+            return Finding(
+                "the points labelled vehicle are no vehicles, or the clouds are not in metres",
+                evidence,
+                "compare the class numbers of the labels with their table, then the unit of the clouds",
+            )
+    unit = min(_LENGTH_UNITS, key=lambda factor: abs(np.log(scale / factor)))
+    named = f"{_LENGTH_UNITS[unit]}, not metres" if abs(np.log(scale / unit)) < 0.5 else "not in metres"
+    factor = unit if "not metres" in named else scale
+    return Finding(
+        f"the clouds are {'in ' if 'not metres' in named else ''}{named}",
+        evidence,
+        f"multiply the points by {1.0 / factor:.3g}",
+    )
+
+
+def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
+    """Clouds in the camera's axes under a start that is not made for them: the ground tells what is down."""
+    ground = None if drive.survey is None else usual_ground(drive.survey)
+    if ground is None or ground.share < FLAT or ground.up[1] > -_UPRIGHT:
+        return None
+    if guess is not None and float((guess.rotation().matrix() @ ground.up)[1]) < -_UPRIGHT:
+        return None
+    x, y, z = ground.up
+    return Finding(
+        "the clouds are in the camera's axes (x right, y down, z forward)",
+        f"the ground's normal is ({x:.2f}, {y:.2f}, {z:.2f}), expected (0, 0, 1)",
+        "give clouds in the LiDAR's axes (x forward, y left, z up), and a start that goes with them",
+    )
+
+
+def start_unit(guess: gtsam.Pose3 | None) -> Finding | None:
+    """A start whose translation is in another unit than metres."""
+    if guess is None:
+        return None
+    length = float(np.linalg.norm(guess.translation()))
+    if length < _FARTHEST_START_M:
+        return None
+    unit, factor = ("millimetres", 1000.0) if length > 100.0 else ("centimetres", 100.0)
+    return Finding(
+        f"the translation of the start (Tr) is in {unit}, not metres",
+        f"it is {length:.4g} long; as {unit} {length / factor:.2g} m",
+        f"divide it by {factor:.0f}",
+    )
+
+
+FLAT = 0.75
+"""Share of the points labelled ground on one plane: above 0.9 on streets, about a half for other things."""
+
+
+def vehicle_heights(survey: Survey) -> FloatArray:
+    """(k,) of all vehicles of the scans looked at closely."""
+    return np.concatenate([np.zeros(0), *(scan.vehicle_heights for scan in survey.scans)])
+
+
+def usual_ground(survey: Survey) -> Ground | None:
+    """The median ground of the scans; None where fewer than half of those looked at closely show one."""
+    grounds: Sequence[Ground] = [scan.ground for scan in survey.scans if scan.ground is not None]
+    if not grounds:
+        return None
+    up = np.median([ground.up for ground in grounds], axis=0)
+    return Ground(
+        up / max(float(np.linalg.norm(up)), 1e-9),
+        float(np.median([ground.height for ground in grounds])),
+        float(np.median([ground.share for ground in grounds])),
+    )

@@ -1,0 +1,66 @@
+"""Whether marginals that are to be fused agree: their constant at the common optimum is a chi-squared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc
+
+from sst_graph.errors import ContradictionError
+from sst_graph.uncertainty.contradiction import Difference, PartAnswer, combined, name_step
+
+FloatArray = NDArray[np.float64]
+
+SIGNIFICANCE = 1e-3
+"""Probability that marginals which agree, with covariances that hold, are refused."""
+_FAR_SIGMA = 1e3
+"""A direction that a marginal does not tell has this sigma [rad, m, s]."""
+
+
+def check_agreement(
+    parts: Sequence[tuple[FloatArray, FloatArray]],
+    cTl: gtsam.Pose3,
+    names: Sequence[str] = (),
+    significance: float = SIGNIFICANCE,
+) -> None:
+    """That quadratic costs about one point agree, each with the others and all together.
+
+    Args:
+        parts: (7, 7) information and (7,) vector of each.
+        cTl: the point's extrinsic, for the words.
+        names: of the parts; numbers from 0 where none are given.
+        significance: probability of an error where they agree; 0 checks nothing.
+
+    Raises:
+        ContradictionError: they do not.
+    """
+    if len(parts) < 2 or significance <= 0.0:
+        return
+    answers = [_answer(information, vector) for information, vector in parts]
+    # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
+    common = combined(answers)
+    away = [part.step - common.step for part in answers]
+    chi2 = float(sum(d @ information @ d for d, (information, _) in zip(away, parts, strict=True)))
+    freedom = 7 * (len(parts) - 1)
+    # 2. Each against the others.
+    against = [
+        Difference.of(combined([*answers[:k], *answers[k + 1 :]]), part) for k, part in enumerate(answers)
+    ]
+    worst = int(np.argmax([difference.chi2 for difference in against]))
+    p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
+    if 2.0 * p_value < significance:
+        name = repr(names[worst]) if names else f"number {worst}"
+        raise ContradictionError(
+            f"{len(parts)} marginals contradict one another (chi-squared {chi2:.0f} of {freedom}): {name} "
+            f"differs from the others in {name_step(against[worst], cTl).sentence}; fuse what was recorded "
+            "with one mount and one clock, or give significance=0 to fuse all the same"
+        )
+
+
+def _answer(information: FloatArray, vector: FloatArray) -> PartAnswer:
+    """A cost's own optimum; a direction that it does not tell has a large variance."""
+    covariance = np.asarray(np.linalg.inv(information + np.eye(7) / _FAR_SIGMA**2), np.float64)
+    return PartAnswer(covariance @ vector, covariance)

@@ -1,0 +1,342 @@
+"""Alignment terms in iSAM2 and in a fixed-lag smoother: factors swapped as the estimate moves.
+
+At every update the user's factors go in first. Then the terms whose matches have become stale (points moved,
+stamp + offset in another interval, another kernel) are matched again at the new estimate, and their factors
+take the place of the old ones. Kernel, proximal prior and the scale of the information are those of
+:mod:`sst_graph.problem.rematching`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, TermMatches, TermState
+from sst_graph.problem.object_sides import ObjectSides
+from sst_graph.problem.rematching import (
+    RematchConfig,
+    TermWarning,
+    inflation,
+    last_warnings,
+    moved_px,
+    proximal,
+    robust_covariance,
+    side_totals,
+    wide_uncertainty,
+)
+
+FloatArray = NDArray[np.float64]
+
+Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
+
+
+@dataclass(frozen=True)
+class IncrementalConfig:
+    """Beside the schedule of :class:`RematchConfig`.
+
+    Attributes:
+        rematch: kernels and scale of the information.
+        stale_px: a term is matched again when the estimate has moved its points by more (RMS) [px].
+        rounds: rounds of matching an update, at most.
+        known: the kernel is narrowed only when extrinsic and offset are known to less than this share of it
+            in the image (one sigma): a single image must not decide.
+        rescale: the factors are made anew when the scale of their information is off by more than this share.
+    """
+
+    rematch: RematchConfig = field(default_factory=RematchConfig)
+    stale_px: float = 0.3
+    rounds: int = 2
+    known: float = 0.5
+    rescale: float = 0.2
+
+
+@dataclass(frozen=True)
+class IncrementalUpdate:
+    """The state after an update.
+
+    Attributes:
+        values: the estimate.
+        covariance: (7, 7) of extrinsic and offset, robust to sides of objects that err in all images, once
+            the kernel has its last scale; until then the solver's marginal, proximal prior included.
+        kernel_px: scale of the kernel [px].
+        settled: the kernel has its last scale, the proximal prior is gone, and the matches are fresh.
+        rematched: how many factors were swapped.
+        waiting: terms that have no factor, and why.
+        warnings: what may be wrong.
+    """
+
+    values: gtsam.Values
+    covariance: FloatArray
+    kernel_px: float
+    settled: bool
+    rematched: int
+    waiting: Mapping[TermState, int]
+    warnings: tuple[TermWarning, ...]
+
+
+class IncrementalTerms:
+    """The alignment terms of one camera in one solver."""
+
+    def __init__(self, solver: Solver, keys: AlignmentKeys, config: IncrementalConfig | None = None) -> None:
+        """solver: yours; all later updates go through :meth:`update`. keys: those of the terms."""
+        self._solver, self._keys = solver, keys
+        self._config = config or IncrementalConfig()
+        self._terms: list[_Placed] = []
+        self._proximal: dict[int, gtsam.NonlinearFactor] = {}
+        self._stamps: dict[int, float] = {}
+        self._kernel_px = self._config.rematch.first_px
+        self._held, self._information = True, 1.0
+        self._sides = ObjectSides()
+        self._gone: dict[int, FloatArray] = {}
+        self._gone_matches = [0.0, 0.0]
+
+    def update(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        terms: Sequence[AlignmentTerm] = (),
+        stamps: Mapping[int, float] | None = None,
+    ) -> IncrementalUpdate:
+        """New factors and variables, then the terms matched where the estimate has come to.
+
+        Args:
+            graph, values: as the solver's own ``update`` takes them; the first hold extrinsic and offset.
+            terms: new ones; a term whose image lies after the last pose waits for it.
+            stamps: for a smoother, stamp of each variable [s]; extrinsic and offset are stamped anew here.
+        """
+        stamps = self._stamped(stamps)
+        self._solve(graph, values, stamps, self._leaving(stamps))
+        self._terms += [_Placed(term) for term in terms]
+        return self._renew(self._config.rounds)
+
+    def settle(self, most_rounds: int | None = None) -> IncrementalUpdate:
+        """Rounds of matching without anything new, until they change nothing."""
+        rounds = self._config.rematch.most_rounds if most_rounds is None else most_rounds
+        return self._renew(rounds)
+
+    # --- rounds
+
+    def _renew(self, rounds: int) -> IncrementalUpdate:
+        rematched, settled, estimate = 0, False, self._solver.calculateEstimate()
+        first_warnings: list[TermWarning] = []
+        alone = None if self._matches() else self._marginal()
+        covariance = np.zeros((7, 7))
+        for _ in range(rounds):
+            self._retire(estimate)
+            swapped = self._swap(estimate)
+            if not any(placed.matches for placed in self._terms):
+                break
+            rematched += swapped
+            before, estimate = estimate, self._solver.calculateEstimate()
+            if alone is not None:
+                first_warnings = wide_uncertainty(self._matches(), before, alone, self._config.rematch)
+                alone = None
+            covariance, settled = self._anneal(estimate)
+            if settled:
+                break
+        warnings = first_warnings
+        matches = self._matches()
+        if matches and self._kernel_px == self._config.rematch.last_px:
+            warnings = warnings + last_warnings(matches, estimate, covariance, self._config.rematch)
+        return IncrementalUpdate(
+            estimate,
+            covariance,
+            self._kernel_px,
+            settled,
+            rematched,
+            self._waiting(),
+            tuple(dict.fromkeys(warnings)),
+        )
+
+    def _anneal(self, estimate: gtsam.Values) -> tuple[FloatArray, bool]:
+        """The next kernel; covariance, and whether all has settled."""
+        config = self._config.rematch
+        P, matches = self._marginal(), self._matches()
+        sigma_px = wide_uncertainty(matches, estimate, P, config, 0.0)
+        known = bool(sigma_px) and sigma_px[0].value < self._config.known * self._kernel_px
+        calm = moved_px(matches, estimate) < config.settled * self._kernel_px
+        if self._kernel_px > config.last_px:
+            if calm and known:
+                self._kernel_px = config.narrower(self._kernel_px)
+            return P, False
+        if self._held:
+            self._held = not (calm and known)
+            return P, False
+        C, own = self._robust(P, estimate)
+        wanted = 1.0 / inflation(own, C)
+        if abs(wanted / self._information - 1.0) > self._config.rescale:
+            self._information = wanted
+            return C, False
+        fresh = not any(self._is_stale(p, estimate) for p in self._terms if p.slots)
+        return C, fresh
+
+    def _robust(self, P: FloatArray, estimate: gtsam.Values) -> tuple[FloatArray, FloatArray]:
+        """The robust covariance, and the part of it that no two images share.
+
+        Under a factor scaled by q, what the matches err by alone is q P, and a side's score q s.
+        """
+        totals = self._information * side_totals(self._matches(), self._sides, estimate)
+        for side, score in self._gone.items():
+            totals[side] += score
+        count = sum(len(each) for each in self._matches())
+        q = (count * self._information + self._gone_matches[1]) / max(count + self._gone_matches[0], 1)
+        own = q * P
+        return robust_covariance(own, P, totals, self._config.rematch.side_sigma_px), own
+
+    def _swap(self, estimate: gtsam.Values) -> int:
+        """Match stale terms anew; new factors in, old ones and the old proximal prior out, in one update."""
+        stale = [placed for placed in self._terms if self._is_stale(placed, estimate)]
+        graph, owners, removed = gtsam.NonlinearFactorGraph(), list[_Placed | None](), list[int]()
+        for placed in stale:
+            removed += self._slots_of(placed.slots)
+            matches = placed.term.matched(estimate, self._kernel_px, self._information)
+            placed.set(matches, self._information, self._scores(matches, estimate))
+            if matches.factor is not None:
+                graph.add(matches.factor)
+                owners.append(placed)
+        matches_now = self._matches()
+        removed += self._slots_of(self._proximal)
+        self._proximal = {}
+        if self._held and matches_now:
+            for prior in _factors(proximal(matches_now, estimate, self._kernel_px, self._keys)):
+                graph.add(prior)
+                owners.append(None)
+        if graph.size() or removed:
+            slots = self._solve(graph, gtsam.Values(), {}, removed)
+            for owner, slot in zip(owners, slots, strict=True):
+                held = self._proximal if owner is None else owner.slots
+                held[slot] = self._graph().at(slot)
+        return len(stale)
+
+    def _scores(self, matches: TermMatches, estimate: gtsam.Values) -> dict[int, FloatArray]:
+        """(7,) score of each side that a term's matches lie on."""
+        found: dict[int, FloatArray] = {}
+        if matches.term is not None:
+            for numbers, scores in matches.term.side_scores(matches, self._sides, estimate):
+                for side in np.unique(numbers):
+                    found[int(side)] = found.get(int(side), np.zeros(7)) + scores[numbers == side].sum(axis=0)
+        return found
+
+    def _is_stale(self, placed: _Placed, estimate: gtsam.Values) -> bool:
+        matches = placed.matches
+        if matches is None or matches.factor is None:
+            return True
+        return (
+            matches.kernel_px != self._kernel_px
+            or placed.information != self._information
+            or matches.left_interval_s(estimate) > 0.0
+            or matches.moved_px(estimate) > self._config.stale_px
+        )
+
+    def _retire(self, estimate: gtsam.Values) -> None:
+        """Terms on poses that the smoother has marginalized stay as they are in its marginal.
+
+        Their sides' scores are kept from when their poses were last there.
+        """
+        for placed in self._terms:
+            if placed.is_gone(estimate):
+                for side, score in placed.scores.items():
+                    self._gone[side] = self._gone.get(side, np.zeros(7)) + placed.information * score
+                self._gone_matches[0] += placed.count
+                self._gone_matches[1] += placed.count * placed.information
+        self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
+
+    def _matches(self) -> list[TermMatches]:
+        return [p.matches for p in self._terms if p.matches is not None and p.matches.factor is not None]
+
+    def _waiting(self) -> dict[TermState, int]:
+        states = [p.matches.state for p in self._terms if p.matches is not None and p.matches.factor is None]
+        return {state: states.count(state) for state in dict.fromkeys(states)}
+
+    # --- solver
+
+    def _solve(
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        stamps: Mapping[int, float],
+        removed: Sequence[int],
+    ) -> list[int]:
+        """One update; slots of the new factors."""
+        if isinstance(self._solver, gtsam.ISAM2):
+            return list(self._solver.update(graph, values, list(removed)).getNewFactorsIndices())
+        self._solver.update(graph, values, cast(Any, dict(stamps)), list(removed))
+        return list(self._solver.getISAM2Result().getNewFactorsIndices())
+
+    def _graph(self) -> gtsam.NonlinearFactorGraph:
+        if isinstance(self._solver, gtsam.ISAM2):
+            return self._solver.getFactorsUnsafe()
+        return self._solver.getFactors()
+
+    def _slots_of(self, held: Mapping[int, gtsam.NonlinearFactor]) -> list[int]:
+        """Slots that still hold the factors that were put there: a smoother uses those of others again."""
+        graph = self._graph()
+        return [slot for slot, factor in held.items() if slot < graph.size() and graph.at(slot) is factor]
+
+    def _marginal(self) -> FloatArray:
+        """(7, 7) of extrinsic and offset by the solver."""
+        isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
+        joint = isam.jointMarginalCovariance(list(self._keys.variables))
+        return self._keys.placed(np.asarray(joint.fullMatrix()))
+
+    def _stamped(self, stamps: Mapping[int, float] | None) -> dict[int, float]:
+        if isinstance(self._solver, gtsam.ISAM2):
+            return {}
+        found = dict(stamps or {})
+        if found:
+            latest = max(found.values())
+            found.update(dict.fromkeys(self._keys.lasting, latest))
+        self._stamps.update(found)
+        return found
+
+    def _leaving(self, stamps: Mapping[int, float]) -> list[int]:
+        """Slots of terms whose poses this update marginalizes, while their matches are not to be believed."""
+        if not stamps or (self._kernel_px == self._config.rematch.last_px and not self._held):
+            return []
+        assert not isinstance(self._solver, gtsam.ISAM2)
+        horizon = max(stamps.values()) - self._solver.smootherLag()
+        leaving = {key for key, stamp in self._stamps.items() if stamp < horizon}
+        slots = []
+        for placed in self._terms:
+            place = None if placed.matches is None else placed.matches.place
+            if place is not None and leaving & {place.X_a, place.X_b, place.X_scan}:
+                slots += self._slots_of(placed.slots)
+                placed.slots, placed.scores = {}, {}
+        return slots
+
+
+class _Placed:
+    """A term in the solver: its matches, and the slot of its factor."""
+
+    def __init__(self, term: AlignmentTerm) -> None:
+        self.term = term
+        self.matches: TermMatches | None = None
+        self.slots: dict[int, gtsam.NonlinearFactor] = {}
+        self.information = 1.0
+        self.scores: dict[int, FloatArray] = {}
+
+    @property
+    def count(self) -> int:
+        """Matches that count in the solver."""
+        return len(self.matches) if self.matches is not None and self.slots else 0
+
+    def set(self, matches: TermMatches, information: float, scores: dict[int, FloatArray]) -> None:
+        self.matches, self.information, self.scores, self.slots = matches, information, scores, {}
+
+    def is_gone(self, estimate: gtsam.Values) -> bool:
+        """Whether a pose of its factor, or every pose it could be on, has left the solver."""
+        place = None if self.matches is None else self.matches.place
+        if place is not None and not all(
+            estimate.exists(key) for key in (place.X_a, place.X_b, place.X_scan)
+        ):
+            return True
+        return self.matches is not None and self.matches.state == TermState.BEFORE_TRAJECTORY
+
+
+def _factors(graph: gtsam.NonlinearFactorGraph) -> list[gtsam.NonlinearFactor]:
+    return [graph.at(i) for i in range(graph.size())]

@@ -1,0 +1,191 @@
+"""Whether parts of the data agree: the difference of their own answers against its covariance.
+
+Every part (a drive, a stretch of a drive) has an answer of its own, as a step from a common reference with a
+cluster-robust covariance. The squared Mahalanobis length of the difference of two answers would be
+chi-squared if the covariances were known. They are estimated from a limited number of clusters (sides of
+objects), which makes it Hotelling's T^2: an F with about as many degrees of freedom in the denominator as
+clusters (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI). A direction
+that a part does not know has a large variance in the difference and so does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtrc, fdtrc
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_FREEDOM = 4.0
+"""Least degrees of freedom of a covariance, however few clusters: part of it is the error model's."""
+_WORTH, _WORTH_SHARE = 6.0, 0.05
+"""A kind of step (rotation, translation, time offset) must lower the squared length by so much a number, and
+by this share of all of it, to be named: three times Akaike's price, for names are meant to be few; and a
+large step disturbs a little whatever else is estimated (odometry, what moves)."""
+_ONE_AXIS = 0.9
+"""A step along one axis to this share (cosine) is named by that axis alone."""
+_KINDS = {"rotation": slice(0, 3), "translation": slice(3, 6), "offset": slice(6, 7)}
+_TURNS = ("pitch", "yaw", "roll")
+_WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
+
+
+@dataclass(frozen=True)
+class PartAnswer:
+    """What a part of the data says by itself.
+
+    Attributes:
+        step: (7,) from the common reference to the part's answer, in the tangent space of the reference
+            (right perturbation: rotation [rad], translation [m], offset [s]).
+        covariance: (7, 7) of it, cluster-robust.
+        clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
+    """
+
+    step: FloatArray
+    covariance: FloatArray
+    clusters: float = np.inf
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far two parts lie apart.
+
+    Attributes:
+        step: (n,) from the first to the second; 7 numbers, 6 where each part has a time offset of its own.
+        covariance: (n, n) of it.
+        freedom: degrees of freedom of the covariance; infinite where it is known.
+    """
+
+    step: FloatArray
+    covariance: FloatArray
+    freedom: float = np.inf
+
+    @classmethod
+    def of(cls, one: PartAnswer, other: PartAnswer, own_offsets: bool = False) -> Difference:
+        """From one part to another that is independent of it.
+
+        The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
+        (Nel and van der Merwe, A solution to the multivariate Behrens-Fisher problem, 1986).
+
+        Args:
+            own_offsets: each part has a time offset of its own: only the extrinsics are compared.
+        """
+        n = 6 if own_offsets else 7
+        step, covariance = (other.step - one.step)[:n], (one.covariance + other.covariance)[:n, :n]
+        along = np.linalg.solve(covariance, step)
+        total = max(float(along @ covariance @ along), 1e-300)
+        freedom = sum(
+            (float(along @ part.covariance[:n, :n] @ along) / total) ** 2 / max(part.clusters - 1.0, 1.0)
+            for part in (one, other)
+        )
+        return cls(step, covariance, max(1.0 / freedom, _LEAST_FREEDOM) if freedom > 0.0 else np.inf)
+
+    @property
+    def chi2(self) -> float:
+        """Squared Mahalanobis length."""
+        return float(self.step @ np.linalg.solve(self.covariance, self.step))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of such a length or a larger one where the parts agree."""
+        n = len(self.step)
+        if not np.isfinite(self.freedom):
+            return float(chdtrc(n, self.chi2))
+        return float(fdtrc(n, self.freedom, self.chi2 / n))
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Sorts the least likely first, also where the probability is too small for a float."""
+        return self.p_value, -self.chi2
+
+
+def combined(parts: Sequence[PartAnswer]) -> PartAnswer:
+    """The answer of several independent parts together, weighted by their information."""
+    information = [np.linalg.inv(part.covariance) for part in parts]
+    covariance = np.asarray(np.linalg.inv(np.sum(information, axis=0)))
+    weighted = np.sum([H @ part.step for H, part in zip(information, parts, strict=True)], axis=0)
+    return PartAnswer(covariance @ weighted, covariance, sum(part.clusters for part in parts))
+
+
+@dataclass(frozen=True)
+class NamedStep:
+    """A step between two parts, by the fewest of rotation, translation and time offset that explain it.
+
+    Attributes:
+        kinds: which of "rotation", "translation", "offset" take part.
+        sentence: how large they are, in words: "rotation by 1.10° ± 0.05° about ..., time offset by ...".
+    """
+
+    kinds: tuple[str, ...]
+    sentence: str
+
+
+def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
+    """What the step between two parts is, for people.
+
+    Where speed and direction are steady, a time offset and a translation look alike, and one number is
+    preferred to three.
+
+    Args:
+        cTl: extrinsic, for the camera's axes.
+    """
+    n = len(difference.step)
+    kinds = [kind for kind, where in _KINDS.items() if where.stop <= n]
+    subsets = [subset for size in range(1, len(kinds) + 1) for subset in combinations(kinds, size)]
+    information = np.asarray(np.linalg.inv(difference.covariance), np.float64)
+    least = _WORTH_SHARE * difference.chi2
+
+    def price(subset: tuple[str, ...]) -> float:
+        step, _ = _restricted(difference.step, information, subset)
+        rest = difference.step - step
+        worth = _WORTH * len(_columns(subset)) + least * len(subset)
+        return float(rest @ information @ rest) + worth
+
+    best = min(subsets, key=price)
+    step, covariance = _restricted(difference.step, information, best)
+    return NamedStep(best, ", ".join(_words(kind, step[_KINDS[kind]], covariance, cTl) for kind in best))
+
+
+def _columns(subset: Sequence[str]) -> list[int]:
+    return [i for kind in subset for i in range(_KINDS[kind].start, _KINDS[kind].stop)]
+
+
+def _restricted(
+    step: FloatArray, information: FloatArray, subset: Sequence[str]
+) -> tuple[FloatArray, FloatArray]:
+    """(n,) the step if only some kinds of unknowns changed, and its covariance (n, n), 0 elsewhere."""
+    columns, n = _columns(subset), len(step)
+    inner = np.linalg.inv(information[np.ix_(columns, columns)])
+    found, covariance = np.zeros(n), np.zeros((n, n))
+    found[columns] = inner @ (information @ step)[columns]
+    covariance[np.ix_(columns, columns)] = inner
+    return found, covariance
+
+
+def _words(kind: str, step: FloatArray, covariance: FloatArray, cTl: gtsam.Pose3) -> str:
+    own = covariance[_KINDS[kind], _KINDS[kind]]
+    if kind == "offset":
+        return f"time offset by {1e3 * step[0]:+.0f} ms ± {1e3 * float(np.sqrt(own[0, 0])):.0f} ms"
+    R = np.asarray(cTl.rotation().matrix())
+    c_step, size = R @ step, float(np.linalg.norm(step))
+    unit = c_step / max(size, 1e-12)
+    sigma = float(np.sqrt(unit @ R @ own @ R.T @ unit))
+    axis = int(np.abs(unit).argmax())
+    alone = abs(unit[axis]) > _ONE_AXIS
+    if kind == "rotation":
+        amount = f"rotation by {np.degrees(size):.2f}° ± {np.degrees(sigma):.2f}°"
+        if alone:
+            return f"{amount} about the camera's {'xyz'[axis]} axis ({_TURNS[axis]})"
+        each = ", ".join(
+            f"{name} {value:+.2f}°" for name, value in zip(_TURNS, np.degrees(c_step), strict=True)
+        )
+        return f"{amount} ({each})"
+    amount = f"translation by {100.0 * size:.1f} cm ± {100.0 * sigma:.1f} cm"
+    if alone:
+        return f"{amount} {_WAYS[axis][int(c_step[axis] > 0.0)]}"
+    each = ", ".join(f"{name} {100.0 * value:+.1f} cm" for name, value in zip("xyz", c_step, strict=True))
+    return f"{amount} ({each} along the camera's axes)"

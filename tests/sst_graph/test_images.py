@@ -1,0 +1,180 @@
+"""Pictures and masks that are not whole, or declare what they do not hold."""
+
+from __future__ import annotations
+
+import os
+import resource
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.data.decoder_output import decoder_output
+from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
+from sst_graph.errors import DataError
+
+WIDTH, HEIGHT = 160, 120
+
+
+def picture() -> NDArray[np.uint8]:
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
+    return np.asarray(cv2.GaussianBlur(noise, (7, 7), 3), np.uint8)
+
+
+def encoded(suffix: str, image: NDArray[Any] | None = None, *parameters: int) -> bytes:
+    return cv2.imencode(suffix, picture() if image is None else image, list(parameters))[1].tobytes()
+
+
+def chunks(png: bytes) -> list[tuple[bytes, bytes]]:
+    at, found = 8, []
+    while at < len(png):
+        (length,) = struct.unpack_from(">I", png, at)
+        found.append((png[at + 4 : at + 8], png[at + 8 : at + 8 + length]))
+        at += 12 + length
+    return found
+
+
+def joined(parts: list[tuple[bytes, bytes]]) -> bytes:
+    """A PNG file of chunks, each with its right checksum."""
+    body = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(body)
+
+
+def with_header(width: int, height: int, depth: int = 8, colour: int = 2) -> bytes:
+    header = struct.pack(">IIBBBBB", width, height, depth, colour, 0, 0, 0)
+    return joined([(b"IHDR", header), *chunks(encoded(".png"))[1:]])
+
+
+def with_data(change: Any) -> bytes:
+    """The picture with its compressed data, in one chunk, changed."""
+    parts = chunks(encoded(".png"))
+    data = change(b"".join(data for kind, data in parts if kind == b"IDAT"))
+    return joined([parts[0], (b"IDAT", data), parts[-1]])
+
+
+JPEG = encoded(".jpg")
+PROGRESSIVE = encoded(".jpg", None, cv2.IMWRITE_JPEG_PROGRESSIVE, 1)
+PREVIEW = b"\xff\xe1" + struct.pack(">H", 2 + len(JPEG)) + JPEG
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        JPEG[: len(JPEG) // 2],
+        JPEG[: len(JPEG) // 2] + b"\xff\xd9",
+        PROGRESSIVE[: len(PROGRESSIVE) // 2] + b"\xff\xd9",
+        # A preview in the header ends with an end of its own.
+        JPEG[:2] + PREVIEW + JPEG[2 : len(JPEG) // 2],
+        JPEG[:2] + PREVIEW,
+        JPEG[:30],
+        JPEG[:3],
+        JPEG.replace(struct.pack(">HH", HEIGHT, WIDTH), struct.pack(">HH", 0, WIDTH), 1),
+        encoded(".png")[:-12],
+        encoded(".png")[:20],
+        with_data(lambda data: data[: len(data) // 2]),
+        with_data(lambda data: data[:200] + bytes([data[200] ^ 0x55]) + data[201:]),
+        with_data(lambda data: b""),
+        with_data(lambda data: zlib.compress(bytes(100))),
+        with_header(WIDTH, HEIGHT + 1),
+        with_header(WIDTH, HEIGHT - 1),
+        with_header(WIDTH + 1, HEIGHT),
+        with_header(0, HEIGHT),
+        with_header(WIDTH, HEIGHT, 16),
+        with_header(WIDTH, HEIGHT, 8, 7),
+        b"GIF89a" + bytes(100),
+        b"",
+    ],
+)
+def test_damaged_pictures_are_refused_and_nothing_is_printed(
+    tmp_path: Path, data: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="a: found"):
+        read_picture(path)
+    with pytest.raises(DataError, match="a: found"):
+        read_mask(path)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        JPEG,
+        PROGRESSIVE,
+        JPEG[:2] + PREVIEW + JPEG[2:],
+        JPEG[:-2] + bytes(20) + JPEG[-2:],  # padded, as some cameras do
+        JPEG + bytes(100),
+        encoded(".png"),
+        encoded(".png") + b"trailing",
+        # What libpng warns of, but no pixel is touched by it.
+        joined([*chunks(encoded(".png"))[:1], (b"iCCP", b"bad\0\0"), *chunks(encoded(".png"))[1:]]),
+    ],
+)
+def test_whole_pictures_are_read_in_silence(
+    tmp_path: Path, data: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(data)
+    assert picture_size(path) == (WIDTH, HEIGHT)
+    pixels = read_picture(path, (WIDTH, HEIGHT))
+    assert np.abs(pixels.astype(int) - picture()).max() < 60 and pixels.shape == (HEIGHT, WIDTH, 3)
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("size", [(60_000, 60_000), (32_767, 32_767), (2**31 - 1, 1), (8000, 7000)])
+def test_a_declared_giant_costs_no_memory(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(with_header(*size))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for read in (read_picture, read_mask, read_instances):
+        with pytest.raises(DataError, match=f"found {size[0]}x{size[1]} px, expected at most 50000000"):
+            read(path)
+        with pytest.raises(DataError, match=f"found {size[0]}x{size[1]} px, expected 8x6 px"):
+            read(path, (8, 6))
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+
+
+def test_an_orientation_tag_is_not_followed(tmp_path: Path) -> None:
+    tiff = b"MM\0\x2a\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    path = tmp_path / "a.jpg"
+    path.write_bytes(JPEG[:2] + b"\xff\xe1" + struct.pack(">H", 2 + len(exif)) + exif + JPEG[2:])
+    assert cv2.imread(str(path)).shape[:2] == (WIDTH, HEIGHT)
+    assert read_picture(path).shape[:2] == (HEIGHT, WIDTH)
+
+
+def test_what_others_write_meanwhile_is_passed_on(capfd: pytest.CaptureFixture[str]) -> None:
+    with decoder_output() as lines:
+        os.write(2, b"libpng error: x\nsomebody else\nCorrupt JPEG data: y\n")
+    assert lines == ["libpng error: x", "Corrupt JPEG data: y"]
+    assert capfd.readouterr().err == "somebody else\n"
+
+
+def test_more_than_a_pipe_holds_does_not_block(capfd: pytest.CaptureFixture[str]) -> None:
+    with decoder_output() as lines:
+        for _ in range(20_000):
+            try:
+                os.write(2, b"libpng error: x\n")
+            except BlockingIOError:
+                break
+    assert len(lines) > 1000 and capfd.readouterr().err == ""
+
+
+def test_a_process_without_stderr_reads_pictures_too(tmp_path: Path) -> None:
+    path = tmp_path / "a.jpg"
+    path.write_bytes(JPEG)
+    code = (
+        f"import os; os.close(2)\nfrom sst_graph.data.images import read_picture\nread_picture({str(path)!r})"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
