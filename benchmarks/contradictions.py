@@ -107,7 +107,7 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
     objects = [object_tracks(drive) for drive in drives]
     tracks = Tracks(drives, objects)
     solution = solve_joint(drives, start, joint, tracks=tracks)
-    parts = Parts(drives, tracks, objects, solution.state, joint, config.common_error)
+    parts = Parts(drives, tracks, objects, solution.state, joint, config.assumptions)
     return find_contradictions(parts, config.contradictions)
 
 

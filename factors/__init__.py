@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from .alignment import (
         Alignment,
         GroupedBias,
+        LinearTerm,
         alignment_cost,
         frame_factor,
         pixel_to_point_factor,
@@ -89,6 +90,7 @@ __all__ = [
     "JacobianReport",
     "KernelKind",
     "Kind",
+    "LinearTerm",
     "MotionModel",
     "PackedGraph",
     "PinholeCamera",
@@ -141,6 +143,7 @@ _HOMES = {
     "JacobianReport": "check",
     "KernelKind": "robust",
     "Kind": "variables",
+    "LinearTerm": "alignment",
     "MIN_DEPTH_M": "camera",
     "MotionModel": "motion",
     "PackedGraph": "cloning",

@@ -30,6 +30,7 @@ from .variables import Kind, Vector, checked_key, dimension, is_key, key_name, n
 __all__ = [
     "Alignment",
     "GroupedBias",
+    "LinearTerm",
     "alignment_cost",
     "frame_factor",
     "pixel_to_point_factor",
@@ -55,6 +56,23 @@ class GroupedBias:
 
     biases: tuple[int | float, ...]
     groups: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearTerm:
+    """A scalar that all silhouettes of one alignment depend on: r_i += coefficients_i (theta - at).
+
+    For parameters whose column is known in closed form: a focal length, a distortion, a range bias.
+
+    Attributes:
+        key: of theta (``Vector(1)``).
+        coefficients: (n,) derivative of each match's residual by theta [px per unit].
+        at: value of theta at which the matches were made.
+    """
+
+    key: int
+    coefficients: FloatArray
+    at: float = 0.0
 
 
 def point_to_pixel_factor(
@@ -102,6 +120,7 @@ def frame_factor(
     c_twist: int | FloatArray | None = None,
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | None = None,
     *,
+    terms: Sequence[Sequence[LinearTerm]] | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """All alignments of one image as one factor.
@@ -114,6 +133,7 @@ def frame_factor(
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel; a
             :class:`GroupedBias` where the objects of one alignment have a bias each).
+        terms: of each alignment, scalars that its silhouettes depend on besides; None for none.
         condensed: False gives two rows a match and one more; for tests and for looking at residuals.
 
     Returns:
@@ -122,7 +142,7 @@ def frame_factor(
     Raises:
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
-    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px)
+    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px, terms)
     rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
     function = _FrameError(frame, condensed, rows)
     return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.named, function, frame.kinds, rows, _NAME)
@@ -166,6 +186,7 @@ class _Part:
         groups: (n,) the bias of each match, or None where all share one.
         columns: columns of the alignment's [J r] that belong to variables, the residual last.
         targets: the same columns in the factor's [J r].
+        terms: scalars that the residuals depend on besides, and where their values come from.
     """
 
     alignment: Alignment
@@ -173,6 +194,18 @@ class _Part:
     groups: NDArray[np.intp] | None
     columns: list[int]
     targets: list[int]
+    terms: tuple[tuple[LinearTerm, _Source], ...] = ()
+
+    def evaluated(
+        self, values: Sequence[Any], state: tuple[gtsam.Pose3, float, FloatArray], jacobians: bool
+    ) -> Evaluated:
+        """Residuals, and derivatives with a column for each term where ``jacobians`` is true."""
+        found = evaluate(self.alignment, *state, self.bias_px(values), jacobians)
+        if not self.terms:
+            return found
+        coefficients = np.stack([term.coefficients for term, _ in self.terms])
+        steps = np.array([_scalar(source.value(values)) - term.at for term, source in self.terms])
+        return found.with_terms(coefficients, steps, jacobians)
 
     def bias_px(self, values: Sequence[Any]) -> float | FloatArray | None:
         if not self.biases:
@@ -223,13 +256,13 @@ class FrameResidual:
 
     def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[Evaluated, float]:
         """Weighted [J r] of one alignment and its constant."""
-        return part.weighted(evaluate(part.alignment, *self._state(values), part.bias_px(values), True))
+        return part.weighted(part.evaluated(values, self._state(values), True))
 
     def cost(self, values: Sequence[Any]) -> float:
         total = 0.0
         for part in self.parts:
             state = self._state(values)
-            total += cost(part.alignment, evaluate(part.alignment, *state, part.bias_px(values), False))
+            total += cost(part.alignment, part.evaluated(values, state, False))
         return total
 
     def gram(self, values: Sequence[Any]) -> tuple[FloatArray, float]:
@@ -270,7 +303,7 @@ class FrameResidual:
         """The error of :meth:`stacked`, without the work for its Jacobian."""
         blocks, constant = [], 0.0
         for part in self.parts:
-            evaluated = evaluate(part.alignment, *self._state(values), part.bias_px(values), False)
+            evaluated = part.evaluated(values, self._state(values), False)
             constant += weigh(part.alignment, evaluated)
             blocks.append(evaluated.rows[-1].reshape(-1))
         return np.concatenate([*blocks, [np.sqrt(constant)]])
@@ -282,6 +315,7 @@ def frame_residual(
     offset_s: Any,
     c_twist: Any,
     biases_px: Any,
+    terms: Sequence[Sequence[LinearTerm]] | None = None,
     name: str = _NAME,
 ) -> FrameResidual:
     """The residual behind :func:`frame_factor`, whose arguments these are; ``name`` is for errors."""
@@ -295,20 +329,29 @@ def frame_residual(
     offset = variables.source("offset_s", number_or_key(name, "offset_s", offset_s), Vector(1))
     twist = variables.source("c_twist", _twist_or_key(name, c_twist), Vector(6))
     biases = [_bias_sources(bias, variables) for bias in _bias_of_each(alignments, biases_px)]
+    scalars = [
+        tuple(
+            (term, variables.source("term", checked_key(name, "terms", term.key), Vector(1)))
+            for term in of_one
+        )
+        for of_one in _terms_of_each(alignments, terms)
+    ]
     if not variables.keys:
         raise FactorError(f"keys of {name}", "constants only", "the key of one variable or more")
     cols = sum(variables.dims)
     parts = []
-    for alignment, (sources, groups) in zip(alignments, biases, strict=True):
+    for alignment, (sources, groups), own_terms in zip(alignments, biases, scalars, strict=True):
         columns, targets = [], []
         named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["offset_s"]), (twist, _COLUMNS["c_twist"])]
-        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(sources)]
+        singles = [*(source for _, source in own_terms), *sources]
+        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(singles)]
         for source, own in named:
             if source.slot is not None:
                 columns += list(own)
                 start = sum(variables.dims[: source.slot])
                 targets += list(range(start, start + len(own)))
-        parts.append(_Part(alignment, sources, groups, [*columns, 13 + len(sources)], [*targets, cols]))
+        columns, targets = [*columns, 13 + len(singles)], [*targets, cols]
+        parts.append(_Part(alignment, sources, groups, columns, targets, own_terms))
     kinds, names = tuple(variables.kinds), tuple(variables.names)
     return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), kinds, names)
 
@@ -357,6 +400,26 @@ def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int |
     return biases
 
 
+def _terms_of_each(
+    alignments: Sequence[Alignment], terms: Sequence[Sequence[LinearTerm]] | None
+) -> list[Sequence[LinearTerm]]:
+    """The terms of each alignment, their shapes checked."""
+    if terms is None:
+        return [()] * len(alignments)
+    if len(terms) != len(alignments):
+        raise FactorError("terms", f"{len(terms)} entries", f"{len(alignments)}, one an alignment")
+    for alignment, own in zip(alignments, terms, strict=True):
+        if own and alignment.normals is None:
+            raise FactorError("terms", "one for point-to-pixel matches", "none: only silhouettes have them")
+        for term in own:
+            checked_array("coefficients of a linear term", term.coefficients, (len(alignment),))
+    return list(terms)
+
+
+_SEVERAL = ("bias", "term")
+"""Arguments that a factor may have more than one of."""
+
+
 class _Variables:
     """Collects the keys of a factor, their kinds, and the arguments that they came as."""
 
@@ -371,20 +434,20 @@ class _Variables:
         return [dimension(kind) for kind in self.kinds]
 
     def source(self, name: str, key_or_value: Any, kind: Kind) -> _Source:
-        """Of a key or constant that has been checked; several biases may share a key, others may not."""
+        """Of a key or constant that has been checked; biases may share a key, and terms, others may not."""
         if not isinstance(key_or_value, int):
             return _Source(None, key_or_value)
         key = key_or_value
         if key in self.keys:
             before = self.names[self.keys.index(key)]
-            if name != "bias" or not before.startswith("bias"):
+            if name not in _SEVERAL or not before.startswith(name):
                 both = f"{key_name(key)} for {before} and {name}"
                 raise FactorError(f"keys of {self.factor}", both, "distinct keys")
         else:
-            count = sum(each.startswith("bias") for each in self.names)
+            count = sum(each.startswith(name) for each in self.names)
             self.keys.append(key)
             self.kinds.append(kind)
-            self.names.append(f"bias {count + 1}" if name == "bias" else name)
+            self.names.append(f"{name} {count + 1}" if name in _SEVERAL else name)
         return _Source(self.keys.index(key))
 
 

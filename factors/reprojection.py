@@ -129,6 +129,22 @@ class Evaluated:
         rows = self.rows.reshape(len(self.rows), -1)
         return rows if self.lift is None else np.concatenate([self.lift @ rows[:6], rows[6:]])
 
+    def with_terms(self, coefficients: FloatArray, steps: FloatArray, jacobians: bool) -> Evaluated:
+        """The same with linear terms added to the residuals of silhouettes, before any weighting.
+
+        Args:
+            coefficients: (k, n) derivatives of the residuals by each term's scalar.
+            steps: (k,) what the scalars are beyond the values that the matches were made at.
+            jacobians: whether the rows hold derivatives: the terms' then follow those of the motion.
+        """
+        seen = coefficients if self.behind is None else np.where(self.behind, 0.0, coefficients)
+        rows = self.rows
+        if jacobians:
+            motion = 13 if self.lift is None else 6
+            rows = np.concatenate([rows[:motion], seen[:, None, :], rows[motion:]])
+        rows[-1, 0] += steps @ seen
+        return Evaluated(rows, self.lift, self.behind)
+
     def by_group(self, groups: NDArray[np.intp], count: int) -> Evaluated:
         """The same with a bias column for each of ``count`` groups of matches; groups (n,)."""
         n = self.rows.shape[2]

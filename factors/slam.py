@@ -270,7 +270,7 @@ def _on_poses(
     E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
     if X_a == X_b:
         raise FactorError(f"keys of {_NAME}", f"{key_name(X_a)} for X_a and X_b", "distinct keys")
-    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, _NAME)
+    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, name=_NAME)
     variables: dict[int, tuple[str, Kind]] = {X_a: ("X_a", gtsam.Pose3), X_b: ("X_b", gtsam.Pose3)}
     variables.setdefault(X_s, ("X_scan", gtsam.Pose3))
     own: list[tuple[Any, str, Kind]] = [(E, "cTl", gtsam.Pose3), (D, "offset_s", Vector(1))]

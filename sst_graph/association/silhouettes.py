@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -15,6 +16,7 @@ from factors.motion import move_points
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
 from sst_graph.association.contour import ContourMap
+from sst_graph.assumptions.model import Effect
 from sst_graph.config import Settings, setting
 from sst_graph.types import SemanticClass
 
@@ -60,6 +62,14 @@ class Motion:
     c_acceleration: FloatArray
 
 
+class PointDeviation(Protocol):
+    """What points and pixels differ by from what is assumed of them (:mod:`sst_graph.assumptions`)."""
+
+    def effect(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> Effect:
+        """On points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
+        ...
+
+
 @dataclass(frozen=True)
 class SilhouetteMatches:
     """Matches of one class in one pair.
@@ -94,6 +104,7 @@ def match_silhouettes(
     kernel: RobustKernel,
     config: MatchConfig,
     velocities: Mapping[SemanticClass, FloatArray] | None = None,
+    deviation: PointDeviation | None = None,
 ) -> dict[SemanticClass, SilhouetteMatches]:
     """Each boundary point's nearest contour at the current estimate, where the two face the same way.
 
@@ -102,6 +113,8 @@ def match_silhouettes(
     Args:
         velocities: (n, 3) velocity over ground of each boundary point's object, in the LiDAR frame [m/s], of
             the classes in which some move.
+        deviation: of the points and pixels from what is assumed of them; the matched pixels are then those
+            of the ideal camera.
     """
     found = {}
     for c, points in boundaries.items():
@@ -110,6 +123,12 @@ def match_silhouettes(
         base_taus = base_tau_s - points.offsets_s
         moving = (velocities or {}).get(c)
         uvs, outs = _project(points, camera, cTl, offset_s + base_taus, motion, moving)
+        shift = np.zeros((len(points), 2))
+        if deviation is not None:
+            points, base_taus = _deviated(points, base_taus, deviation, uvs)
+            ideal, beyond = _project(points, camera, cTl, offset_s + base_taus, motion, moving)
+            shift, out_shift = (_pixel_shift(deviation, points, each) for each in (ideal, beyond))
+            uvs, outs = ideal + shift, beyond + out_shift
         feet = contours[c].look_up(uvs)
         way = outs - uvs
         length = np.linalg.norm(way, axis=1)
@@ -127,7 +146,7 @@ def match_silhouettes(
             camera=camera,
             lPs=points.lPs[index],
             base_taus_s=base_taus[index],
-            pixels=feet.feet[index],
+            pixels=feet.feet[index] - shift[index],
             sigmas_px=sigmas,
             normals=feet.normals[index],
             kernel=kernel,
@@ -139,6 +158,22 @@ def match_silhouettes(
             alignment, points.objects[index], sides, index, int(np.count_nonzero(used))
         )
     return found
+
+
+def _deviated(
+    points: Boundaries, base_taus_s: FloatArray, deviation: PointDeviation, uvs: FloatArray
+) -> tuple[Boundaries, FloatArray]:
+    """The points where they are, and their intervals."""
+    effect = deviation.effect(points.lPs, points.offsets_s, uvs)
+    if effect.l_shift is not None:
+        points = replace(points, lPs=points.lPs + effect.l_shift, outward=points.outward + effect.l_shift)
+    return points, base_taus_s if effect.time_s is None else base_taus_s + effect.time_s
+
+
+def _pixel_shift(deviation: PointDeviation, points: Boundaries, uvs: FloatArray) -> FloatArray:
+    """(n, 2) by how much the pixels of points lie beside the ideal ones ``uvs`` [px]."""
+    shift = deviation.effect(points.lPs, points.offsets_s, uvs).pixel_shift
+    return np.zeros_like(uvs) if shift is None else shift
 
 
 def _has_a_mask(

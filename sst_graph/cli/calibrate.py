@@ -29,6 +29,7 @@ def run(args: argparse.Namespace) -> int:
         "method": args.method,
         "classes": chosen_classes(args.classes),
         "delay_per_drive": args.delay_per_drive,
+        "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(CalibrationConfig(), args, flags)
     inputs = {"DATA": None, "--init": args.init, "--config": args.config}

@@ -129,6 +129,12 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     calibrate.add_argument(
         "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
+    calibrate.add_argument(
+        "--estimate",
+        metavar="NAMES",
+        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
+        "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
+    )
     _add_settings(calibrate)
     calibrate.add_argument(
         "--out",

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -13,6 +13,13 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
+from sst_graph.estimators.assumption_tests import (
+    Finding,
+    TestedProblem,
+    assumption_report,
+    check_assumptions,
+    estimated_report,
+)
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.causes import with_causes
 from sst_graph.estimators.config import CalibrationConfig, Method
@@ -27,7 +34,7 @@ from sst_graph.estimators.contest import (
 )
 from sst_graph.estimators.contradictions import find_contradictions
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
+from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
@@ -39,7 +46,7 @@ from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
-from sst_graph.uncertainty.common_error import common_covariance
+from sst_graph.uncertainty.assumptions import BUDGET, budget, consider, motion_covariance
 from sst_graph.uncertainty.covariance import RobustCovariance, robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
@@ -87,7 +94,7 @@ def calibrate(
     seconds = time.perf_counter() - began
     result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
     timing = {"prepare": seconds, **result.diagnostics["seconds"]}
-    return dataclasses.replace(result, diagnostics={**result.diagnostics, "seconds": timing})
+    return replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 
 
 def prepare_drives(
@@ -96,7 +103,7 @@ def prepare_drives(
     """Of every frame what the method needs: image features are not tracked for one that does without."""
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
-        prepare = dataclasses.replace(prepare, use_visual_odometry=False)
+        prepare = replace(prepare, use_visual_odometry=False)
     if config.method != "joint" or config.undersides.use == "never":
         prepare = without_undersides(prepare)
     return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
@@ -125,7 +132,7 @@ def calibrate_prepared(
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
         diagnostics["left_out"] = left_out
-    return dataclasses.replace(result, diagnostics=diagnostics)
+    return replace(result, diagnostics=diagnostics)
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -148,6 +155,7 @@ def answer_joint(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """The default: a global start, then silhouettes over the whole drive."""
+    config = replace(config, joint=_estimating(config))
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
     contest = choose_start(
@@ -165,10 +173,10 @@ def answer_joint(
     # 3. Edges towards the ground, where the labels agree about them.
     best = rivals(finals, guess.cTl, guess.offset_s, config.start)
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
-    config, finals = dataclasses.replace(config, joint=below.joint), below.solutions
+    config, finals = replace(config, joint=below.joint), below.solutions
     solution = finals[0]
     # 4. Do the drives agree, and the stretches of each?
-    parts = Parts(drives, tracks, objects, solution.state, config.joint, config.common_error)
+    parts = Parts(drives, tracks, objects, solution.state, config.joint, config.assumptions)
     contradictions = find_contradictions(parts, config.contradictions)
     # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
@@ -181,14 +189,25 @@ def answer_joint(
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
+    # 6. What is taken for granted: considered in the covariance, and tested.
+    frozen = solution.pairs, solution.values, solution.state
+    considered = consider(robust, *frozen, config.assumptions)
+    centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+    problem = TestedProblem(drives, tracks, objects, solution, config.joint, centre)
+    findings = check_assumptions(problem, config.assumptions)
+    size = 6 + len(solution.state.offsets_s)
+    motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
+    parts_of_sigma = budget(covariance, motion, considered)
+    covariance = covariance[:size, :size] + considered.covariance(size)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
+        covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config),
         _frames_used(drives, solution),
         remarks=(*_remarks(drives), *heard.remarks),
         by_standing=by_standing[:7, :7],
         doubts=(
+            *_contradicted(findings),
             *_doubts(solution, finals, covariance, evidence, guess, config),
             *contradictions.sentences,
             *heard.doubts,
@@ -199,10 +218,28 @@ def answer_joint(
             **evidence,
             "start_score": contest.score,
             "motion": heard.diagnostics,
+            "assumptions": assumption_report(considered, findings),
+            BUDGET: parts_of_sigma,
+            "estimated": estimated_report(robust, solution.state),
             "contradictions": contradictions.diagnostics,
             **_numbers(drives, solution, below, robust),
         },
     )
+
+
+def _estimating(config: CalibrationConfig) -> JointConfig:
+    """The joint method's settings with the parameters that are to be estimated."""
+    joint = config.joint
+    return replace(joint, graph=replace(joint.graph, estimate=config.assumptions.estimated))
+
+
+def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The reason that the data contradict assumptions: the most likely one, and which others would do."""
+    against = [finding for finding in findings if finding.contradicted]
+    if not against:
+        return ()
+    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
+    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
 
 
 def _numbers(
@@ -316,14 +353,9 @@ def _doubts(
     return tuple(doubts)
 
 
-def _beside_matches(
-    drives: Sequence[Drive], solution: JointSolution, variance_s2: float, config: CalibrationConfig
-) -> FloatArray:
+def _beside_matches(solution: JointSolution, variance_s2: float, config: CalibrationConfig) -> FloatArray:
     """(7, 7) covariance by what no match shows."""
-    common = common_covariance(solution.state.cTl, drives[0].camera, config.common_error)
-    return common + unknown_motion_covariance(
-        solution.pairs, solution.state, variance_s2, config.unknown_motion
-    )
+    return unknown_motion_covariance(solution.pairs, solution.state, variance_s2, config.unknown_motion)
 
 
 def _remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
@@ -368,7 +400,7 @@ def _by_drive(
     for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
         own = [*range(6), 6 + number]
         block, standing = covariance[np.ix_(own, own)], by_standing[np.ix_(own, own)]
-        block = block + _beside_matches(drives, solution, float(block[6, 6]), config)
+        block = block + _beside_matches(solution, float(block[6, 6]), config)
         found.append(DriveKnowledge(drives[number].name, block, standing))
     return tuple(found)
 

@@ -16,7 +16,7 @@ from sst_graph.estimators.start import StartConfig
 from sst_graph.estimators.undersides import UndersideConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.common_error import CommonErrorConfig
+from sst_graph.uncertainty.assumptions import AssumptionConfig
 from sst_graph.uncertainty.observability import ObservabilityConfig
 from sst_graph.uncertainty.unknown_motion import UnknownMotionConfig
 
@@ -46,8 +46,9 @@ class CalibrationConfig(Settings):
         semalign: sampled starts.
         motion: hand-eye calibration.
         challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
-        common_error: what the covariance of method joint, and the tracker's, has beside that of the matches.
-        unknown_motion: the same where a single scan tells no motion; both 0 where the vehicle stood.
+        assumptions: what is taken for granted: considered in the covariance, tested, or estimated.
+        unknown_motion: what the covariance has beside that of the matches where a single scan tells no
+            motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
         contradictions: when method joint finds that drives, or parts of one, contradict each other.
         check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
@@ -68,7 +69,7 @@ class CalibrationConfig(Settings):
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
-    common_error: CommonErrorConfig = field(default_factory=CommonErrorConfig)
+    assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
     contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)

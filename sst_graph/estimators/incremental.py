@@ -168,7 +168,7 @@ class Tracker:
         return self.covariance[:7, :7] + self._common(self.point.cTl)
 
     def _common(self, cTl: gtsam.Pose3) -> FloatArray:
-        return common_covariance(cTl, self.camera, self.config.calibration.common_error)
+        return common_covariance(cTl, self.camera, self.config.calibration.assumptions)
 
     def consolidate(self) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.

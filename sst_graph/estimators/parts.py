@@ -16,7 +16,8 @@ from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks, associate
 from sst_graph.problem.objects import ObjectId, tracks_of_scans
 from sst_graph.problem.state import State
-from sst_graph.uncertainty.common_error import CommonErrorConfig, common_covariance
+from sst_graph.uncertainty.assumptions import AssumptionConfig
+from sst_graph.uncertainty.common_error import common_covariance
 from sst_graph.uncertainty.contradiction import PartAnswer
 from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.standing import standing_covariance
@@ -62,7 +63,7 @@ class Parts:
         reference: the answer of all drives together, where the parts start and what their weak priors are
             centred on.
         joint: settings of the joint method.
-        common_error: what each part's covariance has beside its matches.
+        assumptions: whose principal point each part's covariance has beside its matches.
         kernel_px: scales of the robust kernel of a part's solution, as in :class:`JointConfig` [px].
     """
 
@@ -71,7 +72,7 @@ class Parts:
     objects: Sequence[dict[ObjectId, int]]
     reference: State
     joint: JointConfig
-    common_error: CommonErrorConfig
+    assumptions: AssumptionConfig
     kernel_px: tuple[float, ...] = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
 
     def solve(self, part: Part) -> SolvedPart | None:
@@ -104,7 +105,7 @@ class Parts:
         state = solution.state
         objects = [tracks_of_scans(self.objects[part.drive], part.scans)]
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
-        common = common_covariance(state.cTl, self.drives[part.drive].camera, self.common_error)
+        common = common_covariance(state.cTl, self.drives[part.drive].camera, self.assumptions)
         # What moving objects alone tell is not called known: a vehicle that brakes looks like another offset.
         covariance = standing_covariance(robust, solution.pairs)[:7, :7] + common
         weights = np.bincount(robust.table.sides, robust.table.root_weights**2)

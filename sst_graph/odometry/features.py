@@ -78,7 +78,7 @@ class FeatureTracker:
         Raises:
             DataError: the image is not later than the one before, or of another size.
         """
-        gray = _gray(image)
+        gray = gray_of(image)
         last, self._last = self._last, (image, gray)
         if last is None:
             return None
@@ -89,7 +89,7 @@ class FeatureTracker:
             return Tracks(image_a.stamp_ns, image.stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)))
         if gray.shape != gray_a.shape:
             raise DataError("visual odometry", f"image {gray.shape}", f"the size before, {gray_a.shape}")
-        corners = detect_corners(gray_a, _trackable(image_a, self.config), self.config)
+        corners = detect_corners(gray_a, trackable_area(image_a, self.config), self.config)
         uv_a, uv_b = _track(gray_a, gray, corners, self.config)
         # A corner that slid on to something that may move is no landmark.
         column, row = np.rint(uv_b).astype(np.intp).T
@@ -136,7 +136,7 @@ def detect_corners(
     return np.asarray(uvs[order[rank < config.per_cell]], np.float32)
 
 
-def _trackable(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
+def trackable_area(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
     """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask."""
     if not image.has_mask:
         return np.full(image.mask.shape, 255, np.uint8)
@@ -147,7 +147,7 @@ def _trackable(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
     return np.asarray(cv2.bitwise_not(barred), np.uint8)
 
 
-def _gray(image: CameraImage) -> NDArray[np.uint8]:
+def gray_of(image: CameraImage) -> NDArray[np.uint8]:
     """(h, w) grey picture; empty without one."""
     if not image.has_picture:
         return np.zeros((0, 0), np.uint8)
@@ -161,8 +161,20 @@ def _track(
     config: FeatureConfig,
 ) -> tuple[FloatArray, FloatArray]:
     """Corners that LK finds in b, inside the image, and that return to where they started."""
+    there, good = follow_corners(gray_a, gray_b, corners, config)
+    return corners[good].astype(np.float64), there[good]
+
+
+def follow_corners(
+    gray_a: NDArray[np.uint8],
+    gray_b: NDArray[np.uint8],
+    corners: NDArray[np.float32],
+    config: FeatureConfig,
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(n, 2) where Lucas-Kanade finds corners (n, 2) of a in b [px], and (n,) whether it does: inside the
+    image, and returning to where they started."""
     if len(corners) == 0:
-        return np.zeros((0, 2)), np.zeros((0, 2))
+        return np.zeros((0, 2)), np.zeros(0, np.bool_)
     there, found = _flow(gray_a, gray_b, corners, None, config)
     # Back from where it went: the pyramid has done its work, two levels check it.
     back, found_back = _flow(gray_b, gray_a, there, corners, config)
@@ -173,7 +185,7 @@ def _track(
         & (np.linalg.norm(back - corners, axis=1) < config.max_round_trip_px)
         & np.all((there >= 0) & (there <= [width - 1, height - 1]), axis=1)
     )
-    return corners[good].astype(np.float64), there[good].astype(np.float64)
+    return there.astype(np.float64), np.asarray(good, np.bool_)
 
 
 def _flow(

@@ -16,6 +16,7 @@ from sst_graph.association.contour import ContourMap
 from sst_graph.association.picture_edges import PictureConfig
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
+from sst_graph.odometry.chains import ChainTracker, FeatureChain
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
@@ -148,6 +149,7 @@ class Drive:
         image_pairs: tracks between consecutive images; empty for a single image.
         left_out: what the data lacked.
         survey: what the raw frames show, for the search for causes; None where nobody looked.
+        chains: corners followed through several images, where image features are tracked.
     """
 
     name: str
@@ -158,6 +160,7 @@ class Drive:
     image_pairs: tuple[ImagePair, ...]
     left_out: LeftOut = field(default_factory=LeftOut)
     survey: Survey | None = None
+    chains: tuple[FeatureChain, ...] = ()
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -176,6 +179,12 @@ class Drive:
     def part(self, scans: Sequence[int]) -> Drive:
         """The drive with some of its scans only, by position, rising; all images and motions stay."""
         return replace(self, scans=tuple(self.scans[position] for position in scans))
+
+    @property
+    def scan_period_s(self) -> float:
+        """Median interval between scans [s]; 0.1 for a single one."""
+        stamps = self.scan_stamps_ns
+        return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
         """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
@@ -199,7 +208,7 @@ def prepare_drive(
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
-    tracker = FeatureTracker(config.visual_odometry.features)
+    tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
     left_out, surveyor = LeftOut(), Surveyor(source.name, source.camera, total)
@@ -213,6 +222,7 @@ def prepare_drive(
             scans.append(scan_features(frame.index, frame.scan, classes, config))
         if frame.image is not None:
             if config.use_visual_odometry:
+                follower.add(frame.image)
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
@@ -234,6 +244,7 @@ def prepare_drive(
         tuple(pairs),
         left_out,
         surveyor.survey(),
+        follower.chains(),
     )
 
 

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import GroupedBias, delay_prior, frame_factor, twist_transfer_factor, velocity_factor
+from factors import GroupedBias, LinearTerm, delay_prior, frame_factor, twist_transfer_factor, velocity_factor
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries
 from sst_graph.association.pairing import Pair, pair_by_time
@@ -21,9 +21,12 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions.model import Scene
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError
 from sst_graph.problem.drive import Drive, outlines
+from sst_graph.problem.nuisances import deviation_of, moved_twist, residual_columns
 from sst_graph.problem.objects import (
     Mover,
     ObjectId,
@@ -38,6 +41,7 @@ from sst_graph.problem.state import (
     State,
     bias_key,
     delay_key,
+    nuisance_key,
     object_bias_key,
     twist_key,
     underside_track,
@@ -72,6 +76,7 @@ class GraphConfig(Settings):
         mover_reach_m: an object that moves so far by itself between its scan and its image, in a way that is
             not known, keeps half of its weight, one that moves a little farther none [m].
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
+        estimate: assumptions whose parameters are variables, with the deviation of each from 0.
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
@@ -85,6 +90,7 @@ class GraphConfig(Settings):
     rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
     mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
     still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
+    estimate: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         if 0.0 < self.object_bias_sigma_px < 0.001:
@@ -105,6 +111,8 @@ class PairMatches:
         matches: by class.
         tracks: for each class, the track (n,) of the object that each match lies on; empty where objects
             share their class's mask bias.
+        scene: what assumptions may depend on.
+        terms: for each class, derivative (n,) of each residual by the parameters that are estimated, by name.
     """
 
     drive: int
@@ -113,6 +121,8 @@ class PairMatches:
     motion: Motion
     matches: Mapping[SemanticClass, SilhouetteMatches]
     tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
+    scene: Scene | None = None
+    terms: Mapping[SemanticClass, Mapping[str, FloatArray]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return sum(len(matches) for matches in self.matches.values())
@@ -206,6 +216,8 @@ def associate(
         for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, limit):
             image = drive.images[pair.image]
             l_twist = tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
+            scene = scene_of(drive, pair.image, l_twist)
+            l_twist = moved_twist(l_twist, state.nuisances, scene)
             motion = _camera_motion(l_twist, state.cTl)
             movers, tau_s = tracks.movers(number, pair.scan), offset_s + pair.base_tau_s
             share = partial(_shares, movers, reach_m=config.mover_reach_m, tau_s=tau_s)
@@ -223,14 +235,28 @@ def associate(
                 kernel,
                 config.match,
                 velocities_of_points(known, boundaries),
+                deviation_of(state.nuisances, scene),
             )
             matches = {c: _weighted(m, share(c, m.objects)) for c, m in matches.items()}
             if matches:
                 on = _objects_of(
                     matches, pair.scan, None if tracks.objects is None else tracks.objects[number]
                 )
-                found.append(PairMatches(number, pair, l_twist, motion, matches, on))
+                at = state.cTl, offset_s, motion.c_twist
+                terms = {
+                    c: residual_columns(m.alignment, scene, pair.base_tau_s, at, dict(config.estimate))
+                    for c, m in matches.items()
+                    if config.estimate
+                }
+                found.append(PairMatches(number, pair, l_twist, motion, matches, on, scene, terms))
     return found
+
+
+def scene_of(drive: Drive, image: int, l_twist: TwistSample | None) -> Scene:
+    """What assumptions about an image of a drive may depend on, beside the points."""
+    since_s = (drive.images[image].stamp_ns - drive.images[0].stamp_ns) * 1e-9
+    twist = np.zeros(6) if l_twist is None else l_twist.twist
+    return Scene(drive.camera, twist, since_s, drive.scan_period_s)
 
 
 def _told(boundaries: Mapping[SemanticClass, Boundaries], share: _Share) -> dict[SemanticClass, Boundaries]:
@@ -275,23 +301,30 @@ def joint_graph(
     """The whole problem at a state: silhouettes, motion, weak priors around the guess (or the state)."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     _add_calibration(graph, values, state, guess or state, config)
+    _add_nuisances(graph, values, state, config)
     _add_biases(graph, values, pairs, state, config)
     for pair in pairs:
         E, D, V = EXTRINSIC, delay_key(state.clock(pair.drive)), twist_key(pair.drive, pair.pair.image)
         if not values.exists(V):
             values.insert(V, pair.motion.c_twist)
             graph.add(motion_factor(pair, E, D, V, state.cTl, state.offset_s(pair.drive), config))
-        graph.add(silhouettes_factor(pair, E, D, V, partial(bias_key, pair.drive)))
+        graph.add(silhouettes_factor(pair, E, D, V, partial(bias_key, pair.drive), state.nuisances))
     return graph, values
 
 
 def silhouettes_factor(
-    pair: PairMatches, E: int, D: int, V: int, bias_of: Callable[[SemanticClass], int]
+    pair: PairMatches,
+    E: int,
+    D: int,
+    V: int,
+    bias_of: Callable[[SemanticClass], int],
+    nuisances: Mapping[str, float] | None = None,
 ) -> gtsam.CustomFactor:
     """All silhouette matches of one pair as one condensed factor on extrinsic, offset, twist and mask biases.
 
     Args:
         bias_of: key of the mask bias that a class's objects share where they have none of their own.
+        nuisances: values of the assumptions' parameters that the matches were made at.
     """
     biases: list[int | float | GroupedBias | None] = []
     for c in pair.matches:
@@ -300,7 +333,12 @@ def silhouettes_factor(
             biases.append(GroupedBias(tuple(object_bias_key(pair.drive, track) for track in names), groups))
         else:
             biases.append(bias_of(c))
-    return frame_factor([matches.alignment for matches in pair.matches.values()], E, D, V, biases)
+    at = nuisances or {}
+    terms = [
+        [LinearTerm(nuisance_key(name), column, at.get(name, 0.0)) for name, column in own.items()]
+        for own in (pair.terms.get(c, {}) for c in pair.matches)
+    ]
+    return frame_factor([m.alignment for m in pair.matches.values()], E, D, V, biases, terms=terms)
 
 
 def motion_factor(
@@ -338,6 +376,16 @@ def _add_calibration(
     for clock, offset_s in enumerate(state.offsets_s):
         graph.add(delay_prior(delay_key(clock), guess.offset_s(clock), config.delay_sigma_s))
         values.insert(delay_key(clock), np.array([offset_s]))
+
+
+def _add_nuisances(
+    graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
+) -> None:
+    """The parameters that are estimated, with what is known of them beforehand."""
+    for name, sigma in config.estimate:
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
+        graph.add(gtsam.PriorFactorVector(nuisance_key(name), np.zeros(1), noise))
+        values.insert(nuisance_key(name), np.array([state.nuisances.get(name, 0.0)]))
 
 
 def _add_biases(
@@ -379,4 +427,6 @@ def state_from(values: gtsam.Values, state: State, pairs: Sequence[PairMatches])
     for drive, _, track in tracked_objects(pairs):
         objects[drive, track] = float(values.atVector(object_bias_key(drive, track))[0])
     offsets = tuple(float(values.atVector(delay_key(i))[0]) for i in range(len(state.offsets_s)))
-    return State(values.atPose3(EXTRINSIC), offsets, biases, objects)
+    keys = {name: nuisance_key(name) for name in ASSUMPTIONS}
+    estimated = {name: float(values.atVector(key)[0]) for name, key in keys.items() if values.exists(key)}
+    return State(values.atPose3(EXTRINSIC), offsets, biases, objects, {**state.nuisances, **estimated})

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import gtsam
 
+from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.types import SemanticClass
 
 EXTRINSIC = gtsam.symbol("E", 0)
@@ -44,6 +45,11 @@ def object_bias_key(drive: int, track: int) -> int:
 _Key = TypeVar("_Key")
 
 
+def nuisance_key(name: str) -> int:
+    """Key of the parameter of an assumption that is estimated (``Vector(1)``)."""
+    return int(gtsam.symbol("N", list(ASSUMPTIONS).index(name)))
+
+
 @dataclass(frozen=True)
 class State:
     """The current estimate.
@@ -53,12 +59,14 @@ class State:
         offsets_s: time offset of each clock [s].
         biases_px: mask bias by (drive, class) [px]; 0 where it is missing.
         object_biases_px: mask bias by (drive, track of an object) [px]; its class's where it is missing.
+        nuisances: values of the assumptions' parameters, by name; 0 where it is missing.
     """
 
     cTl: gtsam.Pose3
     offsets_s: tuple[float, ...] = (0.0,)
     biases_px: Mapping[tuple[int, SemanticClass], float] = field(default_factory=dict)
     object_biases_px: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    nuisances: Mapping[str, float] = field(default_factory=dict)
 
     def clock(self, drive: int) -> int:
         """Number of the clock that a drive's time offset belongs to."""
@@ -87,6 +95,7 @@ class State:
             tuple(a + share * (b - a) for a, b in zip(self.offsets_s, other.offsets_s, strict=True)),
             _between(self.biases_px, other.biases_px, share),
             _between(self.object_biases_px, other.object_biases_px, share),
+            _between(self.nuisances, other.nuisances, share),
         )
 
 

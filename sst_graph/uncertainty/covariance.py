@@ -32,7 +32,7 @@ from factors.robust import RobustKernel
 from sst_graph.association.silhouettes import SIDES
 from sst_graph.problem.graph import PairMatches, bias_groups, state_from
 from sst_graph.problem.objects import ObjectId
-from sst_graph.problem.state import State, delay_key, twist_key
+from sst_graph.problem.state import State, delay_key, nuisance_key, twist_key
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance, twist_responses
 from sst_graph.uncertainty.object_spread import ObjectSpread, composed, step_without
@@ -165,6 +165,8 @@ def _rows(
         block[index, :6] += J[:, :6]
         block[index, clock] += J[:, 6]
         block[index, unknowns.column(key)] += J[:, 13]
+        for name, column in pair.terms.get(c, {}).items():
+            block[index, unknowns.column(nuisance_key(name))] += column[index] * J[:, 13]
         roots[index] = root
         residuals[index] = unweighted(r, root)
     return block, roots, residuals

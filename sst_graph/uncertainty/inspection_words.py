@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.result import CalibrationResult
+from sst_graph.uncertainty.budget_words import budget_lines
 from sst_graph.uncertainty.frame_information import FrameInformation
 from sst_graph.uncertainty.gained_words import MOST_FRAMES, SHORT, gained_lines, short
 from sst_graph.uncertainty.inspection import (
@@ -37,6 +38,8 @@ def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
         _correlation_block(inspection),
         _weak_block(inspection),
     ]
+    if budget := budget_lines(inspection.result):
+        blocks.append(budget)
     if inspection.plan is None:
         blocks.append(gained_lines(inspection.result, inspection.gained, all_frames))
     else:

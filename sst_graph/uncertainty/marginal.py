@@ -10,23 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.problem.graph import PairMatches, tracked_objects
-from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, object_bias_key
+from sst_graph.problem.state import EXTRINSIC, State, bias_key, delay_key, nuisance_key, object_bias_key
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Columns of the unknowns that are not motion: the extrinsic, the clocks, the mask biases."""
+    """Columns of the unknowns that are not motion: the extrinsic, the clocks, parameters of assumptions that
+    are estimated, the mask biases."""
 
     keys: tuple[int, ...]
 
     @classmethod
     def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
         delays = [delay_key(clock) for clock in range(len(state.offsets_s))]
+        names = dict.fromkeys(name for pair in pairs for own in pair.terms.values() for name in own)
         biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
         objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
-        return cls((EXTRINSIC, *delays, *sorted(biases), *sorted(objects)))
+        return cls((EXTRINSIC, *delays, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
 
     @property
     def size(self) -> int:

@@ -115,7 +115,7 @@ def parts_of(drives: Sequence[Drive], offset_s: float) -> Parts:
     """Ready to be solved, about the truth."""
     objects = [object_tracks(drive) for drive in drives]
     reference = State(street().truth.cTl, (offset_s,))
-    return Parts(drives, Tracks(drives, objects), objects, reference, JointConfig(), CONFIG.common_error)
+    return Parts(drives, Tracks(drives, objects), objects, reference, JointConfig(), CONFIG.assumptions)
 
 
 def first_frame_after(result: CalibrationResult) -> int:

@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 
 from factors.camera import PinholeCamera
-from sst_graph.uncertainty.common_error import CommonErrorConfig, common_covariance
+from sst_graph.config import with_overrides
+from sst_graph.errors import ConfigError
+from sst_graph.uncertainty.assumptions import AssumptionConfig
+from sst_graph.uncertainty.common_error import common_covariance
 
 CAMERA = PinholeCamera(700.0, 720.0, 600.0, 180.0, 1242, 375)
+def shifted(sigma_px: float) -> AssumptionConfig:
+    """A principal point with this deviation."""
+    return with_overrides(AssumptionConfig(), [f"sigmas.cx={sigma_px}", f"sigmas.cy={sigma_px}"])
+
+
 AXES = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 cTl = gtsam.Pose3(AXES, np.array([0.1, -0.3, -0.2]))
 
@@ -17,7 +25,7 @@ cTl = gtsam.Pose3(AXES, np.array([0.1, -0.3, -0.2]))
 @pytest.mark.parametrize("axis", [0, 1])
 def test_it_moves_the_middle_of_the_picture_by_its_sigma(axis: int) -> None:
     """Far along the optical axis, the covariance of a projected point is sigma squared in u and in v."""
-    covariance = common_covariance(cTl, CAMERA, CommonErrorConfig(sigma_px=0.4))[:6, :6]
+    covariance = common_covariance(cTl, CAMERA, shifted(0.4))[:6, :6]
     lP = cTl.transformTo(np.array([0.0, 0.0, 500.0]))
     step, columns = 1e-6, []
     for i in range(6):
@@ -31,7 +39,7 @@ def test_it_moves_the_middle_of_the_picture_by_its_sigma(axis: int) -> None:
 
 def test_the_camera_turns_about_its_own_centre() -> None:
     """Its place in the LiDAR's frame stays as certain as it was."""
-    covariance = common_covariance(cTl, CAMERA, CommonErrorConfig(sigma_px=0.4))[:6, :6]
+    covariance = common_covariance(cTl, CAMERA, shifted(0.4))[:6, :6]
     values, vectors = np.linalg.eigh(covariance)
     assert np.linalg.matrix_rank(covariance, tol=1e-9 * values[-1]) == 2
     centre = cTl.inverse().translation()
@@ -41,11 +49,11 @@ def test_the_camera_turns_about_its_own_centre() -> None:
 
 
 def test_the_time_offset_is_not_concerned_and_zero_turns_it_off() -> None:
-    assert not common_covariance(cTl, CAMERA, CommonErrorConfig())[6].any()
-    assert not common_covariance(cTl, CAMERA, CommonErrorConfig(sigma_px=0.0)).any()
+    assert not common_covariance(cTl, CAMERA, AssumptionConfig())[6].any()
+    assert not common_covariance(cTl, CAMERA, shifted(0.0)).any()
 
 
 @pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
 def test_a_sigma_out_of_range_is_refused(sigma: float) -> None:
-    with pytest.raises(ValueError, match="sigma_px"):
-        CommonErrorConfig(sigma_px=sigma)
+    with pytest.raises(ConfigError, match=r"sigmas\.cx"):
+        shifted(sigma)

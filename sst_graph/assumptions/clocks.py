@@ -1,0 +1,40 @@
+"""The two clocks run at the same rate, and all rows of a picture are exposed at once."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sst_graph.assumptions.model import Assumption, Effect, View
+
+
+def _skew(view: View) -> Effect:
+    """The time offset grows by one second a second."""
+    return Effect(time_s=np.full(len(view.lPs), view.image_s))
+
+
+def _line_delay(view: View) -> Effect:
+    """A row is exposed one second after the row above; the middle row has the picture's stamp."""
+    rows = view.uvs[:, 1] - 0.5 * (view.camera.height - 1)
+    return Effect(time_s=np.where(np.isfinite(rows), rows, 0.0))
+
+
+SKEW = Assumption(
+    name="skew",
+    unit="s/s",
+    effect=_skew,
+    sigma=1e-6,
+    source="synchronised clocks (PTP, GPS) drift less; free quartz clocks 2e-5",
+    span=0.05,
+    finding="one clock runs faster than the other: the time offset grows",
+    remedy="synchronise the clocks, or estimate the skew with --estimate skew",
+)
+LINE_DELAY = Assumption(
+    name="line_delay",
+    unit="s",
+    effect=_line_delay,
+    sigma=1e-7,
+    source="global shutter; rolling shutters take 1e-5 to 5e-5 s a row",
+    span=1e-4,
+    finding="rows of the pictures are exposed one after the other (rolling shutter)",
+    remedy="use a camera with a global shutter, or estimate it with --estimate line_delay",
+)

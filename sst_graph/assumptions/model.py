@@ -1,0 +1,131 @@
+"""What a calibration takes for granted, as parameters: an assumption is that its parameter is zero.
+
+A nuisance parameter theta acts on a match in at most four ways: it moves the point (a range that is too
+long), changes the interval from the point to its image (a sweep that is not compensated), moves the pixel
+(a lens that bends), or changes the LiDAR's measured motion. Each is linear in theta, so a match's residual
+has the closed-form column
+
+    dr/dtheta = r_H_lP . l_shift + r_H_tau time_s + n . pixel_shift + r_H_twist . Ad(cTl) twist_shift
+
+beside the factor's own Jacobian. Signs and frames are those of :mod:`factors`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class View:
+    """Points of one scan as one image sees them.
+
+    Attributes:
+        lPs: (n, 3) points in the LiDAR frame [m].
+        offsets_s: (n,) time of each point relative to its scan's stamp [s].
+        uvs: (n, 2) their pixels by the ideal camera; NaN behind it [px].
+        camera: the ideal camera.
+        l_twist: (6,) the LiDAR's twist at the image's instant [rad/s, m/s]; zeros where it is not known.
+        image_s: stamp of the image minus that of the drive's first image [s].
+        period_s: time between two scans [s].
+    """
+
+    lPs: FloatArray
+    offsets_s: FloatArray
+    uvs: FloatArray
+    camera: PinholeCamera
+    l_twist: FloatArray
+    image_s: float
+    period_s: float
+
+    @property
+    def rays(self) -> FloatArray:
+        """(n, 2) x = X/Z and y = Y/Z of the points in the ideal camera."""
+        camera = self.camera
+        centre, focal = np.array([camera.cx, camera.cy]), np.array([camera.fx, camera.fy])
+        return np.asarray((self.uvs - centre) / focal)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What one unit of a parameter does to the points of a view; None where it does nothing.
+
+    Attributes:
+        l_shift: (n, 3) moves the points, in the LiDAR frame [m].
+        time_s: (n,) is added to the interval tau from the point to its image [s].
+        pixel_shift: (n, 2) moves their pixels [px].
+        twist_shift: (6,) is added to the LiDAR's measured twist [rad/s, m/s].
+    """
+
+    l_shift: FloatArray | None = None
+    time_s: FloatArray | None = None
+    pixel_shift: FloatArray | None = None
+    twist_shift: FloatArray | None = None
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One parameter that is taken to be zero.
+
+    Attributes:
+        name: as it stands in settings and results.
+        unit: of the parameter; empty where it has none.
+        effect: what one unit of it does.
+        sigma: deviation that a careful set-up leaves: considered in the covariance.
+        source: where ``sigma`` comes from.
+        span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
+        finding: what it means that the data contradict it, for people.
+        remedy: what to do about it.
+        by_matches: whether the matches test it. They do not test the sweep: at constant speed it looks like a
+            shift.
+    """
+
+    name: str
+    unit: str
+    effect: Callable[[View], Effect]
+    sigma: float
+    source: str
+    span: float
+    finding: str
+    remedy: str
+    by_matches: bool = True
+
+    def figure(self, value: float, sigma: float) -> str:
+        """The parameter's estimate as people read it."""
+        unit = f" {self.unit}" if self.unit else ""
+        return f"{self.name} = {value:.3g} ± {sigma:.2g}{unit}"
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the effects of assumptions depend on beside the points: of one scan and one image.
+
+    Attributes:
+        camera, l_twist, image_s, period_s: as in :class:`View`.
+    """
+
+    camera: PinholeCamera
+    l_twist: FloatArray
+    image_s: float
+    period_s: float
+
+    def view(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> View:
+        """Points of the scan as the image sees them; arguments as in :class:`View`."""
+        return View(lPs, offsets_s, uvs, self.camera, self.l_twist, self.image_s, self.period_s)
+
+
+def combined(effects: Sequence[tuple[float, Effect]]) -> Effect:
+    """The effect of several parameters at their values: their sum."""
+
+    def total(name: str) -> FloatArray | None:
+        parts = [theta * part for theta, effect in effects if (part := getattr(effect, name)) is not None]
+        return np.asarray(sum(parts[1:], parts[0])) if parts else None
+
+    return Effect(total("l_shift"), total("time_s"), total("pixel_shift"), total("twist_shift"))

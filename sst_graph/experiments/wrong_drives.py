@@ -1,0 +1,123 @@
+"""Drives whose data break an assumption on purpose, by a known size.
+
+Made by changing what is recorded, never by the effects in :mod:`sst_graph.assumptions`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass, Source
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class KeptDrive:
+    """A drive whose frames are held in memory (satisfies :class:`sst_graph.types.Source`)."""
+
+    name: str
+    camera: PinholeCamera
+    nominal: gtsam.Pose3 | None
+    truth: GroundTruth | None
+    frames: Sequence[Frame]
+
+    @classmethod
+    def of(cls, source: Source) -> KeptDrive:
+        """All frames of a source, read now."""
+        return cls(source.name, source.camera, source.nominal, source.truth, tuple(source))
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, position: int) -> Frame:
+        return self.frames[position]
+
+    def __iter__(self) -> Iterator[Frame]:
+        return iter(self.frames)
+
+    def with_images(self, change: Callable[[CameraImage], CameraImage]) -> KeptDrive:
+        """The drive with every image changed."""
+        return replace(self, frames=tuple(replace(f, image=f.image and change(f.image)) for f in self.frames))
+
+    def with_scans(self, change: Callable[[Scan], Scan]) -> KeptDrive:
+        """The drive with every scan changed."""
+        return replace(self, frames=tuple(replace(f, scan=f.scan and change(f.scan)) for f in self.frames))
+
+
+def with_focal(drive: KeptDrive, size: float) -> KeptDrive:
+    """The camera's true focal length is larger by the share ``size`` than the one given."""
+    camera = drive.camera
+    return replace(drive, camera=replace(camera, fx=camera.fx / (1 + size), fy=camera.fy / (1 + size)))
+
+
+def with_principal_point(drive: KeptDrive, right_px: float, down_px: float) -> KeptDrive:
+    """The true principal point lies this far from the one given [px]."""
+    camera = drive.camera
+    return replace(drive, camera=replace(camera, cx=camera.cx - right_px, cy=camera.cy - down_px))
+
+
+def with_distortion(drive: KeptDrive, k1: float, k2: float = 0.0) -> KeptDrive:
+    """Pictures and masks as a lens with these coefficients (OpenCV's) would have made them."""
+    camera = drive.camera
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    uvs = np.stack([u, v], axis=-1).reshape(-1, 1, 2).astype(np.float64)
+    coefficients = np.array([k1, k2, 0.0, 0.0])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-9)
+    rays = cv2.undistortPoints(uvs, camera.matrix, coefficients, None, None, None, criteria).reshape(-1, 2)
+    ideal = rays * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    columns = ideal.reshape(camera.height, camera.width, 2).astype(np.float32)
+    inside = (columns >= 0).all(axis=2) & (columns <= [camera.width - 1, camera.height - 1]).all(axis=2)
+
+    def change(image: CameraImage) -> CameraImage:
+        x, y = columns[..., 0], columns[..., 1]
+        mask = np.where(inside, cv2.remap(image.mask, x, y, cv2.INTER_NEAREST), int(SemanticClass.IGNORE))
+        numbers = image.instances
+        if numbers is not None:
+            numbers = np.where(inside, cv2.remap(numbers, x, y, cv2.INTER_NEAREST), 0).astype(np.uint16)
+        pixels = np.asarray(cv2.remap(image.pixels, x, y, cv2.INTER_LINEAR), np.uint8)
+        return CameraImage(image.stamp_ns, mask.astype(np.uint8), pixels, numbers)
+
+    return drive.with_images(change)
+
+
+def with_ranges(drive: KeptDrive, bias_m: float, scale: float) -> KeptDrive:
+    """The true ranges are longer than the measured ones by a constant [m] and by a share."""
+
+    def change(scan: Scan) -> Scan:
+        ranges = np.linalg.norm(scan.points.astype(np.float64), axis=1)
+        measured = np.maximum(ranges - bias_m, 0.1) / (1.0 + scale)
+        share = measured / np.maximum(ranges, 1e-6)
+        return replace(scan, points=(scan.points * share[:, None]).astype(np.float32))
+
+    return drive.with_scans(change)
+
+
+def with_skew(drive: KeptDrive, size: float) -> KeptDrive:
+    """The camera's clock loses ``size`` seconds a second against the LiDAR's, from the first image on."""
+    first = next(frame.image.stamp_ns for frame in drive.frames if frame.image is not None)
+
+    def change(image: CameraImage) -> CameraImage:
+        return replace(image, stamp_ns=first + round((image.stamp_ns - first) / (1.0 + size)))
+
+    return drive.with_images(change)
+
+
+WRONG: dict[str, Callable[[KeptDrive, float], KeptDrive]] = {
+    "focal": with_focal,
+    "cx": lambda drive, size: with_principal_point(drive, size, 0.0),
+    "cy": lambda drive, size: with_principal_point(drive, 0.0, size),
+    "k1": with_distortion,
+    "k2": lambda drive, size: with_distortion(drive, 0.0, size),
+    "skew": with_skew,
+    "range_bias": lambda drive, size: with_ranges(drive, size, 0.0),
+    "range_scale": lambda drive, size: with_ranges(drive, 0.0, size),
+}
+"""How to break an assumption by the size of its parameter."""

@@ -1,0 +1,108 @@
+"""The parameters of assumptions in a problem: matches made under their values, and their Jacobian columns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.alignment import Alignment, residuals
+from factors.motion import move_points
+from sst_graph.assumptions import ASSUMPTIONS, Effect, combined
+from sst_graph.assumptions.model import Scene
+from sst_graph.problem.trajectory import TwistSample
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """What a scan and an image differ by from what is assumed of them.
+
+    Attributes:
+        values: parameters that are not 0, by name.
+        scene: the scan and the image.
+    """
+
+    values: Mapping[str, float]
+    scene: Scene
+
+    def effect(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> Effect:
+        """On points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
+        view = self.scene.view(lPs, offsets_s, uvs)
+        return combined([(theta, ASSUMPTIONS[name].effect(view)) for name, theta in self.values.items()])
+
+
+def deviation_of(nuisances: Mapping[str, float], scene: Scene) -> Deviation | None:
+    """The deviation at these parameters; None where all are 0."""
+    values = {name: theta for name, theta in nuisances.items() if theta != 0.0}
+    return Deviation(values, scene) if values else None
+
+
+def moved_twist(
+    sample: TwistSample | None, nuisances: Mapping[str, float], scene: Scene
+) -> TwistSample | None:
+    """The LiDAR's twist as it is under the parameters, from the measured one."""
+    deviation = deviation_of(nuisances, scene)
+    if sample is None or deviation is None:
+        return sample
+    shift = deviation.effect(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2))).twist_shift
+    return sample if shift is None else replace(sample, twist=sample.twist + shift)
+
+
+def residual_columns(
+    alignment: Alignment,
+    scene: Scene,
+    base_tau_s: float,
+    pose: tuple[gtsam.Pose3, float, FloatArray],
+    names: Iterable[str],
+) -> dict[str, FloatArray]:
+    """Derivatives (n,) of the residuals of silhouettes by assumptions' parameters [px per unit].
+
+    Args:
+        alignment: the matches.
+        scene: of their scan and image.
+        base_tau_s: stamp of the image minus that of the scan [s].
+        pose: the extrinsic, the time offset [s], and the camera's twist (6,) [rad/s, m/s].
+        names: of the assumptions.
+    """
+    cTl, offset_s, c_twist = pose
+    view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
+    _, J = residuals(alignment, cTl, offset_s, c_twist)
+    seen = np.isfinite(view.uvs).all(axis=1)
+    columns = {}
+    for name in names:
+        column = _column(alignment, J, cTl, ASSUMPTIONS[name].effect(view))
+        columns[name] = np.where(seen, column, 0.0)
+    return columns
+
+
+def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effect) -> FloatArray:
+    """Derivatives (n,) by one parameter; J (n, 13) as :func:`factors.residuals` gives it."""
+    total = np.zeros(len(alignment))
+    if effect.l_shift is not None:
+        # A step of the extrinsic's translation (right perturbation) moves the point in the LiDAR frame.
+        total += np.einsum("ij,ij->i", J[:, 3:6], effect.l_shift)
+    if effect.time_s is not None:
+        total += J[:, 6] * effect.time_s
+    if effect.pixel_shift is not None:
+        assert alignment.normals is not None
+        total += np.einsum("ij,ij->i", alignment.normals, effect.pixel_shift)
+    if effect.twist_shift is not None:
+        total += J[:, 7:13] @ np.asarray(cTl.AdjointMap()) @ effect.twist_shift
+    return total
+
+
+def _pixels(alignment: Alignment, cTl: gtsam.Pose3, offset_s: float, c_twist: FloatArray) -> FloatArray:
+    """(n, 2) pixels of the matches' points by the ideal camera; NaN behind it."""
+    lPs, _, _ = alignment.columns
+    velocities = alignment.velocity_columns
+    taus = alignment.taus_s(offset_s)
+    moved = move_points(
+        cTl, lPs, taus, c_twist, alignment.c_acceleration, alignment.motion_model, velocities
+    )
+    return alignment.camera.project(moved.cPs.T)
+

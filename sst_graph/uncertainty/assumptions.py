@@ -1,0 +1,201 @@
+"""How an answer follows the assumptions it rests on, and what that adds to its covariance.
+
+A parameter theta that is held at 0 but has deviation sigma moves the answer by (dx/dtheta) theta: Schmidt's
+considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
+the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the covariance that
+the solve itself claims,
+
+    dx/dtheta = -P J'c,      P_considered = sum sigma^2 (dx/dtheta)(dx/dtheta)'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, make_dataclass, replace
+from typing import TYPE_CHECKING
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.config import Settings, setting
+from sst_graph.errors import ConfigError
+from sst_graph.problem.graph import GraphConfig, PairMatches, joint_graph
+from sst_graph.problem.nuisances import residual_columns
+from sst_graph.problem.state import State, twist_key
+from sst_graph.uncertainty.covariance import MatchTable, RobustCovariance
+from sst_graph.uncertainty.marginal import marginal_covariance
+
+FloatArray = NDArray[np.float64]
+
+BUDGET = "sigma_budget"
+"""Key of :func:`budget` among a result's diagnostics."""
+
+
+_Sigmas = make_dataclass(
+    "_Sigmas",
+    [
+        (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
+        for name, each in ASSUMPTIONS.items()
+    ],
+    bases=(Settings,),
+    frozen=True,
+)
+if TYPE_CHECKING:
+
+    class AssumptionSigmas(Settings):
+        """Deviation of each assumption's parameter, by its name, in its unit; 0: it holds exactly."""
+else:
+    AssumptionSigmas = _Sigmas
+
+
+@dataclass(frozen=True)
+class AssumptionConfig(Settings):
+    """What is taken for granted, and how far it may be wrong.
+
+    Attributes:
+        sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
+            what a careful set-up leaves (``sst_graph.assumptions`` names their sources).
+        estimate: assumptions whose parameters are variables of the answer: ``name``, or ``name=sigma`` with
+            the deviation from 0 beforehand, in its unit.
+        test: test the assumptions against the data.
+        threshold: an estimate of a parameter farther from 0 than this many of its deviations contradicts
+            the assumption; with ten tests, 3.3 gives one false alarm in a hundred drives.
+    """
+
+    sigmas: AssumptionSigmas = field(default_factory=AssumptionSigmas)
+    estimate: tuple[str, ...] = ()
+    test: bool = True
+    threshold: float = setting(3.3, at_least=1.0, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        names = [name for name, _ in self.estimated]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"estimate: found {', '.join(names)}, expected each name once")
+
+    def sigma(self, name: str) -> float:
+        """Deviation of an assumption's parameter."""
+        return float(getattr(self.sigmas, name))
+
+    @property
+    def estimated(self) -> tuple[tuple[str, float], ...]:
+        """Assumptions whose parameters are variables, with the deviation of each beforehand."""
+        return tuple(_named_sigma(text) for text in self.estimate)
+
+
+def _named_sigma(text: str) -> tuple[str, float]:
+    """Name and deviation from ``name`` or ``name=sigma``."""
+    name, equals, number = (part.strip() for part in text.partition("="))
+    if name not in ASSUMPTIONS:
+        raise ConfigError(f"estimate: found {name!r:.60}, expected one of {', '.join(ASSUMPTIONS)}")
+    span = ASSUMPTIONS[name].span
+    if not equals:
+        return name, span
+    try:
+        sigma = float(number)
+    except ValueError:
+        sigma = np.nan
+    if not 1e-6 * span <= sigma <= 100.0 * span:
+        expected = f"{1e-6 * span:g} to {100.0 * span:g} {ASSUMPTIONS[name].unit}".rstrip()
+        raise ConfigError(f"estimate: {name}: found {number!r:.60}, expected {expected}")
+    return name, sigma
+
+
+@dataclass(frozen=True)
+class Considered:
+    """What the assumptions add to a covariance.
+
+    Attributes:
+        sensitivities: how extrinsic and offsets (n,) follow each parameter, by name [rad, m, s per unit].
+        sigmas: deviations of the parameters.
+    """
+
+    sensitivities: Mapping[str, FloatArray]
+    sigmas: Mapping[str, float]
+
+    def part(self, name: str) -> FloatArray:
+        """(n, n) covariance by one assumption."""
+        step = self.sigmas[name] * self.sensitivities[name]
+        return np.outer(step, step)
+
+    def covariance(self, size: int) -> FloatArray:
+        """(size, size) covariance by all of them."""
+        return np.asarray(sum((self.part(name) for name in self.sigmas), np.zeros((size, size))))
+
+
+def columns_of(
+    pairs: Sequence[PairMatches], values: gtsam.Values, state: State, names: Sequence[str]
+) -> FloatArray:
+    """(m, k) derivatives of all matches' residuals by assumptions' parameters [px per unit], unweighted.
+
+    In the order of :func:`~sst_graph.uncertainty.covariance.match_table`.
+    """
+    blocks = [np.zeros((0, len(names)))]
+    for pair in pairs:
+        assert pair.scene is not None
+        c_twist = values.atVector(twist_key(pair.drive, pair.pair.image))
+        at = state.cTl, state.offset_s(pair.drive), c_twist
+        for matches in pair.matches.values():
+            found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
+            blocks.append(np.stack([found[name] for name in names], axis=1))
+    return np.concatenate(blocks)
+
+
+def weighted_columns(table: MatchTable, pairs: Sequence[PairMatches], columns: FloatArray) -> FloatArray:
+    """Columns (m, k) multiplied by sqrt(weight) / sigma, as the table's rows are."""
+    sigmas = np.concatenate([m.alignment.sigmas_px for pair in pairs for m in pair.matches.values()])
+    return np.asarray(columns * (table.root_weights / sigmas)[:, None])
+
+
+def consider(
+    robust: RobustCovariance,
+    pairs: Sequence[PairMatches],
+    values: gtsam.Values,
+    state: State,
+    config: AssumptionConfig,
+) -> Considered:
+    """How an answer follows every assumption that is not estimated beside it.
+
+    Args:
+        robust: its covariance and matches.
+        pairs, values, state: its last frozen problem.
+    """
+    names = [name for name in ASSUMPTIONS if name not in dict(config.estimated)]
+    columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
+    size = 6 + len(state.offsets_s)
+    steps = -(robust.bread @ (robust.table.J.T @ columns))[:size]
+    return Considered(dict(zip(names, steps.T, strict=True)), {name: config.sigma(name) for name in names})
+
+
+def motion_covariance(
+    robust: RobustCovariance, pairs: Sequence[PairMatches], state: State, config: GraphConfig
+) -> FloatArray:
+    """(n, n) part of the covariance that is there because the LiDAR's motion is measured, not known.
+
+    The difference to the same problem with a motion a thousand times as well known.
+    """
+    known = [
+        replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
+        if pair.l_twist is not None
+        else pair
+        for pair in pairs
+    ]
+    graph, values = joint_graph(known, state, config)
+    return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
+
+
+def budget(
+    covariance: FloatArray, motion: FloatArray, considered: Considered
+) -> dict[str, list[float]]:
+    """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
+
+    Args:
+        covariance: (n, n) of matches and motion.
+        motion: (n, n) part of it, by :func:`motion_covariance`.
+        considered: by the assumptions.
+    """
+    moved = np.clip(np.diag(motion)[:7], 0.0, np.diag(covariance)[:7])
+    parts = {"matches": np.diag(covariance)[:7] - moved, "motion": moved}
+    parts |= {name: np.diag(considered.part(name))[:7] for name in considered.sigmas}
+    return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}
