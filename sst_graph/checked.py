@@ -81,7 +81,10 @@ def check_covariance(place: str, covariance: FloatArray) -> None:
     if (sigmas < MIN_SIGMA).any() or (sigmas > MAX_SIGMA).any():
         wrong = sigmas[(sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)][0]
         raise DataError(place, f"a sigma of {wrong:.3g}", f"sigmas of {MIN_SIGMA:g} to {MAX_SIGMA:g}")
-    correlation = covariance / sigmas[:, None] / sigmas
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = covariance / sigmas[:, None] / sigmas
+    if not np.isfinite(correlation).all():
+        raise DataError(place, "a covariance far above the variances", "correlations of -1 to 1")
     if (np.abs(correlation - correlation.T) > 1e-6).any():
         raise DataError(place, "a matrix that is not symmetric", "a covariance")
     if not np.abs(correlation).max() <= 1.0 + 1e-6:

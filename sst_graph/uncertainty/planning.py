@@ -172,7 +172,7 @@ def predict(
     gain = np.linalg.slogdet(_scaled(covariance, sigmas))[1] - np.linalg.slogdet(_scaled(after, sigmas))[1]
     return Prediction(
         proposal.name,
-        np.sqrt(np.diag(after)),
+        np.sqrt(np.maximum(np.diag(after), 0.0)),
         worst_ratio(after, limits),
         max(0.0, 0.5 * float(gain) / float(np.log(2.0))),
         _enough(covariance, proposal, limits) if search else None,
