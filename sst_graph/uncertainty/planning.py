@@ -188,7 +188,8 @@ def predicted_covariance(covariance: FloatArray, information: FloatArray) -> Flo
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     L = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     CL = covariance @ L
-    after = covariance - CL @ np.linalg.solve(np.eye(len(L)) + L.T @ CL, CL.T)
+    # By least squares: beside a covariance of knowing nothing the unit matrix is lost in rounding.
+    after = covariance - CL @ np.linalg.lstsq(np.eye(len(L)) + L.T @ CL, CL.T)[0]
     return np.asarray(0.5 * (after + after.T))
 
 
