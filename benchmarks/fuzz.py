@@ -329,12 +329,14 @@ def _calibrate(ground: Ground, rng: Rng) -> None:
     copy = ground.folder / "mutated"
     shutil.rmtree(copy, ignore_errors=True)
     folder = shutil.copytree(ground.street, copy / "sequences" / "00")
+    mutated: set[Path] = set()
     for _ in range(int(rng.integers(1, 4))):
         pattern, mutation = m.pick(rng, DRIVE_FILES[:-1])
-        paths = [path for path in sorted(folder.glob(pattern)) if path.is_file()]
+        paths = [path for path in sorted(folder.glob(pattern)) if path not in mutated]
         if not paths:
             continue
         path = m.pick(rng, paths)
+        mutated.add(path)
         action = rng.random()
         if action < 0.15:
             path.unlink()

@@ -58,8 +58,9 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
     if np.abs(R).max() > 2.0:  # else the products overflow
         raise DataError(place, f"a 3x3 block with an entry of {np.abs(R).max():.3g}", "a rotation matrix")
     off = float(np.abs(R @ R.T - np.eye(3)).max())
-    if off > ROTATION_TOLERANCE or np.linalg.det(R) < 0.0:
-        found = f"a 3x3 block with |R R' - I| = {off:.2g}, det {np.linalg.det(R):.3g}"
+    determinant = float(np.dot(np.cross(R[0], R[1]), R[2]))
+    if off > ROTATION_TOLERANCE or determinant < 0.0:
+        found = f"a 3x3 block with |R R' - I| = {off:.2g}, det {determinant:.3g}"
         raise DataError(place, found, "a rotation matrix")
     if np.abs(matrix[:3, 3]).max() > MAX_TRANSLATION_M:
         found = f"a translation of {np.abs(matrix[:3, 3]).max():.3g} m"
@@ -67,21 +68,25 @@ def checked_pose(matrix: FloatArray, place: str) -> gtsam.Pose3:
     return gtsam.Pose3(gtsam.Rot3.ClosestTo(R) if off > 1e-12 else gtsam.Rot3(R), matrix[:3, 3])
 
 
-def check_covariance(place: str, covariance: FloatArray) -> None:
+def check_covariance(place: str, covariance: FloatArray, min_sigma: float = MIN_SIGMA) -> None:
     """Require a covariance: finite, symmetric, positive semi-definite but for rounding, sane sigmas.
 
     Raises:
-        DataError: another matrix, or a sigma outside [MIN_SIGMA, MAX_SIGMA].
+        DataError: another matrix, or a sigma outside [min_sigma, MAX_SIGMA].
     """
     check_finite(place, covariance, (len(covariance), len(covariance)))
     variances = np.diag(covariance)
     if (variances < 0.0).any():
         raise DataError(place, f"a variance of {variances.min():.3g}", "variances of at least 0")
     sigmas = np.sqrt(variances)
-    if (sigmas < MIN_SIGMA).any() or (sigmas > MAX_SIGMA).any():
-        wrong = sigmas[(sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)][0]
-        raise DataError(place, f"a sigma of {wrong:.3g}", f"sigmas of {MIN_SIGMA:g} to {MAX_SIGMA:g}")
-    correlation = covariance / sigmas[:, None] / sigmas
+    wrong = sigmas[(sigmas < min_sigma) | (sigmas > MAX_SIGMA)]
+    if len(wrong):
+        raise DataError(place, f"a sigma of {wrong[0]:.3g}", f"sigmas of {min_sigma:g} to {MAX_SIGMA:g}")
+    sigmas = np.maximum(sigmas, 1e-150)  # a zero has zeros beside it, or is found out below
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = covariance / sigmas[:, None] / sigmas
+    if not np.isfinite(correlation).all():
+        raise DataError(place, "a covariance far above the variances", "correlations of -1 to 1")
     if (np.abs(correlation - correlation.T) > 1e-6).any():
         raise DataError(place, "a matrix that is not symmetric", "a covariance")
     if not np.abs(correlation).max() <= 1.0 + 1e-6:

@@ -136,7 +136,7 @@ class CalibrationResult:
         check_finite("T_camera_lidar", self.T_camera_lidar.matrix(), (4, 4))
         check_finite("time_offset_s", np.asarray(self.time_offset_s), ())
         check_finite("covariance", self.covariance, (7, 7))
-        check_covariance("covariance", self.covariance)
+        check_covariance("covariance", self.covariance, min_sigma=0.0)
         for weak in self.weak_directions:
             check_finite("weak_directions.vector", np.asarray(weak.vector), (7,))
             check_finite("weak_directions.sigma", np.asarray(weak.sigma), ())

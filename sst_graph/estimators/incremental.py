@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from factors.errors import FactorError
-from sst_graph.errors import DataError, EstimationError
+from sst_graph.errors import EstimationError
 from sst_graph.estimators.admission import check_image, check_scan
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.arrivals import Arrivals
@@ -131,7 +131,7 @@ class Tracker:
             self.clocks.take_image(image.stamp_ns, self.window.place)
             picture = self.config.calibration.prepare.picture
             self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
-        except (DataError, FactorError, ValueError) as error:
+        except Exception as error:
             return self._answer(image.stamp_ns, str(error))
         return self._answer(image.stamp_ns)
 
@@ -141,7 +141,7 @@ class Tracker:
             check_scan(scan, self.window)
             jump = self.clocks.take_scan(scan.stamp_ns, self.window.place)
             number = self._take_scan(scan)
-        except (DataError, FactorError, ValueError, RuntimeError) as error:
+        except Exception as error:
             return self._answer(scan.stamp_ns, str(error))
         try:
             if jump is not None and self.config.alarm.enabled and self.config.alarm.stamps:
@@ -149,7 +149,7 @@ class Tracker:
             if self.smoother is None:
                 return self._start(scan.stamp_ns)
             return self._track(scan.stamp_ns, number)
-        except (EstimationError, FactorError, ValueError, RuntimeError) as error:
+        except Exception as error:
             return self._answer(scan.stamp_ns, " ".join(str(error).split()))
 
     def current(self) -> TrackUpdate:

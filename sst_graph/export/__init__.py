@@ -11,6 +11,7 @@ from sst_graph.export.marginal import (
     fuse_marginals,
     marginal_of_graph,
     marginal_of_result,
+    read_marginal,
 )
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "fuse_marginals",
     "marginal_of_graph",
     "marginal_of_result",
+    "read_marginal",
 ]

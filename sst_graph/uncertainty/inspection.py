@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
+from sst_graph.errors import DataError
 from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
-from sst_graph.uncertainty.frame_information import FrameInformation, frames_of
+from sst_graph.uncertainty.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.uncertainty.gained import Gained, gained_of
 from sst_graph.uncertainty.observability import ObservabilityConfig, weak_directions
 from sst_graph.uncertainty.planning import Plan, limits_of, plan_recording
@@ -132,9 +133,25 @@ def inspect_result(result: CalibrationResult, config: InspectConfig | None = Non
         frames,
         redundant_frames(frames, config.redundant),
         config.redundant,
-        plan_recording(result, frames, config.next_frames) if frames else None,
+        _plan(result, frames, config.next_frames),
         gained_of(result),
     )
+
+
+def _plan(result: CalibrationResult, frames: tuple[FrameInformation, ...], next_frames: int) -> Plan | None:
+    """What to record next; None without information by frame.
+
+    Raises:
+        DataError: that information is none that a calibration can have.
+    """
+    if not frames:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return plan_recording(result, frames, next_frames)
+    except np.linalg.LinAlgError as error:
+        place = f"diagnostics.{KEY}"
+        raise DataError(place, f"numbers that predict nothing ({error})", "information by frame") from error
 
 
 def correlation_matrix(covariance: FloatArray) -> FloatArray:

@@ -172,7 +172,7 @@ def predict(
     gain = np.linalg.slogdet(_scaled(covariance, sigmas))[1] - np.linalg.slogdet(_scaled(after, sigmas))[1]
     return Prediction(
         proposal.name,
-        np.sqrt(np.diag(after)),
+        np.sqrt(np.maximum(np.diag(after), 0.0)),
         worst_ratio(after, limits),
         max(0.0, 0.5 * float(gain) / float(np.log(2.0))),
         _enough(covariance, proposal, limits) if search else None,
@@ -188,7 +188,8 @@ def predicted_covariance(covariance: FloatArray, information: FloatArray) -> Flo
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     L = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     CL = covariance @ L
-    after = covariance - CL @ np.linalg.solve(np.eye(len(L)) + L.T @ CL, CL.T)
+    # By least squares: beside a covariance of knowing nothing the unit matrix is lost in rounding.
+    after = covariance - CL @ np.linalg.lstsq(np.eye(len(L)) + L.T @ CL, CL.T)[0]
     return np.asarray(0.5 * (after + after.T))
 
 

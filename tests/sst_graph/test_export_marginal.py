@@ -25,6 +25,7 @@ from sst_graph.export import (
     fuse_marginals,
     marginal_of_graph,
     marginal_of_result,
+    read_marginal,
 )
 from sst_graph.problem.drive import PrepareConfig, prepare_drive
 from sst_graph.problem.graph import GraphConfig, Tracks, associate, joint_graph
@@ -180,6 +181,47 @@ def test_json_reads_back() -> None:
 def test_refuses_other_files(text: str) -> None:
     with pytest.raises(DataError, match=r"marginal\.json"):
         CalibrationMarginal.from_json(text)
+
+
+def _changed(path: tuple[str, ...], value: object) -> str:
+    document = json.loads(marginal(6).to_json())
+    holder = document
+    for key in path[:-1]:
+        holder = holder[key]
+    holder[path[-1]] = value
+    return json.dumps(document)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (("information",), np.full((7, 7), 1e308).tolist(), "entries of at most"),
+        (("information",), (-np.eye(7)).tolist(), "on the diagonal"),
+        (("information",), np.triu(np.ones((7, 7))).tolist(), "not symmetric"),
+        (("information",), (np.ones((7, 7)) - 0.5 * np.eye(7)).tolist(), "positive semi-definite"),
+        (("information",), [[None] * 7] * 7, "no numeric array"),
+        (("vector",), [1.0] * 6, r"shape \(6,\)"),
+        (("constant",), "0", "constant: found '0', expected a number"),
+        (("linearization_point",), [], "an object"),
+        (("linearization_point", "time_offset_s"), 1e300, "time offset of at most"),
+        (("linearization_point", "T_camera_lidar"), (2 * np.eye(4)).tolist(), "last row"),
+    ],
+)
+def test_refuses_numbers_that_are_no_marginal(
+    tmp_path: Path, path: tuple[str, ...], value: object, message: str
+) -> None:
+    file = tmp_path / "marginal.json"
+    file.write_text(_changed(path, value))
+    with pytest.raises(DataError, match=rf"marginal\.json.*{message}"):
+        read_marginal(file)
+
+
+def test_reads_a_file(tmp_path: Path) -> None:
+    (tmp_path / "marginal.json").write_text(marginal(6).to_json())
+    found = read_marginal(tmp_path / "marginal.json")
+    np.testing.assert_array_equal(found.information, marginal(6).information)
+    with pytest.raises(DataError, match="no such file"):
+        read_marginal(tmp_path / "nothing.json")
 
 
 def test_fusing_two_drives_equals_the_joint_batch() -> None:

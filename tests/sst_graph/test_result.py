@@ -150,6 +150,53 @@ def test_malformed_file(tmp_path: Path, changes: dict[str, Any], message: str) -
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
+def _covariance(i: int, j: int, value: float) -> list[list[float]]:
+    P = np.diag([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03, 0.004]) ** 2
+    P[i, j] = P[j, i] = value
+    return [[float(entry) for entry in row] for row in P]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"covariance": np.zeros((7, 7)).tolist()}, "covariance: found a sigma of 0, expected sigmas"),
+        ({"covariance": _covariance(0, 0, 5e-324)}, "covariance: found a sigma of"),
+        ({"covariance": _covariance(0, 0, 1e308)}, "covariance: found a sigma of 1e\\+154"),
+        ({"covariance": _covariance(0, 1, 1e308)}, "covariance: found a covariance far above|correlation of"),
+        ({"covariance": _covariance(0, 1, 3e-6)}, "covariance: found a correlation of 1.5"),
+        ({"covariance": (np.eye(7) - 0.5 + 0.5 * np.eye(7)).tolist()}, "expected a covariance .positive"),
+        ({"covariance": [["0"] * 7] * 7}, "covariance: found no numeric array"),
+        ({"covariance": [[True] * 7] * 7}, "covariance: found no numeric array"),
+        ({"T_camera_lidar": [[1, 0, 0, 1e9], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}, "a translation of"),
+        ({"T_camera_lidar": np.diag([1e300, 1, 1, 1]).tolist()}, "an entry of 1e\\+300, expected a rotation"),
+        ({"time_offset_s": 1e300}, "time_offset_s: found 1e\\+300 s, expected a time offset of at most"),
+        ({"camera": {**_document()["camera"], "fx": 1e9}}, "fx = 1e\\+09 px, expected a focal length"),
+        ({"camera": {**_document()["camera"], "width": 0}}, "an image of 0x375 px"),
+        ({"camera": {**_document()["camera"], "width": 10**12}}, "an image of 1000000000000x375 px"),
+        ({"camera": {**_document()["camera"], "name": "a\nrostopic: /evil"}}, "without control characters"),
+        ({"camera": {**_document()["camera"], "name": "\x1b[31m"}}, "without control characters"),
+        ({"method": "\u202etniol"}, "method: found .*without control characters"),
+        ({"versions": {"a": 1}}, "versions: a: found 1, expected text"),
+        ({"frames_used": [{"drive": "a\x1b", "frame": 1}]}, "without control characters"),
+    ],
+)
+def test_values_that_no_calibration_has(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        CalibrationResult.from_json(json.dumps(_document(**changes)))
+    assert str(caught.value).isprintable()
+
+
+def test_sentences_of_others_come_on_one_line() -> None:
+    back = CalibrationResult.from_json(json.dumps(_document(reasons=["no motion\nat all\x1b[2J"])))
+    assert back.reasons == (r"no motion at all\x1b[2J",)
+
+
+def test_a_key_given_twice_is_refused() -> None:
+    text = _result().to_json().replace('"method": "joint"', '"method": "joint", "method": "paper"', 1)
+    with pytest.raises(DataError, match="the key 'method' twice"):
+        CalibrationResult.from_json(text)
+
+
 @pytest.mark.parametrize("key", ["T_camera_lidar", "time_offset_s", "covariance", "status", "camera"])
 def test_missing_key(key: str) -> None:
     document = _document()
