@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
         read_as = options_of(args)
         source = open_drive(args, args.data)
         tracker = _tracker(args, source)
-        _track(args, source, tracker)
+        tracker = _track(args, source, tracker)
         tracker.settle()
         result = tracker_result(tracker, source.name, args.camera)
         result = dataclasses.replace(result, read_as=read_as)
@@ -46,14 +46,20 @@ def run(args: argparse.Namespace) -> int:
     return _verdict(tracker.current(), result)
 
 
-def _track(args: argparse.Namespace, source: Source, tracker: Tracker) -> None:
-    """Add the frames that the tracker has not seen, and save it as it goes."""
+def _track(args: argparse.Namespace, source: Source, tracker: Tracker) -> Tracker:
+    """Add the frames that the tracker has not seen, and save it as it goes; the tracker after the last.
+
+    With a checkpoint it is the one that the file holds, its arrays laid out as in the file: the result is the
+    same to the last bit whether the run was broken off and resumed or not.
+    """
     for number, frame in enumerate(_after(source, tracker.window.last_stamp_ns), 1):
         say(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False))
         if args.checkpoint is not None and number % args.checkpoint_every == 0:
             save_checkpoint(tracker, args.checkpoint)
-    if args.checkpoint is not None:
-        save_checkpoint(tracker, args.checkpoint)
+    if args.checkpoint is None:
+        return tracker
+    save_checkpoint(tracker, args.checkpoint)
+    return load_checkpoint(args.checkpoint)
 
 
 def _check(args: argparse.Namespace) -> None:

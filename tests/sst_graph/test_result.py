@@ -14,13 +14,14 @@ import pytest
 from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
 from sst_graph.result import (
+    WALL_CLOCK,
     CalibrationResult,
     DriveOffset,
     FrameId,
     WeakDirection,
     read_result,
 )
-from sst_graph.types import SemanticClass
+from sst_graph.types import Frame, GroundTruth, Scan, SemanticClass
 
 POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.4, -0.2, 1.0), [0.1, -0.2, 0.3])
 
@@ -222,3 +223,42 @@ def test_a_rounded_rotation_is_made_orthonormal() -> None:
     document = _document(T_camera_lidar=np.round(POSE.matrix(), 5).tolist())
     R = CalibrationResult.from_json(json.dumps(document)).T_camera_lidar.rotation().matrix()
     assert pytest.approx(np.eye(3), abs=1e-12) == R @ R.T
+
+
+def test_equal_results_are_equal() -> None:
+    first, second = _result(), _result()
+    assert first == second and hash(first) == hash(second) and len({first, second}) == 1
+    assert first == CalibrationResult.from_json(first.to_json())
+    assert first != _result(time_offset_s=0.1037) and first != "a result"
+    assert first.weak_directions == second.weak_directions and len({*first.weak_directions}) == 1
+    slower = _result(diagnostics={"iterations": 12, WALL_CLOCK: {"estimate": 3.0}})
+    assert slower == first and slower != _result(diagnostics={"iterations": 13})
+
+
+def test_what_frames_and_truths_hold_is_compared() -> None:
+    def scan(x: float) -> Scan:
+        return Scan(1, np.full((2, 3), x, np.float32), np.zeros(2, np.uint8))
+
+    assert scan(1.0) == scan(1.0) != scan(2.0) and hash(scan(1.0)) == hash(scan(1.0))
+    assert Frame(0, scan(np.nan), None) == Frame(0, scan(np.nan), None)
+    assert GroundTruth(POSE, 0.1) == GroundTruth(gtsam.Pose3(POSE.matrix()), 0.1) != GroundTruth(POSE, None)
+
+
+def test_wall_clock_times_are_not_written() -> None:
+    result = _result(diagnostics={"iterations": 12, WALL_CLOCK: {"estimate": 3.0}})
+    assert result.to_json() == _result().to_json()
+
+
+def test_how_the_drives_were_read_is_kept() -> None:
+    read_as = {"image_shift": 1, "frames": None, "camera": "image_2"}
+    assert CalibrationResult.from_json(_result(read_as=read_as).to_json()).read_as == read_as
+    document = _document()
+    del document["read_as"]
+    assert CalibrationResult.from_json(json.dumps(document)).read_as == {}
+
+
+def test_names_that_are_not_unicode_make_a_valid_file(tmp_path: Path) -> None:
+    result = _result(frames_used=(FrameId("stra\udcdfe", 3),), reasons=("ä \ud800",))
+    path = tmp_path / "calibration.json"
+    path.write_bytes(result.to_json().encode("utf-8"))
+    assert read_result(path).frames_used == result.frames_used and "ä" in path.read_text()
