@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from sst_graph.data import open_source
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.problem.align import align_frame
-    from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, Trajectory
+    from sst_graph.problem.alignment_keys import AlignmentKeys, Trajectory
+    from sst_graph.problem.alignment_term import AlignmentTerm
     from sst_graph.problem.incremental_terms import IncrementalTerms
     from sst_graph.problem.rematching import solve_with_terms
     from sst_graph.result import CalibrationResult
@@ -35,10 +36,10 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AlignmentKeys": "sst_graph.problem.alignment_term",
+    "AlignmentKeys": "sst_graph.problem.alignment_keys",
     "AlignmentTerm": "sst_graph.problem.alignment_term",
     "IncrementalTerms": "sst_graph.problem.incremental_terms",
-    "Trajectory": "sst_graph.problem.alignment_term",
+    "Trajectory": "sst_graph.problem.alignment_keys",
     "solve_with_terms": "sst_graph.problem.rematching",
     "CalibrationConfig": "sst_graph.estimators",
     "CalibrationResult": "sst_graph.result",

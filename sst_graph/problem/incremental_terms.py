@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
-from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, TermMatches, TermState
+from sst_graph.problem.alignment_keys import AlignmentKeys
+from sst_graph.problem.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.problem.object_sides import ObjectSides
 from sst_graph.problem.rematching import (
     RematchConfig,

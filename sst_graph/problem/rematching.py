@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from factors.delay import delay_prior
 from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
-from sst_graph.problem.alignment_term import AlignmentKeys, AlignmentTerm, TermMatches
+from sst_graph.problem.alignment_keys import AlignmentKeys
+from sst_graph.problem.alignment_term import AlignmentTerm, TermMatches
 from sst_graph.problem.object_sides import ObjectSides
 
 FloatArray = NDArray[np.float64]

@@ -130,7 +130,7 @@ def match_table(
         side_of,
         frame_of,
         _numbered(np.concatenate(objects)),
-        _views(side_of, frame_of, np.concatenate(moving), np.concatenate(weights) ** 2),
+        views_of(side_of, frame_of, np.concatenate(moving), np.concatenate(weights) ** 2),
     )
 
 
@@ -187,7 +187,7 @@ def flatness_of(weight: float, curvature: float) -> float:
     return weight / curvature if curvature > 0.0 else np.inf
 
 
-def _views(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
+def views_of(sides: IntArray, frames: IntArray, moving: NDArray[np.bool_], weights: FloatArray) -> float:
     """Effective number of views of a side, averaged harmonically: all its standing frames are one view."""
     first = np.unique(frames, return_index=True)[1]
     by_frame = np.asarray(np.bincount(frames, weights), np.float64)

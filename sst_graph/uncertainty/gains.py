@@ -1,15 +1,18 @@
 """What each frame brings to the covariance: by itself, beside all the others, and one after the other.
 
-The covariance of a set of frames is that of :mod:`sst_graph.uncertainty.covariance` over those frames
-alone, matches and error model unchanged: H sums the frames' information with the motion marginalised out,
-the surplus their scores; sides that several frames see keep their shared error. All this under the error
-model alone, without what the answer's covariance takes from leaving objects out.
+Without a frame, the covariance is made anew from all other matches as
+:mod:`sst_graph.uncertainty.covariance` makes it: information, error model, and the objects left out in turn.
+Matches and estimate stay as they are.
+
+The covariance of the frames up to one, and of one by itself, is a sandwich under the error model of all: H
+sums the frames' information with the motion marginalised out, the surplus their scores; sides that several
+frames see keep their shared error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -19,7 +22,14 @@ from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import PairMatches
 from sst_graph.problem.state import State, delay_key, twist_key
 from sst_graph.result import FrameId
-from sst_graph.uncertainty.covariance import ErrorModel, MatchTable, RobustCovariance
+from sst_graph.uncertainty.covariance import (
+    ErrorModel,
+    MatchTable,
+    RobustCovariance,
+    covariance_of,
+    fit_error_model,
+    views_of,
+)
 from sst_graph.uncertainty.frame_information import FrameInformation, positive_part
 from sst_graph.uncertainty.marginal import Unknowns
 
@@ -97,21 +107,46 @@ def frame_gains(
     sums = Sums(
         prior.copy(), np.zeros_like(prior), np.zeros((int(table.sides.max()) + 1, len(prior))), model.side
     )
-    so_far = []
+    before = []
     columns = [_own(unknowns, state, pair) for pair, _ in groups.values()]
     for part, own in zip(parts, columns, strict=True):
         sums.add(part)
-        so_far.append(sums.covariance(own))
+        before.append(sums.covariance(own))
     found = []
     prior_covariance = np.asarray(np.linalg.inv(prior))
-    for (pair, rows), part, own, seen in zip(groups.values(), parts, columns, so_far, strict=True):
-        full = sums.covariance(own)
-        sums.add(part, -1.0)
-        without = sums.covariance(own)
-        sums.add(part)
+    moving = np.concatenate([np.full(len(pair), pair.moved) for pair in pairs])
+    for (pair, rows), part, own, seen in zip(groups.values(), parts, columns, before, strict=True):
+        full, without = (
+            robust.matrix[np.ix_(own, own)],
+            _left_out(robust, sums, part, rows, moving)[np.ix_(own, own)],
+        )
         view = _view(part, prior_covariance, int(own[6]), model.side)
-        found.append(_entry(pair, len(rows), drives, state, view, full, without, seen))
+        so_far = np.diag(seen) / np.diag(sums.covariance(own))
+        found.append(_entry(pair, len(rows), drives, state, view, full, without, so_far))
     return tuple(found)
+
+
+def _left_out(
+    robust: RobustCovariance, sums: Sums, part: FramePart, rows: IntArray, moving: NDArray[np.bool_]
+) -> FloatArray:
+    """(n, n) covariance of a calibration without a frame, its matches as they are.
+
+    The whole of it is made anew from the matches that are left, error model and objects left out in turn
+    included: a frame that contradicts the others widens both, and leaving it out narrows them. ``moving``:
+    (m,) whether the LiDAR moved, for each match.
+    """
+    information = sums.information.copy()
+    information[np.ix_(part.columns, part.columns)] -= part.information
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    scaled = information * np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
+    bread = np.asarray(np.linalg.inv(scaled)) * np.outer(scale, scale)
+    kept = np.delete(np.arange(len(robust.table.r)), rows)
+    if len(kept) == 0:
+        return bread
+    table = robust.table.take(kept)
+    views = views_of(table.sides, table.side_frames, moving[kept], table.root_weights**2)
+    table = replace(table, views=views)
+    return covariance_of(0.5 * (bread + bread.T), table, fit_error_model(table))
 
 
 def _groups(pairs: Sequence[PairMatches]) -> dict[int, tuple[PairMatches, IntArray]]:
@@ -214,6 +249,7 @@ def _entry(
     without: FloatArray,
     so_far: FloatArray,
 ) -> FrameInformation:
+    """``full``, ``without``: (7, 7) covariances; ``so_far``: (7,) variances over those of all frames."""
     drive = drives[pair.drive]
     lPs = np.concatenate([m.alignment.lPs for m in pair.matches.values()])
     us = np.concatenate([m.alignment.pixels[:, 0] for m in pair.matches.values()])
@@ -222,7 +258,7 @@ def _entry(
         FrameId(drive.name, drive.scans[pair.pair.scan].index),
         0.5 * float(_log_det(without) - _log_det(full)) / float(np.log(2.0)),
         np.sqrt(np.maximum(np.diag(without), 0.0)) / sigmas,
-        np.sqrt(np.maximum(np.diag(so_far), 0.0)) / sigmas,
+        np.sqrt(np.maximum(so_far, 0.0)),
         view,
         np.asarray(state.cTl.inverse().AdjointMap() @ pair.motion.c_twist),
         matches,

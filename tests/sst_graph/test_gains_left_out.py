@@ -1,0 +1,64 @@
+"""What a frame is said to bring, against the calibration that is solved again without it."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from scipy.stats import spearmanr
+
+from factors import RobustKernel
+from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.estimators.joint import JointConfig, solve_joint
+from sst_graph.problem.drive import PrepareConfig, prepare_drive
+from sst_graph.problem.graph import Tracks, associate, joint_graph, state_from
+from sst_graph.problem.objects import object_tracks
+from sst_graph.problem.state import State
+from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.covariance import robust_covariance
+from sst_graph.uncertainty.gains import frame_gains
+
+
+def bits(without: np.ndarray, full: np.ndarray) -> float:
+    return float(0.5 * (np.linalg.slogdet(without)[1] - np.linalg.slogdet(full)[1]) / np.log(2.0))
+
+
+def test_bits_agree_with_leaving_the_frame_out() -> None:
+    source = simulate(
+        SimulationConfig(
+            seed=21,
+            frames=42,
+            width=621,
+            height=188,
+            azimuth_limit_deg=55.0,
+            azimuth_step_deg=0.35,
+            vehicle_density=0.25,
+            moving_fraction=0.0,
+            time_offset_s=0.05,
+        )
+    )
+    drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
+    config, objects = JointConfig(), [object_tracks(drive)]
+    tracks, truth = Tracks([drive], objects), State(source.truth.cTl, (0.05,))
+    solution = solve_joint([drive], truth, config, tracks=tracks)
+    frozen = solution.graph, solution.values, solution.pairs, solution.state
+    robust = robust_covariance(*frozen, objects)
+    frames = frame_gains(*frozen, [drive], robust)
+    kernel = RobustKernel("geman_mcclure", config.kernel_px[-1])
+    claimed, found = [], []
+    for pair, frame in zip(solution.pairs, frames, strict=True):
+        state = solution.state
+        for _ in range(2):  # matches and estimate anew, without the frame
+            pairs = associate([drive], tracks, state, kernel, config.graph)
+            rest = [each for each in pairs if each.pair.image != pair.pair.image]
+            graph, values = joint_graph(rest, state, config.graph, truth)
+            values = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+            state = state_from(values, state, rest)
+        again = robust_covariance(graph, values, rest, state, objects).matrix[:7, :7]
+        claimed.append(frame.bits)
+        found.append(bits(again, robust.matrix[:7, :7]))
+    claimed, found = np.array(claimed), np.array(found)
+    assert len(found) >= 40
+    assert spearmanr(claimed, found)[0] > 0.8
+    large = np.abs(found) > 0.1  # a change of all sigmas together by 1 % is 0.1 bit
+    assert large.sum() > 5
+    np.testing.assert_array_equal(np.sign(claimed[large]), np.sign(found[large]))
