@@ -153,7 +153,9 @@ def _repeated(drive: HeldDrive, scans: bool) -> HeldDrive:
 
 
 def _later_images(drive: HeldDrive, frames: int) -> HeldDrive:
-    return drive.with_images_of(drive.frames[frames:])
+    """Every image under the number of one before it; the last scans are left without."""
+    kept = drive.with_images_of(drive.frames[frames:]).frames
+    return replace(drive, frames=(*kept, *(_with(f, image=None) for f in drive.frames[len(kept) :])))
 
 
 def _shuffled(drive: HeldDrive) -> HeldDrive:
@@ -166,9 +168,10 @@ def _nominal(drive: HeldDrive, change: Callable[[gtsam.Pose3], gtsam.Pose3]) -> 
     return replace(drive, nominal=change(drive.nominal))
 
 
-def _degrees_as_radians(cTl: gtsam.Pose3) -> gtsam.Pose3:
-    """roll -90, pitch 0, yaw -90 given to a function that takes radians: Rz(yaw) Ry(pitch) Rx(roll)."""
-    return gtsam.Pose3(gtsam.Rot3.Ypr(0.0, 0.0, -90.0) * gtsam.Rot3.Ypr(-90.0, 0.0, 0.0), cTl.translation())
+def _radians_as_degrees(cTl: gtsam.Pose3) -> gtsam.Pose3:
+    """The camera's yaw -1.57, pitch 0, roll -1.57 in the LiDAR, given to a function that takes degrees."""
+    lRc = gtsam.Rot3.Ypr(*np.radians([-0.5 * np.pi, 0.0, -0.5 * np.pi]))
+    return gtsam.Pose3(lRc.inverse(), cTl.translation())
 
 
 def _in_millimetres(cTl: gtsam.Pose3) -> gtsam.Pose3:
@@ -189,7 +192,7 @@ LIES: dict[str, Lie] = {
     "clouds in camera axes": lambda d, o: d.with_points(_CAMERA_AXES),
     "Tr inverted": lambda d, o: _nominal(d, lambda T: T.inverse()),
     "Tr in mm": lambda d, o: _nominal(d, _in_millimetres),
-    "degrees as radians": lambda d, o: _nominal(d, _degrees_as_radians),
+    "radians as degrees": lambda d, o: _nominal(d, _radians_as_degrees),
     "x flipped": lambda d, o: d.with_points(np.diag([-1.0, 1.0, 1.0])),
     "y flipped": lambda d, o: d.with_points(np.diag([1.0, -1.0, 1.0])),
     "turned by 180 deg": lambda d, o: d.with_points(np.diag([-1.0, -1.0, 1.0])),
@@ -230,7 +233,7 @@ NAMED: dict[str, str] = {
     "clouds in camera axes": "the clouds are in the camera's axes",
     "Tr inverted": "the start (Tr) is inverted",
     "Tr in mm": "the translation of the start (Tr) is in millimetres",
-    "degrees as radians": "degrees that were taken as radians",
+    "radians as degrees": "radians that were taken as degrees",
     "x flipped": "x axis is flipped",
     "y flipped": "mirrored",
     "turned by 180 deg": "the clouds are turned by 180 deg",

@@ -9,7 +9,7 @@ import gtsam
 from sst_graph.diagnosis import cameras, labels, repeats, units
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
-from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored, numberings
+from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.problem.drive import Drive
 from sst_graph.types import SemanticClass
@@ -58,8 +58,6 @@ def likely_causes(
     if given is not None and given.quality > WELL:
         return ()
     cause = best_hypothesis(drive, guess, offset_s, fit, given)
-    if cause is None:
-        cause = numberings(drive, guess, offset_s, fit, given)
     if cause is None and guess is not None:
         cause = wrong_start(guess, fit(drive, None, offset_s))
     if cause is None and (given is None or given.quality < LEAST_QUALITY):

@@ -6,6 +6,7 @@ each time, and how well the labels agree is compared with what they say of the d
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.diagnosis.fit import LEAST_GAIN, LEAST_QUALITY, WELL, Fit, Fitter
+from sst_graph.diagnosis.fit import (
+    LEAST_CONCENTRATION,
+    LEAST_EXPLAINED_GAIN,
+    LEAST_GAIN,
+    LEAST_QUALITY,
+    WELL,
+    Fit,
+    Fitter,
+)
 from sst_graph.diagnosis.poses import start_finding
 from sst_graph.problem.drive import Drive, ScanFeatures
 
@@ -42,6 +51,8 @@ class Hypothesis:
 
 _MOST_SHIFTS = 4
 """Windows of time offsets that are searched before and after the first."""
+_OVERLAP = 0.8
+"""Farther than this share of the drive's length too few scans meet an image."""
 _WINDOW_S = 0.9
 """Width of a window [s]: the search reaches half a second either way."""
 
@@ -50,25 +61,23 @@ def best_hypothesis(
     drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
 ) -> Finding | None:
     """The change under which the labels agree, where they clearly do; None where none helps."""
-    return _best(hypotheses(drive, guess, offset_s), fit, given)
-
-
-def numberings(
-    drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
-) -> Finding | None:
-    """Images that are later or earlier than was searched."""
-    return _best(_shifts(drive, guess, offset_s), fit, given)
+    tried = itertools.chain(hypotheses(drive, guess, offset_s), _shifts(drive, guess, offset_s))
+    return _best(tried, fit, given)
 
 
 def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Finding | None:
-    base = 0.0 if given is None else given.quality
+    base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
         found = fit(hypothesis.drive, hypothesis.guess, hypothesis.offset_s)
-        if found is None or found.quality < max(LEAST_QUALITY, LEAST_GAIN * base):
+        if found is None or found.concentration < LEAST_CONCENTRATION:
+            continue
+        if found.quality < max(LEAST_QUALITY, LEAST_GAIN * base.quality):
+            continue
+        if found.explained < LEAST_EXPLAINED_GAIN * base.explained:
             continue
         if best is None or found.quality > best[0]:
-            before = 0.0 if given is None else 100.0 * given.explained
+            before = 100.0 * base.explained
             evidence = (
                 f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
             )
@@ -83,8 +92,8 @@ def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Findin
 
 def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
     """Time offsets on either side of what was searched, as far as the drive reaches."""
-    period, length = drive.image_period_s, (drive.image_stamps_ns[-1] - drive.image_stamps_ns[0]) * 1e-9
-    windows = min(_MOST_SHIFTS, int(0.6 * length / _WINDOW_S))
+    period, length = drive.image_period_s, (drive.scan_stamps_ns[-1] - drive.scan_stamps_ns[0]) * 1e-9
+    windows = min(_MOST_SHIFTS, int(_OVERLAP * length / _WINDOW_S))
     for window in range(1, windows + 1):
         for sign in (1.0, -1.0):
             shift_s = sign * window * _WINDOW_S
