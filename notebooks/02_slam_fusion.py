@@ -136,6 +136,10 @@ print(alone.status, alone.sigmas())
 # Where an image falls in the trajectory depends on the time offset, matches depend on everything: so they are
 # made at an estimate, everything is optimised, and they are made again. Each image is aligned with the scan
 # before it. Every vehicle has a mask bias of its own about the common one; without, the calibration is worse.
+#
+# This is the loop by hand, for the biases of single vehicles and for visual odometry at the same places.
+# Without these, `sst_graph.AlignmentTerm` with `solve_with_terms` or `IncrementalTerms` does it
+# (docs/slam.md).
 
 # %%
 
