@@ -7,7 +7,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.errors import ConfigError
-from sst_graph.experiments import accuracy, consistency, drives, motion, paper_table, slam, windows
+from sst_graph.experiments import (
+    accuracy,
+    assumptions,
+    consistency,
+    drives,
+    motion,
+    paper_table,
+    slam,
+    windows,
+)
 from sst_graph.problem.drive import Progress
 
 
@@ -31,6 +40,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "accuracy, failures and consistency of the joint method, scenario by scenario",
         accuracy.AccuracyConfig(),
         accuracy.run,
+    ),
+    "assumptions": Experiment(
+        "assumptions broken on purpose: which are found, and what the others do to the answer",
+        assumptions.AssumptionTableConfig(),
+        assumptions.run,
     ),
     "consistency": Experiment(
         "NEES and coverage of the covariance over many short simulated drives",
