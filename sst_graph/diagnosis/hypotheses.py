@@ -62,10 +62,10 @@ def best_hypothesis(
 ) -> Finding | None:
     """The change under which the labels agree, where they clearly do; None where none helps."""
     tried = itertools.chain(hypotheses(drive, guess, offset_s), _shifts(drive, guess, offset_s))
-    return _best(tried, fit, given)
+    return _best(tried, offset_s, fit, given)
 
 
-def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Finding | None:
+def _best(tried: Iterator[Hypothesis], offset_s: float, fit: Fitter, given: Fit | None) -> Finding | None:
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
@@ -82,6 +82,8 @@ def _best(tried: Iterator[Hypothesis], fit: Fitter, given: Fit | None) -> Findin
                 f"undone, {100.0 * found.explained:.0f} % of the outlines meet; as given, {before:.0f} %"
             )
             finding = replace(hypothesis.finding, evidence=evidence)
+            if hypothesis.offset_s != offset_s:
+                finding = replace(finding, evidence=f"{evidence}, time offset {found.offset_s:+.2f} s")
             if hypothesis.start is not None:
                 finding = start_finding(hypothesis.start, found, finding)
             best = found.quality, finding
@@ -97,9 +99,8 @@ def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterato
     for window in range(1, windows + 1):
         for sign in (1.0, -1.0):
             shift_s = sign * window * _WINDOW_S
-            frames, way = round(abs(shift_s) / period), "late" if shift_s > 0.0 else "early"
             finding = Finding(
-                f"the images' numbers or stamps are off: about {frames} frames ({abs(shift_s):.1f} s) {way}",
+                f"the images' numbers or stamps are off by {round(abs(shift_s) / period)} frames or so",
                 "",
                 "compare the first frames of both sensors, or give --image-shift",
             )
@@ -110,7 +111,7 @@ def mirrored(
     drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
 ) -> Finding | None:
     """Clouds or pictures that are mirrored: of all mistakes the one that an answer may survive."""
-    return _best(_mirrorings(drive, guess, offset_s), fit, given)
+    return _best(_mirrorings(drive, guess, offset_s), offset_s, fit, given)
 
 
 def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
