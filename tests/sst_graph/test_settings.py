@@ -256,8 +256,8 @@ def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, m
 
 def test_the_bounds_of_some_settings_end_in_a_result_or_a_typed_error() -> None:
     """A sample of what ``benchmarks/settings_walk.py`` goes through."""
-    quick = [case for case in cases() if not case.settings[-1].startswith(("start.", "semalign.starts"))]
-    chosen = np.random.default_rng(8).choice(len(quick), 10, replace=False)
+    quick = [case for case in cases() if not case.settings[-1].startswith(("start.", "semalign."))]
+    chosen = np.random.default_rng(8).choice(len(quick), 8, replace=False)
     worker = Worker(seconds=60.0, memory_gb=4.0)
     try:
         ends = {quick[i].settings[-1]: worker.run(quick[i]) for i in chosen}
