@@ -4,9 +4,9 @@
 
 Valid tiny files of every kind are mutated (benchmarks/fuzz_mutations.py) and read in a worker process whose
 memory is limited. Right ends are a value, an error of the package (one printable line), and for a command
-exit 0, 2 (one line on stderr) or 3. Wrong are any other exception, more than 5 s (of the processor), more than
-1 GB, a process that dies, and lines of libraries on stderr. ``--kind calibrate`` runs whole calibrations of mutated drives.
-A case is made again from its number: ``--seed 1 --only 4711``.
+exit 0, 2 (one line on stderr) or 3. Wrong are any other exception, more than 5 s (of the processor), more
+than 1 GB, a process that dies, and lines of libraries on stderr. ``--kind calibrate`` runs whole calibrations
+of mutated drives. A case is made again from its number: ``--seed 1 --only 4711``.
 """
 
 from __future__ import annotations
