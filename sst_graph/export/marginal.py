@@ -127,8 +127,8 @@ class CalibrationMarginal(ByValue):
             point.pose("T_camera_lidar"),
             point.offset_s("time_offset_s"),
             _information(table),
-            table.matrix("vector", (7,)),
-            table.number("constant"),
+            _bounded(table, "vector", table.matrix("vector", (7,))),
+            float(_bounded(table, "constant", np.array(table.number("constant")))),
         )
 
 
@@ -139,6 +139,14 @@ def read_marginal(path: str | Path) -> CalibrationMarginal:
         DataError: missing, unreadable or no such file.
     """
     return CalibrationMarginal.from_json(read_text(path, MARGINAL), path)
+
+
+def _bounded(table: JsonTable, key: str, values: FloatArray) -> FloatArray:
+    """Numbers that can be squared and added up."""
+    if np.abs(values).max() > MAX_INFORMATION:
+        place = f"{table.place}: {key}"
+        raise DataError(place, f"{np.abs(values).max():.3g}", f"at most {MAX_INFORMATION:g}")
+    return values
 
 
 def _information(table: JsonTable) -> FloatArray:
