@@ -52,13 +52,18 @@ def _track(args: argparse.Namespace, source: Source, tracker: Tracker) -> Tracke
     With a checkpoint it is the one that the file holds, its arrays laid out as in the file: the result is the
     same to the last bit whether the run was broken off and resumed or not.
     """
+    # A save consolidates the tracker: what is saved already is not saved again.
+    unsaved = args.checkpoint is not None and not args.checkpoint.exists()
     for number, frame in enumerate(_after(source, tracker.window.last_stamp_ns), 1):
         say(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False))
-        if args.checkpoint is not None and number % args.checkpoint_every == 0:
+        unsaved = args.checkpoint is not None
+        if unsaved and number % args.checkpoint_every == 0:
             save_checkpoint(tracker, args.checkpoint)
+            unsaved = False
+    if unsaved:
+        save_checkpoint(tracker, args.checkpoint)
     if args.checkpoint is None:
         return tracker
-    save_checkpoint(tracker, args.checkpoint)
     return load_checkpoint(args.checkpoint)
 
 
