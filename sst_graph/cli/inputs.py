@@ -30,6 +30,8 @@ def open_drive(args: argparse.Namespace, path: Path) -> Source:
         camera=args.camera,
         cloud=args.cloud,
         sweep=args.sweep,
+        sweep_start_deg=args.sweep_start,
+        sweep_stamp=args.sweep_stamp,
     )
 
 

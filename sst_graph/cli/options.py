@@ -278,9 +278,26 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     )
     source.add_argument(
         "--sweep",
-        choices=("auto", "instant", "azimuth"),
+        choices=("auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"),
         default="auto",
-        help="times of the points: stored ones where there are (auto), all at the stamp, or by azimuth",
+        help="times of the points: stored ones where there are, else what the scans tell (auto, default); "
+        "all at the stamp (compensated, or instant); as measured by a scanner that turns, seen from above, "
+        "clockwise (or azimuth) or counterclockwise",
+    )
+    source.add_argument(
+        "--sweep-start",
+        type=float,
+        default=180.0,
+        metavar="DEG",
+        help="with --sweep clockwise or counterclockwise: azimuth at which a turn begins, counter-clockwise "
+        "from forward (default %(default)s: behind)",
+    )
+    source.add_argument(
+        "--sweep-stamp",
+        choices=("forward", "start", "end"),
+        default="forward",
+        help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
+        "forward (default), the turn begins or ends; no data tell it from a time offset",
     )
 
 

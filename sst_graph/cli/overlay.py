@@ -13,6 +13,7 @@ from sst_graph.cli.inputs import open_drive, result_at
 from sst_graph.cli.pictures import overlay, position_of
 from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_write_bytes
+from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.reference import load_initial
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
@@ -26,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     if args.out.exists() and not args.overwrite:
         raise ConfigError(f"{args.out}: exists already (give --overwrite to replace it)")
     result = result_at(args.result)
-    source = open_drive(args, args.data)
+    source = with_sweep_of(open_drive(args, args.data), result.diagnostics)
     position = len(source) // 2 if args.frame is None else position_of(source, args.frame)
     before = _before(args.before, result, source)
     atomic_write_bytes(args.out, png(overlay(source, position, result, before)))

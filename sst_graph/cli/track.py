@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Iterator
@@ -15,7 +16,8 @@ from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
 from sst_graph.files import atomic_write_text
-from sst_graph.result import CalibrationResult
+from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
+from sst_graph.result import CalibrationResult, Status
 from sst_graph.types import Frame, Source
 
 
@@ -24,6 +26,7 @@ def run(args: argparse.Namespace) -> int:
     _check(args)
     source = open_drive(args, args.data)
     tracker = _tracker(args, source)
+    source = with_sweep(source, tracker.config.calibration.sweep)
     done = tracker.window.last_stamp_ns
     for number, frame in enumerate(_after(source, done), 1):
         print(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False), flush=True)
@@ -32,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     if args.checkpoint is not None:
         save_checkpoint(tracker, args.checkpoint)
     tracker.settle()
-    result = tracker_result(tracker, source.name, args.camera)
+    result = _with_decision(tracker_result(tracker, source.name, args.camera), source)
     if args.out is not None:
         atomic_write_text(args.out, result.to_json())
     return _verdict(tracker.current(), result)
@@ -72,8 +75,21 @@ def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
             yield frame
 
 
+def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
+    """The result with what was decided of the sweep; not to be trusted where the scans did not tell it."""
+    decision = source.sweep_decision
+    diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: decision.to_dict()}}
+    result = dataclasses.replace(result, diagnostics=diagnostics)
+    if decision.kind != "undecided" or not decision.others:
+        return result
+    reason = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
+    status: Status = "not_converged" if result.status == "ok" else result.status
+    return dataclasses.replace(result, status=status, reasons=(*result.reasons, reason))
+
+
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
-    if last.status == "ok":
+    if last.status == result.status == "ok":
         return 0
-    print(f"sst-graph: {last.status}: {'; '.join(result.reasons)}", file=sys.stderr)
+    status = result.status if last.status == "ok" else last.status
+    print(f"sst-graph: {status}: {'; '.join(result.reasons)}", file=sys.stderr)
     return 3

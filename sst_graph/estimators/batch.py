@@ -28,7 +28,9 @@ from sst_graph.estimators.joint import JointSolution, agreement, concentration, 
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import WithMotion, with_motion
+from sst_graph.estimators.sweep_effect import SweepEffects, sweep_effects
 from sst_graph.estimators.undersides import with_undersides, without_undersides
+from sst_graph.odometry.sweep import with_sweep
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -95,7 +97,11 @@ def prepare_drives(
         prepare = dataclasses.replace(prepare, use_visual_odometry=False)
     if config.method != "joint" or config.undersides.use == "never":
         prepare = without_undersides(prepare)
-    return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
+    # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
+    return [
+        prepare_drive(with_sweep(source, config.sweep), config.classes, prepare, progress)
+        for source in sources
+    ]
 
 
 def calibrate_prepared(
@@ -149,10 +155,8 @@ def answer_joint(
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
     finals = _finals(drives, tracks, contest, guess, config, progress)
-    evidence = {
-        "explained": explained(finals[0]),
-        "concentration": concentration(finals[0], drives, tracks, config.joint),
-    }
+    evidence = {"explained": explained(finals[0])}
+    evidence["concentration"] = concentration(finals[0], drives, tracks, config.joint)
     # 3. Edges towards the ground, where the labels agree about them.
     best = rivals(finals, guess.cTl, guess.offset_s, config.start)
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
@@ -169,14 +173,19 @@ def answer_joint(
         if config.use_motion == "always":
             by_standing = standing_covariance(robust, solution.pairs)
     model, cTl = robust.model, solution.state.cTl
+    sweeps = _with_sweeps(drives, solution, covariance, config)
     return Answer(
         cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config),
+        sweeps.covariance,
         _frames_used(drives, solution),
         remarks=_remarks(drives),
         by_standing=by_standing[:7, :7],
-        doubts=(*_doubts(solution, finals, covariance, evidence, guess, config), *heard.doubts),
+        doubts=(
+            *_doubts(solution, finals, covariance, evidence, guess, config),
+            *heard.doubts,
+            *sweeps.doubts,
+        ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         diagnostics={
             "outer_iterations": solution.outer_iterations,
@@ -184,10 +193,7 @@ def answer_joint(
             "pairs": len(solution.pairs),
             "start_score": contest.score,
             **evidence,
-            "mask_bias_px": {
-                f"{drives[d].name}:{c.name.lower()}": bias
-                for (d, c), bias in solution.state.biases_px.items()
-            },
+            "mask_bias_px": _mask_biases(drives, solution),
             "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
             "undersides": [c.name.lower() for c in below.joint.graph.undersides],
             "motion": heard.diagnostics,
@@ -195,6 +201,12 @@ def answer_joint(
             FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
         },
     )
+
+
+def _mask_biases(drives: Sequence[Drive], solution: JointSolution) -> dict[str, float]:
+    """Mask bias [px] by drive and class."""
+    biases = solution.state.biases_px.items()
+    return {f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in biases}
 
 
 def _frozen(
@@ -287,6 +299,15 @@ def _doubts(
                 "that explains the labels almost as well: record more varied scenes or give a closer guess"
             )
     return tuple(doubts)
+
+
+def _with_sweeps(
+    drives: Sequence[Drive], solution: JointSolution, covariance: FloatArray, config: CalibrationConfig
+) -> SweepEffects:
+    """The (7, 7) covariance with what no match shows, and doubts about sweeps that nothing tells."""
+    told = covariance[:7, :7] + _beside_matches(drives, solution, float(covariance[6, 6]), config)
+    effects = sweep_effects(solution, drives, told, config.joint)
+    return SweepEffects(effects.doubts, told + effects.covariance)
 
 
 def _beside_matches(

@@ -17,6 +17,7 @@ from sst_graph.errors import DataError
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
@@ -105,6 +106,7 @@ class Drive:
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
+        sweep: what was decided of the times of the points, or None where nobody asked.
     """
 
     name: str
@@ -113,6 +115,7 @@ class Drive:
     images: tuple[ImageFeatures, ...]
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
+    sweep: SweepDecision | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -171,7 +174,8 @@ def prepare_drive(
     if not scans or not images:
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
-    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs))
+    sweep = source.sweep_decision if isinstance(source, SweptSource) else None
+    return Drive(source.name, source.camera, tuple(scans), tuple(images), tuple(motions), tuple(pairs), sweep)
 
 
 def scan_features(

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from sst_graph.errors import ConfigError
 
 Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning", "there_and_back"]
 """Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed;
 ``there_and_back`` goes forward for half of the drive and returns in reverse."""
+SweepSense = Literal["clockwise", "counterclockwise"]
+"""Which way the scanner turns, seen from above."""
+SweepStamp = Literal["forward", "start", "end"]
+"""Which instant of a turn the scan's stamp names."""
+SweepOutput = Literal["times", "raw", "compensated"]
+"""What the data tell of a rolling sweep: the time of each point; the points as measured and no times; the
+points moved to where they lie at the stamp by the true ego motion (moving objects stay as measured)."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +37,13 @@ class SimulationConfig:
         moving_fraction: share of the vehicles around that move, 0 to 0.8.
         truck_fraction: share of trucks among the parked vehicles.
         label_noise: level of the segmentation's imperfection, 0 (exact) to 2.
-        rolling: True: each point is measured at its own time within the sweep (the stamp is the
-            instant at which the laser faces forward); False: the whole scan at its stamp.
+        rolling: True: each point is measured at its own time within the sweep; False: the whole scan at
+            its stamp.
+        sweep_sense: which way the scanner turns.
+        sweep_start_deg: azimuth at which a turn begins and ends, counter-clockwise from forward [deg].
+        sweep_stamp: the instant that a scan's stamp names; of a turn that begins ahead, ``forward`` is its
+            start.
+        sweep_output: what the data tell of a rolling sweep.
         azimuth_limit_deg: points beyond this azimuth, either side of forward, are cut off [deg].
         azimuth_step_deg: nominal angle between two firings of one laser [deg].
         range_noise_m: standard deviation of the range [m].
@@ -58,6 +70,10 @@ class SimulationConfig:
     truck_fraction: float = 0.08
     label_noise: float = 1.0
     rolling: bool = False
+    sweep_sense: SweepSense = "clockwise"
+    sweep_start_deg: float = 180.0
+    sweep_stamp: SweepStamp = "forward"
+    sweep_output: SweepOutput = "times"
     azimuth_limit_deg: float = 180.0
     azimuth_step_deg: float = 0.1728
     range_noise_m: float = 0.02
@@ -66,8 +82,15 @@ class SimulationConfig:
     max_range_m: float = 90.0
 
     def __post_init__(self) -> None:
-        if self.motion not in get_args(Motion):
-            raise ConfigError(f"motion: found {self.motion!r}, expected one of {', '.join(get_args(Motion))}")
+        choices: dict[str, Any] = {
+            "motion": Motion,
+            "sweep_sense": SweepSense,
+            "sweep_stamp": SweepStamp,
+            "sweep_output": SweepOutput,
+        }
+        for name, kind in choices.items():
+            if (choice := getattr(self, name)) not in get_args(kind):
+                raise ConfigError(f"{name}: found {choice!r}, expected one of {', '.join(get_args(kind))}")
         limits: dict[str, tuple[float, float]] = {
             "seed": (0, 2**63 - 1),
             "frames": (1, 100_000),
@@ -82,6 +105,7 @@ class SimulationConfig:
             "moving_fraction": (0.0, 0.8),
             "truck_fraction": (0.0, 1.0),
             "label_noise": (0.0, 2.0),
+            "sweep_start_deg": (-180.0, 180.0),
             "azimuth_limit_deg": (1.0, 180.0),
             "azimuth_step_deg": (0.02, 5.0),
             "range_noise_m": (0.0, 1.0),
@@ -98,3 +122,8 @@ class SimulationConfig:
     def period_s(self) -> float:
         """Time between two frames, and of one sweep [s]."""
         return 1.0 / self.frame_rate_hz
+
+    @property
+    def gives_times(self) -> bool:
+        """Whether the data tell the time of each point."""
+        return self.rolling and self.sweep_output == "times"
