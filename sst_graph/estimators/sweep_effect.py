@@ -18,7 +18,8 @@ from sst_graph.problem.state import EXTRINSIC, delay_key
 FloatArray = NDArray[np.float64]
 
 MATTERS = 0.5
-"""A sweep matters where a hypothesis moves an unknown by more than this share of its sigma."""
+"""A sweep matters where a hypothesis moves an unknown by more than this share of the sigma that is claimed,
+the effect itself included."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,7 @@ def sweep_effects(
             continue
         worst = max(steps, key=lambda step: float((np.abs(step) / sigmas).max()))
         added += np.outer(worst, worst)
-        if float((np.abs(worst) / sigmas).max()) > MATTERS:
+        if float((np.abs(worst) / np.hypot(sigmas, worst)).max()) > MATTERS:
             doubts.append(
                 f"{drive.name}: whether its clouds are compensated for the sweep cannot be told from the "
                 f"scans (share of the sweep in the points {drive.sweep.fraction:+.2f} +- "

@@ -90,6 +90,11 @@ class SimulatedDrive:
         return f"simulated-{self.config.motion}-{self.config.seed}"
 
     @property
+    def sweep(self) -> str:
+        """What the drive tells of its sweep: that the whole scan is taken at once, or nothing."""
+        return "auto" if self.config.rolling else "compensated"
+
+    @property
     def lidar(self) -> Lidar:
         """The sensor."""
         return make_lidar(self.config)

@@ -41,9 +41,9 @@ class SweepConfig:
             slow by leaving scans out [m, rad].
         most_skipped: most scans left out between two of a stretch.
         rest_mps, rest_radps: a vehicle that is nowhere faster stands [m/s, rad/s].
+        travel_m, travel_rad: a stretch tells nothing where the vehicle moves less from its first scan to its
+            last: surfaces are then seen from one side only, with the same errors in every scan [m, rad].
         sigmas: by how many standard deviations the other hypotheses must be worse.
-        surface_m: error of each 3 m of surfaces that their points share, whatever their number; vegetation,
-            edges and the LiDAR's own calibration leave about so much [m].
         tolerance: the estimated share may differ so much from 0 or 1 beside three of its sigmas.
         long_sweep_m: where the vehicle moves farther in a turn, matches made under a wrong hypothesis hold
             themselves up, and all are tried from the start [m].
@@ -59,8 +59,9 @@ class SweepConfig:
     most_skipped: int = 7
     rest_mps: float = 0.1
     rest_radps: float = 0.02
-    sigmas: float = 4.0
-    surface_m: float = 0.015
+    travel_m: float = 3.0
+    travel_rad: float = 0.25
+    sigmas: float = 3.5
     tolerance: float = 0.2
     long_sweep_m: float = 1.0
 
@@ -155,7 +156,8 @@ def decide_sweep(
     if max(_worth(place, config) for place in places) < 1.0:
         return SweepDecision("standing", timing, speed_mps=max(place.speed_mps for place in places))
     places = sorted(places, key=lambda place: _rank(place, period_s, config))
-    decision = SweepDecision("undecided", timing)
+    both = tuple(replace(timing, fraction=f) for f in (-1.0, 1.0))
+    decision = SweepDecision("undecided", timing, others=both)
     windows: list[Window] = []
     used: list[int] = []
     for place in places:
@@ -165,7 +167,10 @@ def decide_sweep(
         scans = [(k, scan) for k in positions if (scan := scan_at(k)) is not None]
         if len(scans) < 3:
             continue
-        windows.append(Window([scan for _, scan in scans], period_s, config.window))
+        window = Window([scan for _, scan in scans], period_s, config.window)
+        if window.travel[0] < config.travel_m and window.travel[1] < config.travel_rad:
+            continue
+        windows.append(window)
         used += [k for k, _ in scans]
         decision = replace(_decided(windows, timing, config), frames=tuple(sorted(set(used))))
         _LOG.info("sweep: %s", decision.sentence)
@@ -233,7 +238,8 @@ def _judged(
     # One error model for all comparisons: the larger of those for the two best hypotheses' starts.
     starts = {name: int(np.argmin(cost)) for name, cost in costs.items() if name != "compensated"}
     unit = max(
-        found.variance(windows, sector, config.surface_m) for sector in {*starts.values(), found.sector}
+        found.variance(windows, sector, config.window.surface_m)
+        for sector in {*starts.values(), found.sector}
     )
     unit = max(unit, 1e-12)
     least = {name: _marginal(cost, unit) for name, cost in costs.items()}

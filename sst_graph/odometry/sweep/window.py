@@ -47,7 +47,10 @@ class WindowConfig:
         gaps: scans are matched with those so many places later.
         gates_m: farthest match, pass by pass; the last one stays [m].
         scales_m: scale of the robust kernel, pass by pass; the last one stays [m].
-        cell_m: errors are taken as independent from one cell of the ground plan to the next [m].
+        cell_m: edge of the cells of the ground plan; level surfaces of one cell share an error, and so do all
+            its others; errors are independent from cell to cell [m].
+        surface_m: that error: what vegetation, edges, sparse rings and the LiDAR's own calibration leave,
+            whatever the number of points [m].
         movers: which objects of movable classes stand.
         passes: most times that matches are made anew.
     """
@@ -64,6 +67,7 @@ class WindowConfig:
     gates_m: tuple[float, ...] = (1.0, 0.8, 0.6, 0.5, 0.4)
     scales_m: tuple[float, ...] = (0.4, 0.3, 0.2, 0.12, 0.08)
     cell_m: float = 3.0
+    surface_m: float = 0.005
     movers: MoverConfig = field(default_factory=lambda: MoverConfig(slack_m=0.3))
     passes: int = 12
 
@@ -153,6 +157,15 @@ class Window:
             kept[np.flatnonzero(movable[k])[stands]] = True
             found.append(points[kept])
         return found
+
+    @property
+    def travel(self) -> tuple[float, float]:
+        """Distance and turn from first scan to last [m, rad]; 0 where some could not be registered."""
+        if not self.ok:
+            return 0.0, 0.0
+        step = gtsam.Pose3(self._poses[0]).between(gtsam.Pose3(self._poses[-1]))
+        turn = np.linalg.norm(gtsam.Rot3.Logmap(step.rotation()))
+        return float(np.linalg.norm(step.translation())), float(turn)
 
     @property
     def twists(self) -> FloatArray:
@@ -254,8 +267,10 @@ class Window:
             surfaces = self._surfaces[scan]
             of_times[:, 0] += per_turn * (turned(surfaces.azimuths[index], -np.pi) - 0.5)
             of_times[row, 1 + surfaces.sectors[index]] += per_turn
+        level = np.abs(normals[:, 2]) > _LEVEL
         cells = np.floor(wAs[:, :2] / self.config.cell_m).astype(np.int64) + 2**20
-        return _Rows((a, b), residuals, weights, of_poses, of_times, cells[:, 0] * 2**22 + cells[:, 1])
+        number = 2 * (cells[:, 0] * 2**22 + cells[:, 1]) + level
+        return _Rows((a, b), residuals, weights, of_poses, of_times, number)
 
     def _eliminated(self) -> Normal:
         """Normal equations of all rows with the poses, of which the first stays, eliminated."""
@@ -306,10 +321,12 @@ def _surfaces(points: FloatArray, config: WindowConfig) -> _Surfaces:
 def _varied(normals: FloatArray, most: int) -> IndexArray:
     """Of patches with normals (n, 3): at most so many of each direction, level ones being one more."""
     way = np.mod(np.arctan2(normals[:, 1], normals[:, 0]), np.pi) / np.pi * _WAYS
-    way = np.where(np.abs(normals[:, 2]) > 0.8, _WAYS, np.minimum(way.astype(np.intp), _WAYS - 1))
+    way = np.where(np.abs(normals[:, 2]) > _LEVEL, _WAYS, np.minimum(way.astype(np.intp), _WAYS - 1))
     return np.concatenate([_spread(way == k, most) for k in range(_WAYS + 1)])
 
 
+_LEVEL = 0.8
+"""A surface whose normal's height is more than this is level."""
 _WAYS = 12
 """Directions of normals in the horizontal plane that are told apart."""
 
