@@ -18,8 +18,7 @@ from sst_graph.problem.state import EXTRINSIC, delay_key
 FloatArray = NDArray[np.float64]
 
 MATTERS = 0.5
-"""A sweep matters where a hypothesis moves an unknown by more than this share of the sigma that is claimed,
-the effect itself included."""
+"""A sweep matters where it makes up more than this share of the sigma that is claimed for an unknown."""
 
 
 @dataclass(frozen=True)
@@ -35,22 +34,24 @@ def sweep_effects(
 ) -> SweepEffects:
     """The effect of every sweep that the scans did not tell, one drive at a time.
 
+    The covariance is the mean square of the changes under the hypotheses, by their probability.
+
     covariance: (7, 7) of the answer, without it.
     """
-    doubts, added, sigmas = [], np.zeros((7, 7)), np.sqrt(np.diag(covariance))
+    doubts, added = [], np.zeros((7, 7))
     for number, drive in enumerate(drives):
-        if drive.sweep is None or drive.sweep.kind != "undecided":
+        sweep = drive.sweep
+        if sweep is None or sweep.kind != "undecided" or not sweep.others:
             continue
-        steps = [sweep_step(solution, {number: timing}, config) for timing in drive.sweep.others]
-        if not steps:
-            continue
-        worst = max(steps, key=lambda step: float((np.abs(step) / sigmas).max()))
-        added += np.outer(worst, worst)
-        if float((np.abs(worst) / np.hypot(sigmas, worst)).max()) > MATTERS:
+        steps = {timing.fraction: sweep_step(solution, {number: timing}, config) for timing in sweep.others}
+        effect = sum(sweep.shares[fraction] * np.outer(step, step) for fraction, step in steps.items())
+        added += effect
+        if np.sqrt(np.diag(effect) / np.diag(covariance + effect)).max() > MATTERS:
+            worst = max(steps.values(), key=lambda step: float((step**2 / np.diag(covariance)).max()))
             doubts.append(
                 f"{drive.name}: whether its clouds are compensated for the sweep cannot be told from the "
-                f"scans (share of the sweep in the points {drive.sweep.fraction:+.2f} +- "
-                f"{drive.sweep.sigma:.2f}), and it matters: {np.degrees(np.linalg.norm(worst[:3])):.2f} deg, "
+                f"scans (share of the sweep in the points {sweep.fraction:+.2f} +- {sweep.sigma:.2f}), and "
+                f"it matters: {np.degrees(np.linalg.norm(worst[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(worst[3:6]):.1f} cm, {1e3 * abs(worst[6]):.1f} ms; {REMEDY}"
             )
     return SweepEffects(tuple(doubts), added)

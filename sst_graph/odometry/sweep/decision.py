@@ -93,6 +93,18 @@ class SweepDecision:
     others: tuple[SweepTiming, ...] = ()
 
     @property
+    def shares(self) -> dict[float, float]:
+        """Probability of each hypothesis, by its fraction; sigmas are taken as twice as large as claimed, for
+        a hypothesis that the scans leave open is one that their error model does not settle.
+        """
+        weights = {
+            fraction: float(np.exp(-0.5 * (0.5 * self.worse_by.get(name, 0.0)) ** 2))
+            for name, fraction in FRACTIONS.items()
+        }
+        total = sum(weights.values())
+        return {fraction: weight / total for fraction, weight in weights.items()}
+
+    @property
     def sentence(self) -> str:
         """The decision in words."""
         share = f"share of the sweep in the points {self.fraction:+.2f} +- {self.sigma:.2f}"
@@ -233,48 +245,48 @@ def _decided(windows: Sequence[Window], timing: SweepTiming, config: SweepConfig
 def _judged(
     windows: Sequence[Window], found: Estimate, timing: SweepTiming, config: SweepConfig
 ) -> SweepDecision:
+    """The three hypotheses by their evidence, that of compensated points being 1."""
     quadratic = found.quadratic
-    costs: dict[str, FloatArray] = {name: quadratic.cost(f) for name, f in FRACTIONS.items()}
-    # One error model for all comparisons: the larger of those for the two best hypotheses' starts.
-    starts = {name: int(np.argmin(cost)) for name, cost in costs.items() if name != "compensated"}
-    unit = max(
-        found.variance(windows, sector, config.window.surface_m)
-        for sector in {*starts.values(), found.sector}
-    )
-    unit = max(unit, 1e-12)
-    least = {name: _marginal(cost, unit) for name, cost in costs.items()}
-    best = min(least, key=lambda name: least[name])
-    worse = {name: float(np.sqrt(max(0.0, 2.0 * (least[name] - least[best]) / unit))) for name in least}
-    sigma = float(np.sqrt(unit / max(quadratic.curvature[found.sector], 1e-12)))
-    sector, told = _start(costs[best], unit) if best != "compensated" else (0, False)
+    units = found.units(windows, config.window.surface_m)
+    costs: dict[str, FloatArray] = {name: quadratic.cost(f) / units for name, f in FRACTIONS.items()}
+    evidence = {name: _log_mean(-cost) for name, cost in costs.items()}
+    best = max(evidence, key=lambda name: evidence[name])
+    worse = {name: float(np.sqrt(2.0 * (evidence[best] - evidence[name]))) for name in evidence}
     excluded = {name for name in worse if worse[name] > config.sigmas}
+    starts = {name: _start(costs[name]) for name in worse}
+    sector, told = starts[best] if best != "compensated" else (found.sector, False)
+    share = float(quadratic.free()[sector])
+    sigma = float(np.sqrt(units[sector] / max(quadratic.curvature[sector], 1e-12)))
+    agrees = abs(share - FRACTIONS[best]) < config.tolerance + 3.0 * sigma
+    decided = len(excluded) == 2 and agrees
     timings = {
-        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(_start(costs[name], unit)[0]))
-        for name in worse
+        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0])) for name in worse
     }
-    share = quadratic.free()[sector if best != "compensated" else found.sector]
-    off = abs(share - FRACTIONS[best])
-    decided = len(excluded) == 2 and off < config.tolerance + 3.0 * sigma
     kind = cast(SweepKind, best if decided else "undecided")
-    used = timings[best] if decided else timing
-    others = () if decided else tuple(timings[name] for name in worse if name not in excluded or name == best)
+    others = [timings[name] for name in worse if name not in excluded or not agrees]
     return SweepDecision(
-        kind, used, float(share), sigma, worse, told, others=tuple(t for t in others if not t.instant)
+        kind,
+        timings[best] if decided and best != "compensated" else timing,
+        share,
+        sigma,
+        worse,
+        told,
+        others=() if decided else tuple(other for other in others if not other.instant),
     )
 
 
-def _marginal(costs: FloatArray, unit: float) -> float:
-    """Cost of a hypothesis whose turn may begin anywhere: the best start's, and more the fewer starts fit."""
-    least = float(costs.min())
-    return least - unit * float(np.log(np.mean(np.exp(-(costs - least) / unit))))
+def _log_mean(values: FloatArray) -> float:
+    """log(mean(exp(values)))."""
+    most = float(values.max())
+    return most + float(np.log(np.mean(np.exp(values - most))))
 
 
-def _start(costs: FloatArray, unit: float) -> tuple[int, bool]:
-    """Sector at whose border a turn begins, and whether the costs (SECTORS,) tell it.
+def _start(costs: FloatArray) -> tuple[int, bool]:
+    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [1/2 sigma^2] tell it.
 
     Of starts that fit equally well (no points between them) the one in the middle of the widest run.
     """
-    alike = 2.0 * (costs - costs.min()) / unit < 4.0
+    alike = 2.0 * (costs - costs.min()) < 4.0
     if alike.all():
         return 0, False
     first = int(np.flatnonzero(alike & ~np.roll(alike, 1))[0])

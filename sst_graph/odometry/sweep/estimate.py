@@ -75,17 +75,19 @@ class Estimate:
     normals: tuple[Normal, ...]
     misfit: float
 
-    def variance(self, windows: Sequence[Window], sector: int, surface_m: float) -> float:
-        """Of the share of a turn that begins at a sector's border, in units of its cost's curvature [m^2].
+    def units(self, windows: Sequence[Window], surface_m: float) -> FloatArray:
+        """(SECTORS,) what a cost of 1/2 sigma^2 is, for turns that begin at each sector's border [m^2].
 
-        Cluster-robust over the cells of the ground plan, with ``surface_m`` of error of its own for each.
+        Cluster-robust over the cells of the ground plan, with ``surface_m`` of error of its own for each; at
+        least what the residuals themselves say.
         """
-        column = CANDIDATES[sector]
-        total = 0.0
+        total = np.zeros(SECTORS)
         for window, normal in zip(windows, self.normals, strict=True):
-            score, lever = window.scores(column, normal)
-            total += float((score**2).sum() + surface_m**2 * (lever**2).sum())
-        return total / max(float(self.quadratic.curvature[sector]), 1e-12)
+            score, lever = window.scores(CANDIDATES.T, normal)
+            total += (score**2).sum(axis=0) + surface_m**2 * (lever**2).sum(axis=0)
+        squares, weights = np.sum([window.squares for window in windows], axis=0)
+        least = squares / max(weights, 1e-9)
+        return np.maximum(total / np.maximum(self.quadratic.curvature, 1e-12), max(least, 1e-12))
 
 
 def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> Estimate:

@@ -209,23 +209,33 @@ class Window:
             for pose, step in zip(self._poses, steps, strict=True)
         ]
 
-    def scores(self, column: FloatArray, normal: Normal) -> tuple[FloatArray, FloatArray]:
-        """By cell of the ground plan: score of a direction (1 + SECTORS,) of the times, the poses eliminated,
-        and what an error of 1 m of the cell's surfaces adds to it.
+    def scores(self, columns: FloatArray, normal: Normal) -> tuple[FloatArray, FloatArray]:
+        """(cells, k) each: by cell of the ground plan the score of directions (1 + SECTORS, k) of the times,
+        the poses eliminated, and what an error of 1 m of the cell's surfaces adds to it.
         """
-        step = normal.back[0] @ column
+        step = normal.back[0] @ columns
         levers = []
         for rows in self._rows:
             a, b = rows.scans
-            own = rows.of_times @ column
-            own = own + rows.of_poses[:, :6] @ step[6 * a : 6 * a + 6]
-            levers.append(rows.weights * (own + rows.of_poses[:, 6:] @ step[6 * b : 6 * b + 6]))
+            own = rows.of_times @ columns
+            own += rows.of_poses[:, :6] @ step[6 * a : 6 * a + 6]
+            own += rows.of_poses[:, 6:] @ step[6 * b : 6 * b + 6]
+            levers.append(rows.weights[:, None] * own)
         lever = np.concatenate(levers)
         residual = np.concatenate([rows.residuals for rows in self._rows])
-        _, number = np.unique(np.concatenate([rows.cells for rows in self._rows]), return_inverse=True)
-        number = number.reshape(-1)
-        score, own = (np.bincount(number, part).astype(np.float64) for part in (lever * residual, lever))
-        return score, own
+        cells = np.concatenate([rows.cells for rows in self._rows])
+        order = np.argsort(cells, kind="stable")
+        ordered = cells[order]
+        first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+        lever = lever[order]
+        score = np.add.reduceat(lever * residual[order][:, None], first, axis=0)
+        return score, np.add.reduceat(lever, first, axis=0)
+
+    @property
+    def squares(self) -> tuple[float, float]:
+        """Weighted sum of squared residuals [m^2], and of weights."""
+        total = sum(float((rows.weights * rows.residuals**2).sum()) for rows in self._rows)
+        return total, sum(float(rows.weights.sum()) for rows in self._rows)
 
     def misfit(self, scale: float) -> float:
         """Mean robust misfit of the points asked about, 0 (all on a surface) to 1 (none near one)."""
