@@ -1,4 +1,4 @@
-"""The sweep, decided from the scans: its model, the registration behind it, the calibration after it."""
+"""The sweep, decided from the scans: its model, the registration behind it, sources that carry it."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
 
-from sst_graph import CalibrationConfig, calibrate, open_source
+from sst_graph import open_source
 from sst_graph.cli import main
 from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.errors import ConfigError
@@ -25,7 +24,6 @@ from sst_graph.odometry.sweep import (
     with_sweep,
     with_sweep_of,
 )
-from sst_graph.report import summary
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Scan
 
@@ -263,24 +261,6 @@ def test_a_result_tells_the_sweep_and_pictures_follow_it() -> None:
     for broken in ({}, {SWEEP_KEY: 3}, {SWEEP_KEY: {drive.name: {"timing": {"fraction": "x"}}}}):
         plain = with_sweep_of(drive, broken)[0].scan
         assert plain is not None and plain.offsets_s is None
-
-
-def test_a_raw_street_is_calibrated_as_with_times() -> None:
-    config = replace(STREET, motion="mixed", frames=20, azimuth_step_deg=0.3, time_offset_s=0.05)
-    errors = {}
-    for output in ("times", "raw"):
-        drive = simulate(replace(config, sweep_output=output))  # type: ignore[arg-type]
-        result = calibrate(drive, drive.truth.cTl, CalibrationConfig())
-        errors[output] = np.append(
-            gtsam.Pose3.Logmap(drive.truth.cTl.between(result.T_camera_lidar)), result.time_offset_s - 0.05
-        )
-        entry = result.diagnostics[SWEEP_KEY][drive.name]
-        assert entry["kind"] == ("clockwise" if output == "raw" else "given")
-        assert ("as measured, clockwise" in summary(result)) == (output == "raw")
-    # The model's times are the true ones, so that the answers agree far better than either errs.
-    apart = np.abs(errors["raw"] - errors["times"])
-    assert np.degrees(np.linalg.norm(apart[:3])) < 0.02
-    assert np.linalg.norm(apart[3:6]) < 0.003 and apart[6] < 0.5e-3
 
 
 def test_the_command_line_knows_both_senses(tmp_path: Path) -> None:
