@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -46,6 +46,8 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
             for drive in result.drive_offsets
         ),
     ]
+    sweeps = _sweeps(result)
+    rows += [("sweep" if k == 0 else "", text) for k, text in enumerate(sweeps)]
     if result.initial is not None:
         rows.append(("moved", _moved(result, result.initial)))
     if comparison is not None:
@@ -112,6 +114,18 @@ def _frames(result: CalibrationResult) -> str:
     return f"{frames} frame{'s' * (frames != 1)} of {many} drive{'s' * (many != 1)}" + (
         f" ({', '.join(drives)})" if drives else ""
     )
+
+
+def _sweeps(result: CalibrationResult) -> list[str]:
+    """By drive: whether its points are as measured, and how that is known; where it was decided."""
+    found = result.diagnostics.get("sweep", {})
+    entries = found.items() if isinstance(found, Mapping) else ()
+    decided = [(drive, entry) for drive, entry in entries if isinstance(entry, Mapping)]
+    decided = [(drive, entry) for drive, entry in decided if entry.get("kind", "given") != "given"]
+    return [
+        f"{drive}: {entry.get('sentence', '')}" if len(decided) > 1 else str(entry.get("sentence", ""))
+        for drive, entry in decided
+    ]
 
 
 def _matrix_rows(pose: gtsam.Pose3) -> list[str]:

@@ -284,7 +284,7 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     return experiment
 
 
-SOURCE_DEFAULTS: dict[str, str | int | None] = {
+SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
     "loader": "auto",
     "sequence": None,
     "frames": None,
@@ -292,6 +292,8 @@ SOURCE_DEFAULTS: dict[str, str | int | None] = {
     "cloud": "velodyne",
     "image_shift": 0,
     "sweep": "auto",
+    "sweep_start_deg": 180.0,
+    "sweep_stamp": "forward",
 }
 """How a drive is read where neither the command line nor a result says it. The parser leaves these options
 None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
@@ -313,8 +315,23 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     )
     source.add_argument(
         "--sweep",
-        choices=("auto", "instant", "azimuth"),
-        help="times of the points: stored ones where there are (auto), all at the stamp, or by azimuth",
+        choices=("auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"),
+        help="times of the points: stored ones where there are, else what the scans tell (auto, default); "
+        "all at the stamp (compensated, or instant); as measured by a scanner that turns, seen from above, "
+        "clockwise (or azimuth) or counterclockwise",
+    )
+    source.add_argument(
+        "--sweep-start-deg",
+        type=float,
+        metavar="DEG",
+        help="with --sweep clockwise or counterclockwise: azimuth at which a turn begins, counter-clockwise "
+        "from forward (default 180: behind)",
+    )
+    source.add_argument(
+        "--sweep-stamp",
+        choices=("forward", "start", "end"),
+        help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
+        "forward (default), the turn begins or ends; no data tell it from a time offset",
     )
 
 

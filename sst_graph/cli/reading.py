@@ -138,7 +138,7 @@ def _stored_in(path: Path) -> Mapping[str, Any]:
     return stored if isinstance(stored, dict) else {}
 
 
-def _given(args: argparse.Namespace, name: str, default: str | int | None) -> Any:
+def _given(args: argparse.Namespace, name: str, default: str | int | float | None) -> Any:
     value = getattr(args, name)
     return default if value is None else value
 

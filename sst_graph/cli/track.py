@@ -19,7 +19,8 @@ from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
 from sst_graph.files import output_file
-from sst_graph.result import CalibrationResult
+from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
+from sst_graph.result import CalibrationResult, Status
 from sst_graph.types import Frame, Source
 
 
@@ -37,9 +38,10 @@ def run(args: argparse.Namespace) -> int:
         read_as = options_of(args)
         source = open_drive(args, args.data)
         tracker = _tracker(args, source)
+        source = with_sweep(source, tracker.config.calibration.sweep)
         tracker = _track(args, source, tracker)
         tracker.settle()
-        result = tracker_result(tracker, source.name, args.camera)
+        result = _with_decision(tracker_result(tracker, source.name, args.camera), source)
         result = dataclasses.replace(result, read_as=read_as)
         if out is not None:
             out.write_text(result.to_json())
@@ -104,8 +106,21 @@ def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
             yield frame
 
 
+def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
+    """The result with what was decided of the sweep; not to be trusted where the scans did not tell it."""
+    decision = source.sweep_decision
+    diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: decision.to_dict()}}
+    result = dataclasses.replace(result, diagnostics=diagnostics)
+    if decision.kind != "undecided" or not decision.others:
+        return result
+    reason = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
+    status: Status = "not_converged" if result.status == "ok" else result.status
+    return dataclasses.replace(result, status=status, reasons=(*result.reasons, reason))
+
+
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
-    if last.status == "ok":
+    if last.status == result.status == "ok":
         return 0
-    complain(f"{last.status}: {'; '.join(result.reasons)}")
+    status = result.status if last.status == "ok" else last.status
+    complain(f"{status}: {'; '.join(result.reasons)}")
     return 3

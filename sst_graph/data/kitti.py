@@ -28,9 +28,10 @@ from sst_graph.data.calib import read_calibration
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
 from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
 from sst_graph.data.kitti_truth import drive_truth
-from sst_graph.data.scan_order import rings_from_order, sweep_offsets_s
-from sst_graph.data.source import Loader, SourceOptions, Sweep
+from sst_graph.data.scan_order import rings_from_order
+from sst_graph.data.source import TURNS, Loader, SourceOptions, Sweep
 from sst_graph.errors import ConfigError, printable
+from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.timestamps import read_times
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
@@ -57,6 +58,8 @@ class KittiSource:
         image_shift: frame k shows image k + image_shift.
         encoding: of the masks.
         sweep: how per-point times are found.
+        sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
+        timing: times by azimuth, where ``sweep`` names a sense of rotation.
     """
 
     name: str
@@ -70,6 +73,8 @@ class KittiSource:
     image_shift: int
     encoding: MaskEncoding
     sweep: Sweep
+    sweep_stamp: SweepStamp = "forward"
+    timing: SweepTiming | None = None
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -124,8 +129,8 @@ class KittiSource:
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
     ) -> NDArray[np.float32] | None:
-        if self.sweep == "azimuth":
-            return sweep_offsets_s(points, float(np.median(np.diff(self.stamps_ns))) * 1e-9)
+        if self.timing is not None:
+            return self.timing.offsets_s(points)
         if self.sweep == "auto" and self.files.point_times is not None:
             return read_offsets(self.files.point_times[index], used)
         return None
@@ -170,8 +175,8 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
     nominal = calibration.cTl(options.camera)
     stamps_ns = read_times(folder / "times.txt")
     files = find_files(folder, options.camera, options.cloud, len(stamps_ns))
-    if options.sweep == "azimuth" and len(stamps_ns) < 2:
-        raise ConfigError("sweep 'azimuth': the period of a turn needs two stamps or more")
+    if options.sweep in TURNS and len(stamps_ns) < 2:
+        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
     indices = _select(files, options, len(stamps_ns))
     size = picture_size(next(iter(files.images.values())))
     if missing := files.missing():
@@ -190,7 +195,17 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
         image_shift=options.image_shift,
         encoding=_encoding(files, options, size),
         sweep=options.sweep,
+        sweep_stamp=options.sweep_stamp,
+        timing=_timing(options, stamps_ns),
     )
+
+
+def _timing(options: SourceOptions, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
+    """Times by azimuth where the options name a sense of rotation."""
+    if options.sweep not in TURNS:
+        return None
+    start_rad, period_s = np.radians(options.sweep_start_deg), float(np.median(np.diff(stamps_ns))) * 1e-9
+    return SweepTiming(TURNS[options.sweep], float(start_rad), period_s, options.sweep_stamp)
 
 
 def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""What the order of the points in a spinning scanner's file tells: laser numbers and times."""
+"""What the order of the points in a spinning scanner's file tells: laser numbers."""
 
 from __future__ import annotations
 
@@ -49,20 +49,6 @@ def rings_from_order(points: NDArray[np.float32]) -> NDArray[np.uint16] | None:
         if explained > best_explained:
             best, best_explained = rings, explained
     return None if best is None else best.astype(np.uint16)
-
-
-def sweep_offsets_s(points: NDArray[np.float32], period_s: float) -> NDArray[np.float32]:
-    """Time (n,) [s] of each point relative to the stamp, for an uncompensated sweep (KITTI's).
-
-    The scanner turns clockwise seen from above and is stamped when it faces forward (+x):
-    offset = -azimuth / (2 pi) * period, from +period/2 behind on the left ... to the right.
-
-    Args:
-        points: (n, 3) LiDAR frame [m].
-        period_s: duration of one turn [s].
-    """
-    azimuth = np.arctan2(points[:, 1].astype(np.float64), points[:, 0].astype(np.float64))
-    return (azimuth * (-period_s / (2.0 * np.pi))).astype(np.float32)
 
 
 def _modulo_turn(angle: Any) -> Any:

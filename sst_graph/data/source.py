@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import Source
 
-Sweep = Literal["auto", "instant", "azimuth"]
+Sweep = Literal["auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"]
 LabelEncoding = Literal["auto", "ids", "trainids"]
 
-SWEEPS: tuple[Sweep, ...] = ("auto", "instant", "azimuth")
+SWEEPS: tuple[Sweep, ...] = get_args(Sweep)
+TURNS = {"clockwise": -1.0, "azimuth": -1.0, "counterclockwise": 1.0}
+"""Share of the sweep in the points, as :class:`~sst_graph.sweep_timing.SweepTiming` counts it."""
 LABEL_ENCODINGS: tuple[LabelEncoding, ...] = ("auto", "ids", "trainids")
 
 
@@ -28,9 +31,12 @@ class SourceOptions:
         camera: name of the camera, "image_2".
         cloud: name of the folder that holds the scans.
         label_encoding: how mask numbers are to be read; "auto" decides over several masks.
-        sweep: "auto" uses per-point times where the data has them, "instant" ignores them,
-            "azimuth" derives them from the azimuth (uncompensated clockwise sweep, stamped when
-            the scanner faces forward).
+        sweep: "auto" uses the points' times where the data have them; where not, a calibration decides from
+            the scans. "compensated" (or "instant"): all points share the stamp, stored times are ignored.
+            "clockwise" (or "azimuth"), "counterclockwise": points as measured by a scanner that turns that
+            way, seen from above; their times follow from their azimuths.
+        sweep_start_deg: for these, the azimuth at which a turn begins, counter-clockwise from forward [deg].
+        sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
     """
 
     sequence: str | None = None
@@ -40,12 +46,18 @@ class SourceOptions:
     cloud: str = "velodyne"
     label_encoding: LabelEncoding = "auto"
     sweep: Sweep = "auto"
+    sweep_start_deg: float = 180.0
+    sweep_stamp: SweepStamp = "forward"
 
     def __post_init__(self) -> None:
         if self.label_encoding not in LABEL_ENCODINGS:
             raise ConfigError(f"label encoding {self.label_encoding!r}: expected one of {LABEL_ENCODINGS}")
         if self.sweep not in SWEEPS:
             raise ConfigError(f"sweep {self.sweep!r}: expected one of {SWEEPS}")
+        if self.sweep_stamp not in get_args(SweepStamp):
+            raise ConfigError(f"sweep stamp {self.sweep_stamp!r}: expected one of {get_args(SweepStamp)}")
+        if not -360.0 <= self.sweep_start_deg <= 360.0:
+            raise ConfigError(f"sweep start {self.sweep_start_deg} deg: expected -360 to 360")
         if self.frames is not None:
             _check_frames(self.frames)
 
@@ -95,6 +107,8 @@ def open_source(
     cloud: str = "velodyne",
     label_encoding: LabelEncoding = "auto",
     sweep: Sweep = "auto",
+    sweep_start_deg: float = 180.0,
+    sweep_stamp: SweepStamp = "forward",
 ) -> Source:
     """Open a drive; frames are read when asked for. Options as in :class:`SourceOptions`.
 
@@ -115,6 +129,8 @@ def open_source(
         cloud=cloud,
         label_encoding=label_encoding,
         sweep=sweep,
+        sweep_start_deg=sweep_start_deg,
+        sweep_stamp=sweep_stamp,
     )
     path = Path(path)
     if loader != "auto":

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.config import to_dict
 from sst_graph.estimators.config import CalibrationConfig
 from sst_graph.estimators.rhythm import jumps_of
+from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
 from sst_graph.uncertainty.observability import (
@@ -105,7 +106,7 @@ def result_of(
         config=to_dict(config),
         initial=guess.cTl,
         initial_offset_s=guess.offset_s,
-        diagnostics=answer.diagnostics,
+        diagnostics={**answer.diagnostics, **sweeps_of(drives)},
         versions=_versions(),
     )
 
@@ -124,6 +125,10 @@ def _weak_directions(
             elif number == 0:  # of the extrinsic alone, which all drives share
                 found.append(weak)
     return tuple(sorted(found, key=lambda weak: -weak.sigma))
+def sweeps_of(drives: Sequence[Drive]) -> dict[str, Any]:
+    """What was decided of the sweeps, by name of the drive, as an entry of the diagnostics."""
+    found = {drive.name: drive.sweep.to_dict() for drive in drives if drive.sweep is not None}
+    return {SWEEP_KEY: found} if found else {}
 
 
 def _jumps(drives: Sequence[Drive]) -> list[str]:

@@ -39,7 +39,9 @@ from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
 from sst_graph.estimators.parts import Parts
+from sst_graph.estimators.sweep_effect import SweepEffects, sweep_effects
 from sst_graph.estimators.undersides import WithUndersides, with_undersides, without_undersides
+from sst_graph.odometry.sweep import with_sweep
 from sst_graph.problem.drive import Drive, Progress, prepare_drive
 from sst_graph.problem.graph import PairMatches, Tracks
 from sst_graph.problem.objects import object_tracks
@@ -106,7 +108,11 @@ def prepare_drives(
         prepare = replace(prepare, use_visual_odometry=False)
     if config.method != "joint" or config.undersides.use == "never":
         prepare = without_undersides(prepare)
-    return [prepare_drive(source, config.classes, prepare, progress) for source in sources]
+    # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
+    return [
+        prepare_drive(with_sweep(source, config.sweep), config.classes, prepare, progress)
+        for source in sources
+    ]
 
 
 def calibrate_prepared(
@@ -166,10 +172,8 @@ def answer_joint(
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
     finals = _finals(drives, tracks, contest, guess, config, progress)
-    evidence = {
-        "explained": explained(finals[0]),
-        "concentration": concentration(finals[0], drives, tracks, config.joint),
-    }
+    evidence = {"explained": explained(finals[0])}
+    evidence["concentration"] = concentration(finals[0], drives, tracks, config.joint)
     # 3. Edges towards the ground, where the labels agree about them.
     best = rivals(finals, guess.cTl, guess.offset_s, config.start)
     below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
@@ -199,10 +203,11 @@ def answer_joint(
     motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
     parts_of_sigma = budget(covariance, motion, considered)
     covariance = covariance[:size, :size] + considered.covariance(size)
+    sweeps = _with_sweeps(drives, solution, covariance, config)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
-        covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config),
+        sweeps.covariance,
         _frames_used(drives, solution),
         remarks=(*_remarks(drives), *heard.remarks),
         by_standing=by_standing[:7, :7],
@@ -211,6 +216,7 @@ def answer_joint(
             *_doubts(solution, finals, covariance, evidence, guess, config),
             *contradictions.sentences,
             *heard.doubts,
+            *sweeps.doubts,
         ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
         by_drive=_by_drive(drives, solution, covariance, by_standing, config),
@@ -351,6 +357,15 @@ def _doubts(
                 "that explains the labels almost as well: record more varied scenes or give a closer guess"
             )
     return tuple(doubts)
+
+
+def _with_sweeps(
+    drives: Sequence[Drive], solution: JointSolution, covariance: FloatArray, config: CalibrationConfig
+) -> SweepEffects:
+    """The (7, 7) covariance with what no match shows, and doubts about sweeps that nothing tells."""
+    told = covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config)
+    effects = sweep_effects(solution, drives, told, config.joint)
+    return SweepEffects(effects.doubts, told + effects.covariance)
 
 
 def _beside_matches(solution: JointSolution, variance_s2: float, config: CalibrationConfig) -> FloatArray:

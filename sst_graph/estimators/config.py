@@ -14,6 +14,7 @@ from sst_graph.estimators.paper import PaperConfig
 from sst_graph.estimators.semalign import SemAlignConfig
 from sst_graph.estimators.start import StartConfig
 from sst_graph.estimators.undersides import UndersideConfig
+from sst_graph.odometry.sweep import SweepConfig
 from sst_graph.problem.drive import PrepareConfig
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.assumptions import AssumptionConfig
@@ -38,6 +39,7 @@ class CalibrationConfig(Settings):
             and as a check. ``auto``: where the labels alone tell all seven unknowns (a direction that only
             the motion tells stays reported as unobservable), and the points of a scan share one time (a
             rolling sweep is compensated by the very motion, which then lags a few milliseconds behind).
+        sweep: how the times of the points are decided where the data bring none.
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
@@ -61,6 +63,7 @@ class CalibrationConfig(Settings):
     classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
     delay_per_drive: bool = False
     use_motion: UseMotion = "auto"
+    sweep: SweepConfig = field(default_factory=SweepConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)

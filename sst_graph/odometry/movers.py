@@ -51,20 +51,28 @@ class StandingObjects:
         before = [points for past_ns, points in self._past if stamp_ns - past_ns >= 0.95e9 * config.memory_s]
         if not before or len(before[-1]) == 0 or len(wPs) == 0:
             return np.zeros(len(wPs), np.bool_)
-        keys = _voxel_representatives(wPs, config.voxel_m)
-        labels = _objects(wPs, config.cell_m)
-        tree = cKDTree(before[-1], balanced_tree=False, compact_nodes=False)
-        distance, _ = tree.query(wPs[keys], distance_upper_bound=config.slack_m)
-        near = np.isfinite(distance).astype(np.float64)
-        total = np.bincount(labels[keys], minlength=labels.max() + 1)
-        share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
-        return np.asarray((share >= config.share)[labels])
+        return standing(wPs, before[-1], config)
 
     def remember(self, wPs: FloatArray, stamp_ns: int) -> None:
         """Keep the movable points wPs (n, 3) of a scan, and forget what is too old to be asked for."""
         self._past.append((stamp_ns, wPs[_voxel_representatives(wPs, self.config.voxel_m)]))
         while len(self._past) > 2 and stamp_ns - self._past[1][0] >= 1e9 * self.config.memory_s:
             self._past.popleft()
+
+
+def standing(wPs: FloatArray, others: FloatArray, config: MoverConfig) -> BoolArray:
+    """(n,) whether points wPs (n, 3) in the world [m] belong to an object that is where points of another
+    time, ``others`` (m, 3), are."""
+    if len(wPs) == 0 or len(others) == 0:
+        return np.zeros(len(wPs), np.bool_)
+    keys = _voxel_representatives(wPs, config.voxel_m)
+    labels = _objects(wPs, config.cell_m)
+    tree = cKDTree(others, balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(wPs[keys], distance_upper_bound=config.slack_m)
+    near = np.isfinite(distance).astype(np.float64)
+    total = np.bincount(labels[keys], minlength=labels.max() + 1)
+    share = np.bincount(labels[keys], near, labels.max() + 1) / np.maximum(total, 1)
+    return np.asarray((share >= config.share)[labels])
 
 
 def _voxel_representatives(points: FloatArray, voxel_m: float) -> NDArray[np.intp]:

@@ -20,6 +20,7 @@ from sst_graph.odometry.chains import ChainTracker, FeatureChain
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
@@ -150,6 +151,7 @@ class Drive:
         left_out: what the data lacked.
         survey: what the raw frames show, for the search for causes; None where nobody looked.
         chains: corners followed through several images, where image features are tracked.
+        sweep: what was decided of the times of the points, or None where nobody asked.
     """
 
     name: str
@@ -161,6 +163,7 @@ class Drive:
     left_out: LeftOut = field(default_factory=LeftOut)
     survey: Survey | None = None
     chains: tuple[FeatureChain, ...] = ()
+    sweep: SweepDecision | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -235,6 +238,7 @@ def prepare_drive(
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
     if left_out.counts():
         _LOG.warning("%s: left out: %s", source.name, left_out)
+    sweep = source.sweep_decision if isinstance(source, SweptSource) else None
     return Drive(
         source.name,
         source.camera,
@@ -245,6 +249,7 @@ def prepare_drive(
         left_out,
         surveyor.survey(),
         follower.chains(),
+        sweep,
     )
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.data.scan_order import rings_from_order, sweep_offsets_s
+from sst_graph.data.scan_order import rings_from_order
+from sst_graph.sweep_timing import SweepTiming
 
 BEAMS = 32
 
@@ -67,6 +68,6 @@ def test_tiny_clouds_give_none(count: int) -> None:
 
 def test_sweep_runs_from_left_to_right_and_is_stamped_ahead() -> None:
     ahead, left, right = [10.0, 0, 0], [0, 5.0, 1], [0, -5.0, 1]
-    offsets = sweep_offsets_s(np.array([ahead, left, right], np.float32), 0.1)
+    offsets = SweepTiming(-1.0, np.pi, 0.1).offsets_s(np.array([ahead, left, right], np.float32))
     np.testing.assert_allclose(offsets, [0.0, -0.025, 0.025], atol=1e-9)
     assert offsets.dtype == np.float32

@@ -80,12 +80,18 @@ def test_lidar_agrees_with_brute_force() -> None:
         np.testing.assert_allclose(reach.ravel()[found], s[found], rtol=2e-6)
 
 
-def test_rolling_lidar_agrees_with_brute_force_at_each_columns_time() -> None:
+@pytest.mark.parametrize(
+    ("sense", "cut", "named", "period_s"),
+    [(-1.0, np.pi, 0.5, 0.1036), (1.0, 0.4, 0.0, 0.2), (-1.0, -2.0, 1.0, 0.05)],
+)
+def test_rolling_lidar_agrees_with_brute_force_at_each_columns_time(
+    sense: float, cut: float, named: float, period_s: float
+) -> None:
     rng = np.random.default_rng(3)
     triangles = lidar_world(rng)
     velocities = np.zeros_like(triangles)
     velocities[:150] = rng.uniform(-12.0, 12.0, (150, 1, 3)) * np.array([1.0, 1.0, 0.02])
-    seconds = -COLUMNS.azimuths / (2 * np.pi) * 0.1036
+    seconds = (np.mod(sense * (COLUMNS.azimuths - cut), 2 * np.pi) / (2 * np.pi) - named) * period_s
     yaw = 0.4 * seconds
     zero, one = np.zeros_like(yaw), np.ones_like(yaw)
     rotations = np.stack(
@@ -97,7 +103,7 @@ def test_rolling_lidar_agrees_with_brute_force_at_each_columns_time() -> None:
         axis=1,
     )
     positions = np.column_stack([14.0 * seconds, 0.5 * seconds, 0.1 * seconds])
-    motion = SweepMotion(rotations, positions, seconds, velocities)
+    motion = SweepMotion(rotations, positions, seconds, velocities, cut)
     faces, reach = cast_lidar(triangles, COLUMNS, motion=motion)[0]
     for column in range(0, COLUMNS.count, 5):
         moved = triangles + velocities * seconds[column]

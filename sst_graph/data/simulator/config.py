@@ -10,6 +10,13 @@ from sst_graph.config import Settings, setting
 Motion = Literal["mixed", "standing", "constant", "stop_and_go", "no_stop", "turning", "there_and_back"]
 """Ego motion: ``mixed`` stands, accelerates, turns and brakes; ``constant`` goes straight at one speed;
 ``there_and_back`` goes forward for half of the drive and returns in reverse."""
+SweepSense = Literal["clockwise", "counterclockwise"]
+"""Which way the scanner turns, seen from above."""
+SweepStamp = Literal["forward", "start", "end"]
+"""Which instant of a turn the scan's stamp names."""
+SweepOutput = Literal["times", "raw", "compensated"]
+"""What the data tell of a rolling sweep: the time of each point; the points as measured and no times; the
+points moved to where they lie at the stamp by the true ego motion (moving objects stay as measured)."""
 
 _MOST_PIXELS, _LONGEST_S, _FARTHEST_M = 10_000_000, 1000.0, 5000.0
 """Larger images take more than 1.5 GB; a longer drive or street takes more than that or a minute to build."""
@@ -33,8 +40,13 @@ class SimulationConfig(Settings):
         moving_fraction: share of the vehicles around that move, 0 to 0.8.
         truck_fraction: share of trucks among the parked vehicles.
         label_noise: level of the segmentation's imperfection, 0 (exact) to 2.
-        rolling: True: each point is measured at its own time within the sweep (the stamp is the
-            instant at which the laser faces forward); False: the whole scan at its stamp.
+        rolling: True: each point is measured at its own time within the sweep; False: the whole scan at
+            its stamp.
+        sweep_sense: which way the scanner turns.
+        sweep_start_deg: azimuth at which a turn begins and ends, counter-clockwise from forward [deg].
+        sweep_stamp: the instant that a scan's stamp names; of a turn that begins ahead, ``forward`` is its
+            start.
+        sweep_output: what the data tell of a rolling sweep.
         azimuth_limit_deg: points beyond this azimuth, either side of forward, are cut off [deg].
         azimuth_step_deg: nominal angle between two firings of one laser [deg].
         range_noise_m: standard deviation of the range [m].
@@ -61,6 +73,10 @@ class SimulationConfig(Settings):
     truck_fraction: float = setting(0.08, at_least=0.0, at_most=1.0)
     label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     rolling: bool = False
+    sweep_sense: SweepSense = "clockwise"
+    sweep_start_deg: float = setting(180.0, at_least=-180.0, at_most=180.0)
+    sweep_stamp: SweepStamp = "forward"
+    sweep_output: SweepOutput = "times"
     azimuth_limit_deg: float = setting(180.0, at_least=1.0, at_most=180.0)
     azimuth_step_deg: float = setting(0.1728, at_least=0.02, at_most=5.0)
     range_noise_m: float = setting(0.02, at_least=0.0, at_most=1.0)
@@ -81,3 +97,8 @@ class SimulationConfig(Settings):
     def period_s(self) -> float:
         """Time between two frames, and of one sweep [s]."""
         return 1.0 / self.frame_rate_hz
+
+    @property
+    def gives_times(self) -> bool:
+        """Whether the data tell the time of each point."""
+        return self.rolling and self.sweep_output == "times"

@@ -90,6 +90,11 @@ class SimulatedDrive:
         return f"simulated-{self.config.motion}-{self.config.seed}"
 
     @property
+    def sweep(self) -> str:
+        """What the drive tells of its sweep: that the whole scan is taken at once, or nothing."""
+        return "auto" if self.config.rolling else "compensated"
+
+    @property
     def lidar(self) -> Lidar:
         """The sensor."""
         return make_lidar(self.config)
@@ -113,18 +118,16 @@ class SimulatedDrive:
             IndexError: beyond the drive.
         """
         index = self._checked(position)
-        raw = self.raw(index)
-        stamp = int(self.stamps_ns[index])
-        scan = Scan(
-            stamp,
-            raw.points,
-            SEMANTIC_CLASS[raw.point_kinds],
-            raw.point_instances,
-            raw.offsets_s if self.config.rolling else None,
-            raw.rings,
-        )
-        image = CameraImage(stamp, SEMANTIC_CLASS[raw.pixel_kinds], raw.pixels, raw.pixel_instances)
-        return Frame(index, scan, image)
+        pixels, kinds, instances = self._image(index)
+        image = CameraImage(int(self.stamps_ns[index]), SEMANTIC_CLASS[kinds], pixels, instances)
+        return Frame(index, self.scan(index), image)
+
+    def scan(self, position: int) -> Scan:
+        """The scan of a frame, without its picture."""
+        index = self._checked(position)
+        points, offsets, rings, kinds, instances = self._scan(index)
+        times = offsets if self.config.gives_times else None
+        return Scan(int(self.stamps_ns[index]), points, SEMANTIC_CLASS[kinds], instances, times, rings)
 
     def raw(self, position: int) -> RawFrame:
         """The frame in the simulator's own kinds."""

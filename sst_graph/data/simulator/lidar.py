@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,13 +61,17 @@ class Lidar:
         count = round(360.0 / config.azimuth_step_deg)
         step, start = 2 * np.pi / count, rng.uniform(-0.5, 0.5) * 2 * np.pi / count
         nominal = Columns(start, step, count, self.slopes)
-        seconds = -nominal.azimuths / (2 * np.pi) * config.period_s if config.rolling else np.zeros(count)
-        motion = _sweep_motion(ego, stamp_s, seconds, velocities) if config.rolling else None
+        seconds = firing_times(config, nominal.azimuths) if config.rolling else np.zeros(count)
+        cut = np.deg2rad(config.sweep_start_deg)
+        motion = _sweep_motion(ego, stamp_s, seconds, velocities, cut) if config.rolling else None
         # Half a radius is the standard deviation of a uniform disc along one axis.
         half = config.beam_divergence_mrad * 1e-3 / 4.0
         beams = cast_lidar(triangles, nominal, (-half, half) if half > 0.0 else (0.0,), motion)
         faces, reach = _mixed(beams, rng)
-        return self._returns(snapshot, triangles, faces, reach, nominal, seconds, rng)
+        returns = self._returns(snapshot, triangles, faces, reach, nominal, seconds, rng)
+        if motion is None or config.sweep_output != "compensated":
+            return returns
+        return _compensated(returns, ego, stamp_s)
 
     def _returns(
         self,
@@ -115,11 +119,37 @@ def make_lidar(config: SimulationConfig) -> Lidar:
     return Lidar(config, np.tan(np.deg2rad(np.sort(elevation))))
 
 
-def _sweep_motion(ego: EgoMotion, stamp_s: float, seconds: FloatArray, velocities: FloatArray) -> SweepMotion:
+def firing_times(config: SimulationConfig, azimuths: FloatArray) -> FloatArray:
+    """(n,) time after the stamp [s] at which the lasers of a spinning scanner look along azimuths (n,) [rad].
+
+    Raising by the share of the turn done since its start; what the stamp names lies at 0.
+    """
+
+    def turned(azimuth: FloatArray) -> FloatArray:
+        ahead = azimuth - np.deg2rad(config.sweep_start_deg)
+        forth = ahead if config.sweep_sense == "counterclockwise" else -ahead
+        return np.asarray(np.mod(forth, 2 * np.pi) / (2 * np.pi))
+
+    named = {"start": 0.0, "end": 1.0, "forward": float(turned(np.zeros(1))[0])}[config.sweep_stamp]
+    return (turned(azimuths) - named) * config.period_s
+
+
+def _compensated(returns: Returns, ego: EgoMotion, stamp_s: float) -> Returns:
+    """The returns moved to where static surfaces lie at the stamp, by the true motion."""
+    rotation, position = (a[0] for a in ego.pose(np.array([stamp_s])))
+    rotations, positions = ego.pose(stamp_s + returns.offsets_s.astype(np.float64))
+    world = np.einsum("nij,nj->ni", rotations, returns.points.astype(np.float64)) + positions
+    points = ((world - position) @ rotation).astype(np.float32)
+    return replace(returns, points=points, offsets_s=np.zeros_like(returns.offsets_s))
+
+
+def _sweep_motion(
+    ego: EgoMotion, stamp_s: float, seconds: FloatArray, velocities: FloatArray, cut: float
+) -> SweepMotion:
     """The sensor's motion relative to its pose at the stamp, for columns at ``seconds`` (n,) after it."""
     rotation, position = (a[0] for a in ego.pose(np.array([stamp_s])))
     rotations, positions = ego.pose(stamp_s + seconds)
-    return SweepMotion(rotation.T @ rotations, (positions - position) @ rotation, seconds, velocities)
+    return SweepMotion(rotation.T @ rotations, (positions - position) @ rotation, seconds, velocities, cut)
 
 
 def _mixed(

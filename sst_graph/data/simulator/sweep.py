@@ -45,12 +45,14 @@ class SweepMotion:
         rotations, positions: (count, 3, 3) and (count, 3) [m] of the sensor at each column's time.
         seconds: (count,) each column's time after the stamp [s].
         velocities: (n, 3, 3) of the corners of all faces, in the sensor's frame at the stamp [m/s].
+        cut: azimuth at which the turn begins and ends: the times of the columns jump there [rad].
     """
 
     rotations: FloatArray
     positions: FloatArray
     seconds: FloatArray
     velocities: FloatArray
+    cut: float = np.pi
 
     def seen(self, corners: FloatArray, face: IndexArray, column: IndexArray) -> FloatArray:
         """(3, 3, m) corners (corner, axis, pair) of faces in the sensor's frame at the columns' times.
@@ -162,7 +164,8 @@ def _candidate_pairs(
             start, low, high, distance, _ = _extent(seen)
             shift, middle = middle, np.mod(start + 0.5 * (low + high) + np.pi, 2 * np.pi) - np.pi
         share = np.minimum(2.0 * ((high - low) + np.abs(middle - shift)) / np.pi + 0.03, 2.0)
-        seam = np.abs(middle) + 0.5 * (high - low) + wide > np.pi
+        from_cut = np.abs(np.mod(middle - motion.cut + np.pi, 2 * np.pi) - np.pi)
+        seam = from_cut < 0.5 * (high - low) + wide
         pad = np.where(seam | (distance < 3.0 * reach), 2.0 * wide, share * wide)
     low, high = low - pad - widen, high + pad + widen
     everywhere = (high - low > 0.9 * np.pi) | (distance < 1e-5)

@@ -39,7 +39,7 @@ def write_drive(
     The camera is image_2. calib.txt carries the nominal extrinsic, groundtruth.json the true one.
     poses.txt is in the convention of KITTI's camera 0 and holds calib.txt's Tr inside, as KITTI's
     does: with that Tr it gives the LiDAR's true motion at the scans' stamps, and nothing else.
-    With a rolling sweep, velodyne_times holds each point's time after the stamp (float32 [s]).
+    Where the drive tells them, velodyne_times holds each point's time after the stamp (float32 [s]).
 
     Args:
         drive: from :func:`simulate`.
@@ -63,19 +63,19 @@ def fill_drive(drive: SimulatedDrive, root: Path, progress: Progress | None = No
         OSError: it cannot be written.
     """
     folder = root / "sequences" / "00"
-    for name in (*FOLDERS, *(("velodyne_times",) if drive.config.rolling else ())):
+    for name in (*FOLDERS, *(("velodyne_times",) if drive.config.gives_times else ())):
         (folder / name).mkdir(parents=True)
     (folder / "calib.txt").write_text(_calibration(drive))
     (folder / "times.txt").write_text("".join(f"{stamp * 1e-9:.9e}\n" for stamp in drive.stamps_ns))
     (folder / "poses.txt").write_text(_poses(drive))
     (folder / "groundtruth.json").write_text(json.dumps(_truth(drive), indent=1) + "\n")
     for index in range(len(drive)):
-        _write_frame(folder, FRAME_NAME.format(index), drive.raw(index), drive.config.rolling)
+        _write_frame(folder, FRAME_NAME.format(index), drive.raw(index), drive.config.gives_times)
         if progress is not None:
             progress(index + 1, len(drive))
 
 
-def _write_frame(folder: Path, name: str, raw: RawFrame, rolling: bool) -> None:
+def _write_frame(folder: Path, name: str, raw: RawFrame, times: bool) -> None:
     """One frame's image, mask, cloud and labels."""
     _write_png(folder / "image_2" / f"{name}.png", raw.pixels)
     _write_png(folder / "semantic_2" / f"{name}.png", CITYSCAPES[raw.pixel_kinds])
@@ -83,7 +83,7 @@ def _write_frame(folder: Path, name: str, raw: RawFrame, rolling: bool) -> None:
     (folder / "velodyne" / f"{name}.bin").write_bytes(cloud.astype("<f4").tobytes())
     labels = SEMANTIC_KITTI[raw.point_kinds] | (raw.point_instances.astype(np.uint32) << 16)
     (folder / "labels" / f"{name}.label").write_bytes(labels.astype("<u4").tobytes())
-    if rolling:
+    if times:
         (folder / "velodyne_times" / f"{name}.bin").write_bytes(raw.offsets_s.astype("<f4").tobytes())
 
 

@@ -1,0 +1,30 @@
+"""When each point of a scan was measured, where the data do not tell: by the scans (docs/sweep.md)."""
+
+from __future__ import annotations
+
+from sst_graph.odometry.sweep.decision import (
+    FRACTIONS,
+    REMEDY,
+    SweepConfig,
+    SweepDecision,
+    SweepKind,
+    decide_sweep,
+)
+from sst_graph.odometry.sweep.source import SWEEP_KEY, SweptSource, timed, with_sweep, with_sweep_of
+from sst_graph.sweep_timing import SweepStamp, SweepTiming
+
+__all__ = [
+    "FRACTIONS",
+    "REMEDY",
+    "SWEEP_KEY",
+    "SweepConfig",
+    "SweepDecision",
+    "SweepKind",
+    "SweepStamp",
+    "SweepTiming",
+    "SweptSource",
+    "decide_sweep",
+    "timed",
+    "with_sweep",
+    "with_sweep_of",
+]

@@ -1,0 +1,317 @@
+"""Whether the points of a drive were moved to one instant, or which way its scanner turned."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, cast
+
+import numpy as np
+
+from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
+from sst_graph.odometry.sweep.estimate import CANDIDATES, Estimate, at_hypothesis, estimate, start_of
+from sst_graph.odometry.sweep.window import SECTORS, Window, WindowConfig
+from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.types import FloatArray, Scan
+
+_LOG = logging.getLogger(__name__)
+
+Hypothesis = Literal["compensated", "clockwise", "counterclockwise"]
+SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided", "standing", "given"]
+"""One of the hypotheses, or: none is excluded; nothing moved, so that none matters; not asked."""
+FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
+
+REMEDY = (
+    "say --sweep compensated, --sweep clockwise or --sweep counterclockwise, or give the time of each point"
+)
+
+
+@dataclass(frozen=True)
+class SweepConfig:
+    """How the sweep of scans without times is decided.
+
+    Attributes:
+        decide: whether it is; False takes such points as compensated.
+        window: how scans are registered to one another.
+        places: pairs of consecutive scans, spread over the drive, whose speed is looked at first.
+        windows: most stretches that are registered, the fastest first.
+        scans: of a stretch.
+        step_m, step_rad: motion from one scan of a stretch to the next that is aimed at, where the vehicle is
+            slow by leaving scans out [m, rad].
+        most_skipped: most scans left out between two of a stretch.
+        rest_mps, rest_radps: a vehicle that is nowhere faster stands [m/s, rad/s].
+        travel_m, travel_rad: a stretch tells nothing where the vehicle moves less from its first scan to its
+            last: surfaces are then seen from one side only, with the same errors in every scan [m, rad].
+        sigmas: by how many standard deviations the other hypotheses must be worse.
+        tolerance: the estimated share may differ so much from 0 or 1 beside three of its sigmas.
+        long_sweep_m: where the vehicle moves farther in a turn, matches made under a wrong hypothesis hold
+            themselves up, and all are tried from the start [m].
+    """
+
+    decide: bool = True
+    window: WindowConfig = field(default_factory=WindowConfig)
+    places: int = 6
+    windows: int = 3
+    scans: int = 12
+    step_m: float = 0.8
+    step_rad: float = 0.15
+    most_skipped: int = 7
+    rest_mps: float = 0.1
+    rest_radps: float = 0.02
+    travel_m: float = 3.0
+    travel_rad: float = 0.25
+    sigmas: float = 3.5
+    tolerance: float = 0.2
+    long_sweep_m: float = 1.0
+
+
+@dataclass(frozen=True)
+class SweepDecision:
+    """What was decided of the sweep, and why.
+
+    Attributes:
+        kind: the hypothesis, or why there is none.
+        timing: times of the points as they are used.
+        fraction, sigma: estimated share of the sweep in the points, -1 (clockwise) to 1, and its standard
+            deviation, at the start of the turn that fits best; sigma infinite where nothing tells.
+        worse_by: by how many standard deviations each hypothesis fits worse than the best.
+        start_told: whether the scans show where a turn begins; else the start lies where no points are.
+        speed_mps: fastest mean speed of the stretches looked at.
+        frames: numbers of the scans looked at, in the order of the drive.
+        others: times of the points under the hypotheses that are not excluded, beside ``timing``.
+    """
+
+    kind: SweepKind
+    timing: SweepTiming
+    fraction: float = 0.0
+    sigma: float = np.inf
+    worse_by: Mapping[str, float] = field(default_factory=dict)
+    start_told: bool = False
+    speed_mps: float = 0.0
+    frames: tuple[int, ...] = ()
+    others: tuple[SweepTiming, ...] = ()
+
+    @property
+    def shares(self) -> dict[float, float]:
+        """Probability of each hypothesis, by its fraction; sigmas are taken as twice as large as claimed, for
+        a hypothesis that the scans leave open is one that their error model does not settle.
+        """
+        weights = {
+            fraction: float(np.exp(-0.5 * (0.5 * self.worse_by.get(name, 0.0)) ** 2))
+            for name, fraction in FRACTIONS.items()
+        }
+        total = sum(weights.values())
+        return {fraction: weight / total for fraction, weight in weights.items()}
+
+    @property
+    def sentence(self) -> str:
+        """The decision in words."""
+        share = f"share of the sweep in the points {self.fraction:+.2f} +- {self.sigma:.2f}"
+        if self.kind == "given":
+            return "as given"
+        if self.kind == "standing":
+            return "taken as compensated: the vehicle stands, so that it does not matter"
+        if self.kind == "undecided":
+            return f"not told by the scans ({share}); taken as compensated"
+        if self.kind == "compensated":
+            return f"compensated ({share}, 0 expected)"
+        where = f"a turn begins at {np.degrees(self.timing.start_rad):.0f} deg" if self.start_told else ""
+        expected = FRACTIONS[self.kind]
+        return f"as measured, {self.kind} ({share}, {expected:+.0f} expected){'; ' * bool(where)}{where}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able, for the diagnostics of a result."""
+        return {
+            "kind": self.kind,
+            "sentence": self.sentence,
+            "fraction": self.fraction,
+            "sigma": self.sigma,
+            "worse_by_sigmas": dict(self.worse_by),
+            "timing": self.timing.to_dict(),
+            "start_told": self.start_told,
+            "speed_mps": self.speed_mps,
+            "scans": list(self.frames),
+        }
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A pair of consecutive scans: position of the first, and motion of the LiDAR from one to the other."""
+
+    position: int
+    seconds: float
+    speed_mps: float
+    turn_radps: float
+
+
+def decide_sweep(
+    scan_at: Callable[[int], Scan | None],
+    count: int,
+    config: SweepConfig | None = None,
+    stamp: SweepStamp = "forward",
+) -> SweepDecision:
+    """Decide it from the scans of a drive that have no times of their points.
+
+    Args:
+        scan_at: scan at a position, or None where the frame has none.
+        count: number of positions.
+        config: settings.
+        stamp: the instant that a scan's stamp names, in case the points are as measured.
+    """
+    config = config or SweepConfig()
+    places = _places(scan_at, count, config)
+    if not places:
+        return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
+    period_s = float(np.median([place.seconds for place in places]))
+    timing = SweepTiming(0.0, -np.pi, period_s, stamp)
+    if max(_worth(place, config) for place in places) < 1.0:
+        return SweepDecision("standing", timing, speed_mps=max(place.speed_mps for place in places))
+    places = sorted(places, key=lambda place: _rank(place, period_s, config))
+    both = tuple(replace(timing, fraction=f) for f in (-1.0, 1.0))
+    decision = SweepDecision("undecided", timing, others=both)
+    windows: list[Window] = []
+    used: list[int] = []
+    for place in places:
+        if _worth(place, config) < 1.0 or any(abs(place.position - k) < config.scans // 2 for k in used):
+            continue
+        positions = _stretch(place, count, config)
+        scans = [(k, scan) for k in positions if (scan := scan_at(k)) is not None]
+        if len(scans) < 3:
+            continue
+        window = Window([scan for _, scan in scans], period_s, config.window)
+        if window.travel[0] < config.travel_m and window.travel[1] < config.travel_rad:
+            continue
+        windows.append(window)
+        used += [k for k, _ in scans]
+        decision = replace(_decided(windows, timing, config), frames=tuple(sorted(set(used))))
+        _LOG.info("sweep: %s", decision.sentence)
+        if decision.kind != "undecided" or len(windows) == config.windows:
+            break
+    return decision
+
+
+def _places(scan_at: Callable[[int], Scan | None], count: int, config: SweepConfig) -> list[_Place]:
+    """Speeds at pairs of scans spread over the drive."""
+    found = []
+    for k in np.unique(np.linspace(0, max(count - 2, 0), config.places).round().astype(int)).tolist():
+        a, b = scan_at(k), scan_at(k + 1) if k + 1 < count else None
+        if a is None or b is None or b.stamp_ns <= a.stamp_ns:
+            continue
+        odometry = LidarOdometry(LidarOdometryConfig())
+        odometry.add(a)
+        motion = odometry.add(b)
+        if motion is not None and motion.ok:
+            turn, speed = (float(np.linalg.norm(part)) for part in np.split(motion.mean_twist, 2))
+            found.append(_Place(k, motion.seconds, speed, turn))
+    return found
+
+
+def _worth(place: _Place, config: SweepConfig) -> float:
+    return max(place.speed_mps / config.rest_mps, place.turn_radps / config.rest_radps)
+
+
+def _rank(place: _Place, period_s: float, config: SweepConfig) -> float:
+    """The fastest first; last, slowest first, those too fast for matches under a wrong hypothesis."""
+    worth = _worth(place, config)
+    return worth if place.speed_mps * period_s > config.long_sweep_m else -worth
+
+
+def _stretch(place: _Place, count: int, config: SweepConfig) -> list[int]:
+    """Positions of the scans around a place, so far apart that the vehicle moves from one to the next."""
+    step = min(
+        config.step_m / max(place.speed_mps * place.seconds, 1e-3),
+        config.step_rad / max(place.turn_radps * place.seconds, 1e-3),
+    )
+    every = int(
+        np.clip(round(step), 1, min(config.most_skipped + 1, max(1, (count - 1) // (config.scans - 1))))
+    )
+    length = (config.scans - 1) * every
+    first = int(np.clip(place.position - length // 2, 0, max(0, count - 1 - length)))
+    return list(range(first, min(count, first + length + 1), every))
+
+
+def _decided(windows: Sequence[Window], timing: SweepTiming, config: SweepConfig) -> SweepDecision:
+    """The decision that some stretches allow."""
+    speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
+    fraction, sector = 0.0, 0
+    far = speed * timing.period_s > config.long_sweep_m
+    if far:
+        fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS), _TRIED, SECTORS // 8)
+    found = estimate(windows, fraction, sector)
+    return replace(_judged(windows, found, timing, config), speed_mps=speed)
+
+
+def _judged(
+    windows: Sequence[Window], found: Estimate, timing: SweepTiming, config: SweepConfig
+) -> SweepDecision:
+    """The three hypotheses by their evidence, that of compensated points being 1."""
+    quadratic = found.quadratic
+    units = found.units(windows, config.window.surface_m)
+    costs: dict[str, FloatArray] = {name: quadratic.cost(f) / units for name, f in FRACTIONS.items()}
+    evidence = {name: _log_mean(-cost) for name, cost in costs.items()}
+    best = max(evidence, key=lambda name: evidence[name])
+    worse = {name: float(np.sqrt(2.0 * (evidence[best] - evidence[name]))) for name in evidence}
+    excluded = {name for name in worse if worse[name] > config.sigmas}
+    starts = {name: _start(costs[name]) for name in worse}
+    sector, told = starts[best] if best != "compensated" else (found.sector, False)
+    share = float(quadratic.free()[sector])
+    sigma = float(np.sqrt(units[sector] / max(quadratic.curvature[sector], 1e-12)))
+    agrees = abs(share - FRACTIONS[best]) < config.tolerance + 3.0 * sigma
+    decided = len(excluded) == 2 and agrees
+    timings = {
+        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0])) for name in worse
+    }
+    kind = cast(SweepKind, best if decided else "undecided")
+    others = [timings[name] for name in worse if name not in excluded or not agrees]
+    return SweepDecision(
+        kind,
+        timings[best] if decided and best != "compensated" else timing,
+        share,
+        sigma,
+        worse,
+        told,
+        others=() if decided else tuple(other for other in others if not other.instant),
+    )
+
+
+def _log_mean(values: FloatArray) -> float:
+    """log(mean(exp(values)))."""
+    most = float(values.max())
+    return most + float(np.log(np.mean(np.exp(values - most))))
+
+
+def _start(costs: FloatArray) -> tuple[int, bool]:
+    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [1/2 sigma^2] tell it.
+
+    Of starts that fit equally well (no points between them) the one in the middle of the widest run.
+    """
+    alike = 2.0 * (costs - costs.min()) < 4.0
+    if alike.all():
+        return 0, False
+    first = int(np.flatnonzero(alike & ~np.roll(alike, 1))[0])
+    runs: list[list[int]] = []
+    for k in range(first, first + SECTORS):
+        if alike[k % SECTORS]:
+            if not alike[(k - 1) % SECTORS] or not runs:
+                runs.append([])
+            runs[-1].append(k)
+    widest = max(runs, key=len)
+    return widest[len(widest) // 2] % SECTORS, bool(alike.sum() <= SECTORS // 6)
+
+
+def _best_start(window: Window, fractions: Sequence[float], every: int) -> tuple[float, int]:
+    """The share, and the start of a turn at every so many sectors, under which scans meet best."""
+    best, least = (0.0, 0), np.inf
+    for fraction in fractions:
+        for sector in range(0, SECTORS, every) if fraction else (0,):
+            tried = window.copy()
+            misfit = at_hypothesis([tried], fraction, sector, _TRIED_PASSES).misfit
+            if misfit < least:
+                best, least = (fraction, sector), misfit
+    return best
+
+
+_TRIED = (0.0, -1.0, 1.0)
+_FEW_SCANS, _FEW_POINTS, _TRIED_PASSES = 6, 60, 4
+__all__ = ["CANDIDATES", "SweepConfig", "SweepDecision", "decide_sweep"]
