@@ -39,6 +39,32 @@ class Nees:
 
 
 @dataclass(frozen=True)
+class TruthSigma:
+    """How well a reference is known itself; standard deviations along each axis, without correlation.
+
+    Attributes:
+        rotation_deg: [deg].
+        translation_m: [m].
+        time_offset_s: [s].
+    """
+
+    rotation_deg: float
+    translation_m: float
+    time_offset_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("rotation_deg", "translation_m", "time_offset_s"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise DataError(f"truth sigma: {name}", f"{getattr(self, name):g}", "0 or more")
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(7, 7) in the order of a result's covariance."""
+        sigmas = [np.radians(self.rotation_deg)] * 3 + [self.translation_m] * 3 + [self.time_offset_s]
+        return np.diag(np.square(sigmas))
+
+
+@dataclass(frozen=True)
 class CalibrationErrors:
     """Errors of an estimate against the truth.
 
@@ -110,12 +136,19 @@ def calibration_errors(
     time_offset_s: float,
     truth: GroundTruth,
     covariance: FloatArray | None = None,
+    truth_sigma: TruthSigma | None = None,
 ) -> CalibrationErrors:
     """Every metric of an estimate (cTl, time_offset_s [s], covariance (7, 7)) against the truth.
+
+    Args:
+        truth_sigma: of a truth that is a reference, known with an error of its own: the NEES is then that of
+            their difference, e' (P + P_truth)^-1 e. None where the truth is exact.
 
     Raises:
         DataError: the covariance is not positive definite.
     """
+    if covariance is not None and truth_sigma is not None:
+        covariance = covariance + truth_sigma.covariance
     time_error = None if truth.time_offset_s is None else time_offset_s - truth.time_offset_s
     return CalibrationErrors(
         qad_deg=quaternion_angle_deg(cTl.rotation(), truth.cTl.rotation()),

@@ -185,6 +185,11 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
         required=True,
         help="groundtruth.json, calibration.json, or a KITTI calib.txt (then without time offset)",
     )
+    evaluate.add_argument(
+        "--truth-sigma",
+        metavar="ROT_DEG,TRANS_CM,MS",
+        help="how well the truth is known itself, one sigma along each axis; the NEES counts it in",
+    )
     evaluate.add_argument("--json", action="store_true", help="print JSON (degrees, metres, seconds)")
     return evaluate
 

@@ -59,6 +59,19 @@ def test_evaluate_as_json(result_file: Path, capsys: pytest.CaptureFixture[str])
     assert values["status"] == "ok"
 
 
+def test_evaluate_counts_the_truths_own_error(
+    result_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = ["--truth", str(result_file.parent / "truth.json")]
+    assert main(["evaluate", str(result_file), *truth, "--json", "--truth-sigma", "0.5,1,2"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["qad_deg"] == pytest.approx(1.0)
+    assert values["nees"]["rotation"] == pytest.approx(4.0 / 2.0)
+    assert values["nees"]["time_offset"] == pytest.approx(4.0 / 2.0)
+    assert main(["evaluate", str(result_file), *truth, "--truth-sigma", "1,2"]) == 2
+    assert "expected three numbers" in capsys.readouterr().err
+
+
 def test_evaluate_against_a_kitti_calibration(
     result_file: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,6 +9,7 @@ import pytest
 from sst_graph.errors import DataError
 from sst_graph.metrics import (
     FORWARD_R_OPTICAL,
+    TruthSigma,
     calibration_errors,
     euler_angles_deg,
     mean_euler_difference_deg,
@@ -114,3 +115,21 @@ def test_time_error_is_estimate_minus_truth() -> None:
     assert calibration_errors(
         gtsam.Pose3(), 0.11, GroundTruth(gtsam.Pose3(), 0.1)
     ).time_offset_s == pytest.approx(0.01)
+
+
+def test_a_truth_with_an_error_of_its_own_counts_in_the_nees() -> None:
+    """Each part by hand: e^2 / (sigma^2 + sigma_truth^2)."""
+    truth = GroundTruth(gtsam.Pose3(gtsam.Rot3.Rz(0.02), np.array([0.0, 0.0, 0.03])), 0.004)
+    covariance = np.diag([0.01**2] * 3 + [0.01**2] * 3 + [0.002**2])
+    sigma = TruthSigma(np.degrees(0.02), 0.02, 0.001)
+    errors = calibration_errors(gtsam.Pose3(), 0.0, truth, covariance, sigma)
+    assert errors.nees is not None
+    assert errors.nees.rotation == pytest.approx(0.02**2 / (0.01**2 + 0.02**2), rel=1e-6)
+    assert errors.nees.translation == pytest.approx(0.03**2 / (0.01**2 + 0.02**2), rel=1e-3)
+    assert errors.nees.time_offset == pytest.approx(0.004**2 / (0.002**2 + 0.001**2), rel=1e-6)
+
+
+@pytest.mark.parametrize("sigmas", [(-0.1, 0.0, 0.0), (0.0, np.nan, 0.0), (0.0, 0.0, np.inf)])
+def test_a_truth_sigma_out_of_range_is_refused(sigmas: tuple[float, float, float]) -> None:
+    with pytest.raises(DataError, match="truth sigma"):
+        TruthSigma(*sigmas)
