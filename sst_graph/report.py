@@ -15,6 +15,7 @@ from sst_graph.metrics import (
     quaternion_angle_deg,
 )
 from sst_graph.result import CalibrationResult
+from sst_graph.uncertainty.budget_words import budget_lines, estimated_lines
 
 OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
 
@@ -46,6 +47,7 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
             for drive in result.drive_offsets
         ),
     ]
+    rows += [("estimated" if k == 0 else "", text) for k, text in enumerate(estimated_lines(result))]
     sweeps = _sweeps(result)
     rows += [("sweep" if k == 0 else "", text) for k, text in enumerate(sweeps)]
     if result.initial is not None:
@@ -94,6 +96,8 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
         f"Sign of the offset: {OFFSET_SIGN}.",
         "```\n" + summary(result, comparison) + "\n```",
     ]
+    if parts := budget_lines(result):
+        blocks += ["## Where the sigmas come from", "```\n" + "\n".join(parts) + "\n```"]
     if result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
         blocks += ["## What the data hardly tells", "\n".join(items)]

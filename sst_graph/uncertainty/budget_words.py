@@ -33,6 +33,17 @@ def budget_lines(result: CalibrationResult) -> list[str]:
     return lines
 
 
+def estimated_lines(result: CalibrationResult) -> list[str]:
+    """The parameters of assumptions that were estimated with the calibration, with their sigmas."""
+    stored = result.diagnostics.get("estimated")
+    lines = []
+    for name, entry in stored.items() if isinstance(stored, dict) else ():
+        values = [entry.get(key) for key in ("value", "sigma")] if isinstance(entry, dict) else [None]
+        if name in ASSUMPTIONS and all(isinstance(v, float) and np.isfinite(v) for v in values):
+            lines.append(ASSUMPTIONS[name].figure(*values))
+    return lines
+
+
 def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
     """(7,) sigmas of each part; empty where the result does not tell them."""
     stored = result.diagnostics.get(BUDGET)
