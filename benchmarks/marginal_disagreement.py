@@ -67,12 +67,15 @@ def pair(seed: int, apart: float) -> tuple[float, list[float]]:
     )
     distance = _length(difference, C_1 + _covariance(graph_2, values_2))
     graphs = [(graph_1, values_1), (graph_2, values_2)]
-    joint, _ = fuse_graphs(graphs, E, D)
-    fused = fuse_marginals([marginal_of_graph(graph, values, E, D) for graph, values in graphs])
+    joint, _ = fuse_graphs(graphs, E, D, significance=0.0)
+    fused = fuse_marginals(
+        [marginal_of_graph(graph, values, E, D) for graph, values in graphs], significance=0.0
+    )
     misses = [_miss(joint, fused)]
     for _ in range(ROUNDS):
         at = fused.cTl, fused.offset_s
-        fused = fuse_marginals([marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs])
+        anew = [marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs]
+        fused = fuse_marginals(anew, significance=0.0)
         misses.append(_miss(joint, fused))
     return distance, misses
 

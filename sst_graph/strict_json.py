@@ -57,4 +57,4 @@ def _dump(document: dict[str, Any]) -> str:
 
 
 def _escaped(match: re.Match[str]) -> str:
-    return f"\\u{ord(match[0]):04x}"
+    return f"\\\\u{ord(match[0]):04x}"

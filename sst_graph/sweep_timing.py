@@ -35,6 +35,10 @@ def turned(azimuth_rad: FloatArray, start_rad: float) -> FloatArray:
     return np.asarray(np.mod(azimuth_rad - start_rad, 2.0 * np.pi) / (2.0 * np.pi))
 
 
+LONGEST_TURN_S = 60.0
+"""No scanner turns more slowly [s]."""
+
+
 @dataclass(frozen=True)
 class SweepTiming:
     """Times of points by their azimuths.
@@ -61,8 +65,9 @@ class SweepTiming:
             )
         if not np.isfinite(self.start_rad):
             raise ConfigError(f"start of a turn: found {self.start_rad}, expected a finite azimuth")
-        if not 0.0 < self.period_s < 60.0:
-            raise ConfigError(f"duration of a turn: found {self.period_s} s, expected up to 60 s")
+        if not 0.0 < self.period_s < LONGEST_TURN_S:
+            expected = f"up to {LONGEST_TURN_S:g} s"
+            raise ConfigError(f"duration of a turn: found {self.period_s} s, expected {expected}")
 
     @property
     def instant(self) -> bool:

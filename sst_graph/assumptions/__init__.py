@@ -3,6 +3,9 @@
 One more assumption is one more small file here, and its name in :data:`ASSUMPTIONS`.
 """
 
+import math
+from collections.abc import Sequence
+
 from sst_graph.assumptions.clocks import LINE_DELAY, SKEW
 from sst_graph.assumptions.distortion import K1, K2
 from sst_graph.assumptions.focal_length import FOCAL
@@ -10,6 +13,7 @@ from sst_graph.assumptions.lidar_range import RANGE_BIAS, RANGE_SCALE
 from sst_graph.assumptions.model import Assumption, Effect, View, combined
 from sst_graph.assumptions.principal_point import CX, CY
 from sst_graph.assumptions.sweep import SWEEP
+from sst_graph.errors import ConfigError
 
 ASSUMPTIONS: dict[str, Assumption] = {
     assumption.name: assumption
@@ -17,4 +21,34 @@ ASSUMPTIONS: dict[str, Assumption] = {
 }
 """All assumptions by name, in the order in which they are shown."""
 
-__all__ = ["ASSUMPTIONS", "Assumption", "Effect", "View", "combined"]
+__all__ = ["ASSUMPTIONS", "Assumption", "Effect", "View", "combined", "named_sigmas"]
+
+
+def named_sigmas(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
+    """Names and deviations from ``name`` (with the assumption's span) or ``name=sigma``.
+
+    Raises:
+        ConfigError: a name is no assumption's, or given twice; a deviation out of range.
+    """
+    found = tuple(_named_sigma(text) for text in texts)
+    names = [name for name, _ in found]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"estimate: found {', '.join(names)}, expected each name once")
+    return found
+
+
+def _named_sigma(text: str) -> tuple[str, float]:
+    name, equals, number = (part.strip() for part in text.partition("="))
+    if name not in ASSUMPTIONS:
+        raise ConfigError(f"estimate: found {name!r:.60}, expected one of {', '.join(ASSUMPTIONS)}")
+    span = ASSUMPTIONS[name].span
+    if not equals:
+        return name, span
+    try:
+        sigma = float(number)
+    except ValueError:
+        sigma = math.nan
+    if not 1e-6 * span <= sigma <= 100.0 * span:
+        expected = f"{1e-6 * span:g} to {100.0 * span:g} {ASSUMPTIONS[name].unit}".rstrip()
+        raise ConfigError(f"estimate: {name}: found {number!r:.60}, expected {expected}")
+    return name, sigma

@@ -239,9 +239,11 @@ def _encoding(files: KittiFiles, options: SourceOptions, size: tuple[int, int]) 
 
 
 def _name(folder: Path) -> str:
+    """Data set and sequence; bytes of a folder's name that are not UTF-8 are escaped."""
     folder = Path(os.path.realpath(folder))
     sequence = folder.parent.name == "sequences"
-    return printable(f"{folder.parent.parent.name}/{folder.name}" if sequence else folder.name)
+    name = f"{folder.parent.parent.name}/{folder.name}" if sequence else folder.name
+    return printable(os.fsencode(name).decode("utf-8", "backslashreplace"))
 
 
 KITTI_LOADER = Loader(recognizes=is_kitti, open=open_kitti, layout=LAYOUT)

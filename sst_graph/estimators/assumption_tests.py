@@ -19,7 +19,7 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from factors.robust import RobustKernel
-from sst_graph.assumptions import ASSUMPTIONS, Assumption
+from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
 from sst_graph.odometry.lens import lens_from_chains
@@ -94,7 +94,7 @@ def check_assumptions(problem: TestedProblem, config: AssumptionConfig) -> tuple
     """What the data say of the assumptions that the score test hints at, the most contradicted first."""
     if not config.test:
         return ()
-    free = dict(problem.config.graph.estimate)
+    free = dict(named_sigmas(problem.config.graph.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in free]
     found = []
     for name, score in zip(names, scores(problem, names), strict=True):
@@ -149,7 +149,7 @@ def _estimated(problem: TestedProblem, name: str, config: AssumptionConfig) -> F
         problem.config,
         kernel_px=(*_WIDE_PX, *(narrow or problem.config.kernel_px[-1:])),
         graph=replace(
-            problem.config.graph, estimate=(*problem.config.graph.estimate, (name, assumption.span))
+            problem.config.graph, estimate=(*problem.config.graph.estimate, name)
         ),
     )
     start = replace(before, nuisances={**before.nuisances, name: 0.0})

@@ -236,7 +236,7 @@ def answer_joint(
 def _estimating(config: CalibrationConfig) -> JointConfig:
     """The joint method's settings with the parameters that are to be estimated."""
     joint = config.joint
-    return replace(joint, graph=replace(joint.graph, estimate=config.assumptions.estimated))
+    return replace(joint, graph=replace(joint.graph, estimate=config.assumptions.estimate))
 
 
 def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:

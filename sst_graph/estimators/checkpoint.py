@@ -51,7 +51,9 @@ _PACKAGES = (
     "sst_graph.association",
     "sst_graph.estimators",
     "sst_graph.odometry",
+    "sst_graph.odometry.sweep",
     "sst_graph.problem",
+    "sst_graph.sweep_timing",
     "sst_graph.types",
     "sst_graph.uncertainty",
 )

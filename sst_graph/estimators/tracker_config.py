@@ -83,7 +83,7 @@ class AlarmConfig(Settings):
     confirm_mps: float = setting(3.0, at_least=0.0, at_most=1000.0)
     stamps: bool = True
     baseline: int = setting(300, at_least=1, at_most=1_000_000)
-    start_chi2: float = setting(15.0, at_least=0.1, at_most=1e9)
+    start_chi2: float = setting(15.0, at_least=1e-9, at_most=1e9)
     warm_up: int = setting(15, at_least=0, at_most=1_000_000)
 
     def __post_init__(self) -> None:

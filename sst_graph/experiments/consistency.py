@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
 from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
 from sst_graph.problem.drive import Progress
@@ -42,13 +43,17 @@ class ConsistencyConfig(Settings):
     """
 
     runs: int = setting(100, at_least=2, at_most=100_000)
-    drives: tuple[str, ...] = setting(tuple(DRIVES), length=(1, 100), choices=DRIVES)
+    drives: tuple[str, ...] = setting(tuple(DRIVES), length=(1, 100))
     seed: int = setting(1000, at_least=0, at_most=10**15)
     start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
     start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
     lost_deg: float = setting(2.0, at_least=0.0, at_most=180.0)
     label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.drives if name not in DRIVES]:
+            raise ConfigError(f"drives: found {', '.join(unknown)}, expected some of {', '.join(DRIVES)}")
 
 
 @dataclass(frozen=True)

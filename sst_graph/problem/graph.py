@@ -21,7 +21,7 @@ from sst_graph.association.silhouettes import (
     SilhouetteMatches,
     match_silhouettes,
 )
-from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.assumptions.model import Scene
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError
@@ -76,7 +76,7 @@ class GraphConfig(Settings):
         mover_reach_m: an object that moves so far by itself between its scan and its image, in a way that is
             not known, keeps half of its weight, one that moves a little farther none [m].
         still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
-        estimate: assumptions whose parameters are variables, with the deviation of each from 0.
+        estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0.
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
@@ -90,7 +90,7 @@ class GraphConfig(Settings):
     rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
     mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
     still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
-    estimate: tuple[tuple[str, float], ...] = ()
+    estimate: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if 0.0 < self.object_bias_sigma_px < 0.001:
@@ -243,10 +243,11 @@ def associate(
                     matches, pair.scan, None if tracks.objects is None else tracks.objects[number]
                 )
                 at = state.cTl, offset_s, motion.c_twist
+                names = [name for name, _ in named_sigmas(config.estimate)]
                 terms = {
-                    c: residual_columns(m.alignment, scene, pair.base_tau_s, at, dict(config.estimate))
+                    c: residual_columns(m.alignment, scene, pair.base_tau_s, at, names)
                     for c, m in matches.items()
-                    if config.estimate
+                    if names
                 }
                 found.append(PairMatches(number, pair, l_twist, motion, matches, on, scene, terms))
     return found
@@ -382,7 +383,7 @@ def _add_nuisances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
 ) -> None:
     """The parameters that are estimated, with what is known of them beforehand."""
-    for name, sigma in config.estimate:
+    for name, sigma in named_sigmas(config.estimate):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.PriorFactorVector(nuisance_key(name), np.zeros(1), noise))
         values.insert(nuisance_key(name), np.array([state.nuisances.get(name, 0.0)]))

@@ -77,7 +77,8 @@ class ImageFacts:
 
     Attributes:
         index: of its frame.
-        picture_digest, mask_digest: equal ones are the same.
+        picture_digest, mask_digest: equal ones are the same; a picture that is missing or of a single colour
+            shows nothing, and has that of the mask.
         labelled: number of pixels by class.
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
@@ -131,7 +132,9 @@ class Surveyor:
 
     def _check_sizes(self, index: int, image: CameraImage) -> None:
         width, height = self._camera.width, self._camera.height
-        for what, shape in (("mask", image.mask.shape), ("picture", image.pixels.shape)):
+        shapes = [("mask", image.mask.shape)]
+        shapes += [("picture", image.pixels.shape[:2])] if image.has_picture else []
+        for what, shape in shapes:
             if shape[:2] != (height, width):
                 raise DataError(
                     f"{self._name}: frame {index}",
@@ -164,13 +167,15 @@ def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFa
     labelled = _counts(image.mask)
     height = image.mask.shape[0]
     rows = {c: float(np.flatnonzero(image.mask == c).mean() // image.mask.shape[1]) for c in labelled}
+    shows = image.has_picture and bool((image.pixels != image.pixels[0, 0]).any())
+    mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
     return ImageFacts(
         index,
-        zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()),
-        zlib.crc32(np.ascontiguousarray(image.mask).tobytes()),
+        zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
+        mask_digest,
         labelled,
         {c: row / height for c, row in rows.items()},
-        contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely else (),
+        contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
     )
 
 

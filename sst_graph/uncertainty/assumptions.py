@@ -18,9 +18,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.config import Settings, setting
-from sst_graph.errors import ConfigError
 from sst_graph.problem.graph import GraphConfig, PairMatches, joint_graph
 from sst_graph.problem.nuisances import residual_columns
 from sst_graph.problem.state import State, twist_key
@@ -34,13 +33,14 @@ BUDGET = "sigma_budget"
 
 
 _Sigmas = make_dataclass(
-    "_Sigmas",
+    "AssumptionSigmas",
     [
         (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
         for name, each in ASSUMPTIONS.items()
     ],
     bases=(Settings,),
     frozen=True,
+    namespace={"__module__": __name__},
 )
 if TYPE_CHECKING:
 
@@ -70,9 +70,7 @@ class AssumptionConfig(Settings):
     threshold: float = setting(3.3, at_least=1.0, at_most=100.0)
 
     def __post_init__(self) -> None:
-        names = [name for name, _ in self.estimated]
-        if len(set(names)) < len(names):
-            raise ConfigError(f"estimate: found {', '.join(names)}, expected each name once")
+        named_sigmas(self.estimate)
 
     def sigma(self, name: str) -> float:
         """Deviation of an assumption's parameter."""
@@ -81,25 +79,7 @@ class AssumptionConfig(Settings):
     @property
     def estimated(self) -> tuple[tuple[str, float], ...]:
         """Assumptions whose parameters are variables, with the deviation of each beforehand."""
-        return tuple(_named_sigma(text) for text in self.estimate)
-
-
-def _named_sigma(text: str) -> tuple[str, float]:
-    """Name and deviation from ``name`` or ``name=sigma``."""
-    name, equals, number = (part.strip() for part in text.partition("="))
-    if name not in ASSUMPTIONS:
-        raise ConfigError(f"estimate: found {name!r:.60}, expected one of {', '.join(ASSUMPTIONS)}")
-    span = ASSUMPTIONS[name].span
-    if not equals:
-        return name, span
-    try:
-        sigma = float(number)
-    except ValueError:
-        sigma = np.nan
-    if not 1e-6 * span <= sigma <= 100.0 * span:
-        expected = f"{1e-6 * span:g} to {100.0 * span:g} {ASSUMPTIONS[name].unit}".rstrip()
-        raise ConfigError(f"estimate: {name}: found {number!r:.60}, expected {expected}")
-    return name, sigma
+        return named_sigmas(self.estimate)
 
 
 @dataclass(frozen=True)

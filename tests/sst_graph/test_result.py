@@ -261,4 +261,4 @@ def test_names_that_are_not_unicode_make_a_valid_file(tmp_path: Path) -> None:
     result = _result(frames_used=(FrameId("stra\udcdfe", 3),), reasons=("ä \ud800",))
     path = tmp_path / "calibration.json"
     path.write_bytes(result.to_json().encode("utf-8"))
-    assert read_result(path).frames_used == result.frames_used and "ä" in path.read_text()
+    assert read_result(path).frames_used == (FrameId("stra\\udcdfe", 3),) and "ä" in path.read_text()

@@ -9,10 +9,11 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.sweep.estimate import CANDIDATES, Estimate, at_hypothesis, estimate, start_of
-from sst_graph.odometry.sweep.window import SECTORS, Window, WindowConfig
-from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.odometry.sweep.window import SECTORS, SweepWindowConfig, Window
+from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
 
 _LOG = logging.getLogger(__name__)
@@ -28,7 +29,7 @@ REMEDY = (
 
 
 @dataclass(frozen=True)
-class SweepConfig:
+class SweepConfig(Settings):
     """How the sweep of scans without times is decided.
 
     Attributes:
@@ -50,20 +51,20 @@ class SweepConfig:
     """
 
     decide: bool = True
-    window: WindowConfig = field(default_factory=WindowConfig)
-    places: int = 6
-    windows: int = 3
-    scans: int = 12
-    step_m: float = 0.8
-    step_rad: float = 0.15
-    most_skipped: int = 7
-    rest_mps: float = 0.1
-    rest_radps: float = 0.02
-    travel_m: float = 3.0
-    travel_rad: float = 0.25
-    sigmas: float = 3.5
-    tolerance: float = 0.2
-    long_sweep_m: float = 1.0
+    window: SweepWindowConfig = field(default_factory=SweepWindowConfig)
+    places: int = setting(6, at_least=1, at_most=1000)
+    windows: int = setting(3, at_least=1, at_most=100)
+    scans: int = setting(12, at_least=2, at_most=200)
+    step_m: float = setting(0.8, at_least=0.001, at_most=100.0)
+    step_rad: float = setting(0.15, at_least=0.001, at_most=7.0)
+    most_skipped: int = setting(7, at_least=0, at_most=1000)
+    rest_mps: float = setting(0.1, at_least=0.0, at_most=100.0)
+    rest_radps: float = setting(0.02, at_least=0.0, at_most=10.0)
+    travel_m: float = setting(3.0, at_least=0.0, at_most=1000.0)
+    travel_rad: float = setting(0.25, at_least=0.0, at_most=100.0)
+    sigmas: float = setting(3.5, at_least=0.0, at_most=1000.0)
+    tolerance: float = setting(0.2, at_least=0.0, at_most=2.0)
+    long_sweep_m: float = setting(1.0, at_least=0.0, at_most=1000.0)
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,9 @@ def decide_sweep(
     if not places:
         return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
     period_s = float(np.median([place.seconds for place in places]))
+    # Stamps in another unit: what is wrong with them is said elsewhere.
+    if not 0.0 < period_s < LONGEST_TURN_S:
+        return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
     timing = SweepTiming(0.0, -np.pi, period_s, stamp)
     if max(_worth(place, config) for place in places) < 1.0:
         return SweepDecision("standing", timing, speed_mps=max(place.speed_mps for place in places))

@@ -19,6 +19,7 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.movers import MoverConfig, standing
@@ -33,7 +34,7 @@ SECTORS = 72
 
 
 @dataclass(frozen=True)
-class WindowConfig:
+class SweepWindowConfig(Settings):
     """How the scans of a stretch are thinned and matched.
 
     Attributes:
@@ -55,21 +56,25 @@ class WindowConfig:
         passes: most times that matches are made anew.
     """
 
-    near_m: float = 2.5
-    far_m: float = 45.0
-    max_points: int = 40_000
-    voxel_m: float = 0.12
-    neighbours: int = 9
-    flatness: float = 0.3
-    breadth: float = 0.25
-    points_a_way: int = 200
-    gaps: tuple[int, ...] = (1, 4, 8)
-    gates_m: tuple[float, ...] = (1.0, 0.8, 0.6, 0.5, 0.4)
-    scales_m: tuple[float, ...] = (0.4, 0.3, 0.2, 0.12, 0.08)
-    cell_m: float = 3.0
-    surface_m: float = 0.005
+    near_m: float = setting(2.5, at_least=0.0, at_most=100.0)
+    far_m: float = setting(45.0, at_least=1.0, at_most=500.0)
+    max_points: int = setting(40_000, at_least=100, at_most=10_000_000)
+    voxel_m: float = setting(0.12, at_least=0.01, at_most=10.0)
+    neighbours: int = setting(9, at_least=3, at_most=100)
+    flatness: float = setting(0.3, at_least=0.001, at_most=1.0)
+    breadth: float = setting(0.25, at_least=0.0, at_most=1.0)
+    points_a_way: int = setting(200, at_least=10, at_most=100_000)
+    gaps: tuple[int, ...] = setting((1, 4, 8), at_least=1, at_most=1000, length=(1, 20))
+    gates_m: tuple[float, ...] = setting(
+        (1.0, 0.8, 0.6, 0.5, 0.4), at_least=0.01, at_most=100.0, length=(1, 50)
+    )
+    scales_m: tuple[float, ...] = setting(
+        (0.4, 0.3, 0.2, 0.12, 0.08), at_least=0.001, at_most=100.0, length=(1, 50)
+    )
+    cell_m: float = setting(3.0, at_least=0.1, at_most=1000.0)
+    surface_m: float = setting(0.005, at_least=1e-5, at_most=1.0)
     movers: MoverConfig = field(default_factory=lambda: MoverConfig(slack_m=0.3))
-    passes: int = 12
+    passes: int = setting(12, at_least=1, at_most=100)
 
 
 @dataclass(frozen=True)
@@ -115,7 +120,7 @@ class _Rows:
 class Window:
     """Scans of a stretch, and their poses."""
 
-    def __init__(self, scans: Sequence[Scan], period_s: float, config: WindowConfig) -> None:
+    def __init__(self, scans: Sequence[Scan], period_s: float, config: SweepWindowConfig) -> None:
         """scans: in the order of their stamps; period_s: duration of a turn [s]."""
         self.config, self.period_s = config, period_s
         self._stamps_s = np.array([(scan.stamp_ns - scans[0].stamp_ns) * 1e-9 for scan in scans])
@@ -310,7 +315,7 @@ _DAMPING = 1e-3
 """Keeps poses where nothing is matched; a match counts about 1."""
 
 
-def _surfaces(points: FloatArray, config: WindowConfig) -> _Surfaces:
+def _surfaces(points: FloatArray, config: SweepWindowConfig) -> _Surfaces:
     """Flat patches among points (n, 3), and of them evenly spread ones of every direction to ask about."""
     if len(points) > config.neighbours:
         thinned = small_gicp.voxelgrid_sampling(small_gicp.PointCloud(points), config.voxel_m)
