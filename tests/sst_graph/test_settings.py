@@ -245,7 +245,7 @@ def test_rules_between_settings(settings: str, message: str) -> None:
         ("prepare.lidar_odometry.neighbours=0", "neighbours: found 0, expected at least 5 and at most 100"),
         ("motion.kernel.scale=0", "motion.kernel.scale: found 0, expected at least 0.01"),
         ("motion.kernel.kind=square", "motion.kernel.kind: found 'square', expected one of none, huber"),
-        ("foo=1", "unknown setting 'foo'; no setting has a name like it; known at the top: assumptions, challenge, "),
+        ("foo=1", "unknown setting 'foo'; no setting has a name like it; known at the top: assumptions, "),
         ("max_outer=3", "unknown setting 'max_outer'; did you mean 'joint.max_outer' or 'motion.max_outer'?"),
     ],
 )
