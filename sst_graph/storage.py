@@ -79,6 +79,9 @@ class _Writer:
     def _parts_of(self, value: object) -> list[Node]:
         if isinstance(value, np.ndarray):
             return self._array(value)
+        if isinstance(value, set | frozenset):
+            # In an order that does not depend on how it came to be.
+            return [type(value).__name__, [self.node(one) for one in sorted(value, key=repr)]]
         if isinstance(value, _SEQUENCES) and type(value) in _SEQUENCES:
             return [type(value).__name__, [self.node(one) for one in value]]
         if isinstance(value, deque):

@@ -16,7 +16,7 @@ from sst_graph.files import atomic_write_bytes
 from sst_graph.storage import restored, stored
 
 FORMAT = "sst-graph/tracker"
-VERSION = 13
+VERSION = 14
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 

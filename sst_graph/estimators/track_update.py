@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.result import WeakDirection
 
 FloatArray = NDArray[np.float64]
+Sensor = Literal["image", "scan"]
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
 
 
@@ -27,8 +28,9 @@ class TrackUpdate:
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
             converged again; ``unconfirmed`` where no frames have lately confirmed it; else whether the limits
             of observability are met.
-        accepted: the frame was taken into the estimate; else ``reason`` says why not.
+        accepted: all of the frame was taken into the estimate; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
+        refused: the sensors of it whose data were not taken in: they have changed nothing.
         matches: silhouette matches in the window.
         chi2: statistic of the change test, over its usual size, or None where it can't be told.
         doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
@@ -49,6 +51,7 @@ class TrackUpdate:
     status: TrackStatus
     accepted: bool
     reason: str = ""
+    refused: tuple[Sensor, ...] = ()
     matches: int = 0
     chi2: float | None = None
     doubt: str = ""
@@ -76,6 +79,7 @@ class TrackUpdate:
             "status": self.status,
             "accepted": self.accepted,
             "reason": self.reason,
+            "refused": list(self.refused),
             "matches": self.matches,
             "chi2": self.chi2,
             "doubt": self.doubt,

@@ -77,19 +77,25 @@ class Window:
 
     def __init__(self, camera: PinholeCamera, scans: int) -> None:
         self.camera = camera
-        self.size, self.held = scans, False
+        self.size = scans
+        self.objects = ObjectTracker(memory=OBJECT_MEMORY)
+        self.next_scan = 0
+        self.next_image = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all scans, images and motions; numbers go on."""
+        self.held = False
+        self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
         self.tracks: dict[int, dict[ObjectName, int]] = {}
-        self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.sightings: dict[int, list[Sighting]] = {}
         self.moving: dict[int, dict[ObjectName, float]] = {}
         self.persistence = Persistence()
         self.velocities = Velocities()
         self.judged_anew: set[int] = set()
-        self.next_scan = 0
-        self.next_image = 0
         self.wTl = gtsam.Pose3()
 
     @property

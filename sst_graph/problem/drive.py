@@ -20,6 +20,7 @@ from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.validation import checked_image, checked_scan
 
 FloatArray = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -146,7 +147,8 @@ def prepare_drive(
     """Read every frame of a source once and keep what calibration needs.
 
     Raises:
-        DataError: the source has no scan or no image, or its stamps do not rise.
+        DataError: the source has no scan or no image, its stamps do not rise, or the arrays of one are not
+            what they must be (:mod:`sst_graph.validation`).
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
@@ -154,18 +156,21 @@ def prepare_drive(
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
     for position, frame in enumerate(source):
+        place = f"{source.name}, frame {frame.index}"
         if frame.scan is not None:
-            motion = odometry.add(frame.scan)
+            scan = checked_scan(frame.scan, place)
+            motion = odometry.add(scan)
             if motion is not None:
                 motions.append(motion)
-            scans.append(scan_features(frame.index, frame.scan, classes, config))
+            scans.append(scan_features(frame.index, scan, classes, config))
         if frame.image is not None:
+            image = checked_image(frame.image, source.camera, place)
             if config.use_visual_odometry:
-                tracks = tracker.add(frame.image)
+                tracks = tracker.add(image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
                     pairs.append(ImagePair(tracks, direction))
-            images.append(image_features(frame.index, frame.image, classes, config.picture))
+            images.append(image_features(frame.index, image, classes, config.picture))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
