@@ -8,9 +8,10 @@ import sys
 from collections.abc import Iterator
 
 from sst_graph.cli.inputs import chosen_classes, open_drive, settings, starting_point
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.resume import Setup, check_setup, frames_to_come
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
@@ -23,15 +24,19 @@ def run(args: argparse.Namespace) -> int:
     """Track ``args.data``; 0 if the last estimate may be trusted, else 3."""
     _check(args)
     source = open_drive(args, args.data)
-    tracker = _tracker(args, source)
-    done = tracker.window.last_stamp_ns
-    for number, frame in enumerate(_after(source, done), 1):
-        print(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False), flush=True)
-        if args.checkpoint is not None and number % args.checkpoint_every == 0:
+    tracker, frames = _tracker(args, source)
+    last = None
+    for number, (frame, is_last) in enumerate(_with_last(frames), 1):
+        last = tracker.add(frame)
+        if args.checkpoint is not None and (is_last or number % args.checkpoint_every == 0):
             save_checkpoint(tracker, args.checkpoint)
-    if args.checkpoint is not None:
-        save_checkpoint(tracker, args.checkpoint)
-    tracker.settle()
+        if is_last:
+            # What the last line says is what is written.
+            tracker.settle()
+            last = tracker.current(last)
+        print(json.dumps({"frame": frame.index, **last.to_dict()}, allow_nan=False), flush=True)
+    if last is None:
+        tracker.settle()
     result = tracker_result(tracker, source.name, args.camera)
     if args.out is not None:
         atomic_write_text(args.out, result.to_json())
@@ -49,27 +54,33 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"{args.out}: found a file, expected none (or --overwrite)")
 
 
-def _tracker(args: argparse.Namespace, source: Source) -> Tracker:
-    """The tracker of the checkpoint where one is resumed and exists, else a new one."""
+def _tracker(args: argparse.Namespace, source: Source) -> tuple[Tracker, Iterator[Frame]]:
+    """The tracker of the checkpoint where one is resumed and exists, else a new one; and its frames."""
+    flags = {"calibration.classes": chosen_classes(args.classes)}
+    config = settings(TrackerConfig(), args, flags)
     if args.resume and args.checkpoint.exists():
         tracker = load_checkpoint(args.checkpoint)
-        if tracker.camera != source.camera:
-            raise DataError(args.checkpoint, "another camera", f"the camera of {source.name}")
-        return tracker
-    default = TrackerConfig()
-    config = settings(default, args, {"calibration.classes": chosen_classes(args.classes)})
-    initial, offset_s = starting_point(args.init, source, args.camera)
-    return Tracker(source.camera, config, initial, offset_s)
+        made = tracker.setup
+        initial, offset_s = made.initial, made.initial_offset_s
+        if args.init is not None:
+            initial, offset_s = starting_point(args.init, source, args.camera)
+        # What is not asked for is the checkpoint's.
+        asked = settings(made.config, args, flags)
+        check_setup(tracker, Setup(source.camera, asked, initial, offset_s), args.checkpoint)
+        return tracker, frames_to_come(tracker, source, args.checkpoint)
+    initial, offset_s = starting_point(args.init or "dataset", source, args.camera)
+    return Tracker(source.camera, config, initial, offset_s), iter(source)
 
 
-def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
-    """Frames of a drive later than a scan's stamp; earlier ones are read past."""
-    for frame in source:
-        newest = frame.scan.stamp_ns if frame.scan is not None else None
-        if newest is None and frame.image is not None:
-            newest = frame.image.stamp_ns
-        if stamp_ns is None or (newest is not None and newest > stamp_ns):
-            yield frame
+def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:
+    """Each frame, and whether it is the last."""
+    waiting: Frame | None = None
+    for frame in frames:
+        if waiting is not None:
+            yield waiting, False
+        waiting = frame
+    if waiting is not None:
+        yield waiting, True
 
 
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:

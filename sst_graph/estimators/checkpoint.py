@@ -12,6 +12,7 @@ import numpy as np
 
 from sst_graph.errors import DataError
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.resume import Setup, check_setup
 from sst_graph.files import atomic_write_bytes
 from sst_graph.storage import restored, stored
 
@@ -37,11 +38,18 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
     atomic_write_bytes(path, stream.getvalue())
 
 
-def load_checkpoint(path: str | Path) -> Tracker:
+def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
 
+    Whether it goes on with the drive that it was saved on, :func:`sst_graph.estimators.resume.frames_to_come`
+    tells.
+
+    Args:
+        setup: camera, settings and guess that it must have been made with; None for any.
+
     Raises:
-        DataError: no such file, or not a checkpoint of this version.
+        DataError: no such file, not a checkpoint of this version, or of a tracker that was made with another
+            camera, other settings or another guess.
     """
     try:
         with np.load(Path(path), allow_pickle=False) as file:
@@ -59,4 +67,6 @@ def load_checkpoint(path: str | Path) -> Tracker:
         raise DataError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
     if not isinstance(tracker, Tracker):
         raise DataError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
+    if setup is not None:
+        check_setup(tracker, setup, path)
     return tracker

@@ -16,9 +16,11 @@ from factors.camera import PinholeCamera
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.known import Known
+from sst_graph.estimators.resume import FirstFrames, Setup
 from sst_graph.estimators.settling import settle_window
 from sst_graph.estimators.snapshot import Snapshot
 from sst_graph.estimators.track_update import Sensor, TrackUpdate
+from sst_graph.estimators.tracked_marginal import TrackedMarginal, increment, tracked_marginal
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
 from sst_graph.estimators.tracking import EXPECTED, Tracking
@@ -48,7 +50,15 @@ class Tracker(Tracking):
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
         super().__init__(camera, config or TrackerConfig(), Guess(initial, initial_offset_s))
+        self.setup = Setup(camera, self.config, initial, initial_offset_s)
+        self.first_frames = FirstFrames()
         self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
+        self.settled = False
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest scan that was taken in [ns]."""
+        return self.scan_order.newest_ns
 
     def __getstate__(self) -> dict[str, Any]:
         """All but what failed."""
@@ -77,7 +87,7 @@ class Tracker(Tracking):
             moved_ns = self.image_order.check(checked.stamp_ns)
         except DataError as error:
             return self._refused("image", image, str(error))
-        return self._whole("image", image, partial(self.take_image, checked, moved_ns))
+        return self._whole("image", checked, partial(self.take_image, checked, moved_ns))
 
     def add_scan(self, scan: Scan) -> TrackUpdate:
         """Take in a scan, match it and whatever of the window is to be renewed, and estimate."""
@@ -86,7 +96,7 @@ class Tracker(Tracking):
             moved_ns = self.scan_order.check(checked.stamp_ns)
         except DataError as error:
             return self._refused("scan", scan, str(error))
-        return self._whole("scan", scan, partial(self.take_scan, checked, moved_ns))
+        return self._whole("scan", checked, partial(self.take_scan, checked, moved_ns))
 
     def _whole(
         self, sensor: Sensor, data: Scan | CameraImage, take: Callable[[], TrackUpdate]
@@ -94,7 +104,9 @@ class Tracker(Tracking):
         """Take in a sensor's data whole; where anything fails, everything is as it was."""
         before = Snapshot(self)
         try:
+            self.settled = False
             update = take()
+            self.first_frames.take(data)
         except DataError as error:
             before.restore()
             return self._refused(sensor, data, str(error))
@@ -125,9 +137,52 @@ class Tracker(Tracking):
             why = f"{why}; the tracker begins anew"
         return self._refused(sensor, data, why)
 
-    def current(self) -> TrackUpdate:
-        """The present estimate as an answer, without a frame."""
-        return self.answer(self.window.last_stamp_ns or 0)
+    def current(self, after: TrackUpdate | None = None) -> TrackUpdate:
+        """The present estimate as an answer, without a frame.
+
+        Args:
+            after: answer to the last frame; what it says of that frame stays.
+        """
+        update = dataclasses.replace(self.answer(self.window.last_stamp_ns or 0), settled=self.settled)
+        if after is None:
+            return update
+        of_frame = ("stamp_ns", "accepted", "reason", "refused", "chi2", "alarm", "adopted")
+        return dataclasses.replace(update, **{name: getattr(after, name) for name in of_frame})
+
+    def marginal(self) -> TrackedMarginal:
+        """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
+
+        Linearized at the estimate, as sure as the reported covariance.
+
+        Raises:
+            EstimationError: there is no estimate yet.
+        """
+        if self.smoother is None:
+            raise EstimationError("the tracker has no estimate yet: no marginal")
+        return tracked_marginal(self.point.cTl, self.point.offset_s, self.reported(), self.starts)
+
+    def marginal_since(self, previous: TrackedMarginal) -> TrackedMarginal:
+        """What to add to an earlier marginal for the present one: nothing counts twice.
+
+        ``known = tracker.marginal()`` once; then, whenever wanted, ``more = tracker.marginal_since(known)``
+        into the graph and ``known = known.plus(more)``. All parts are linearized at the first one's point,
+        and their sum is the tracker's information. A part alone may be negative in some direction: frames
+        may also show that less is known than it seemed.
+
+        Args:
+            previous: an earlier marginal of this tracker, with what was added since.
+
+        Raises:
+            EstimationError: there is no estimate, or the calibration has changed since: take the parts told
+                before out of the graph, and begin with :meth:`marginal`.
+        """
+        whole = self.marginal()
+        if previous.start != whole.start:
+            raise EstimationError(
+                f"found a marginal of start {previous.start}, expected one of start {whole.start}: "
+                "the calibration has changed since"
+            )
+        return increment(whole, previous)
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
@@ -167,4 +222,5 @@ class Tracker(Tracking):
             _LOG.warning("tracker: not settled: %s", error)
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
+        self.settled = True
         return rests

@@ -13,6 +13,8 @@ from sst_graph.result import WeakDirection
 
 FloatArray = NDArray[np.float64]
 Sensor = Literal["image", "scan"]
+UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""Of an estimate that does not exist yet [rad, m, s]."""
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
 
 
@@ -24,7 +26,7 @@ class TrackUpdate:
         stamp_ns: of the scan or image that was added.
         T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
         time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
-        covariance: (7, 7) cluster-robust.
+        covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
             converged again; ``unconfirmed`` where no frames have lately confirmed it; else whether the limits
             of observability are met.
@@ -42,12 +44,14 @@ class TrackUpdate:
             ``alarm.confirm_offset_s`` [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
+        covariance_reason: why there is no covariance; empty where there is.
+        settled: the window was solved as a whole after this frame (:meth:`Tracker.settle`).
     """
 
     stamp_ns: int
     T_camera_lidar: gtsam.Pose3
     time_offset_s: float
-    covariance: FloatArray
+    covariance: FloatArray | None
     status: TrackStatus
     accepted: bool
     reason: str = ""
@@ -60,10 +64,14 @@ class TrackUpdate:
     offset_unconfirmed_s: float = 0.0
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
+    covariance_reason: str = ""
+    settled: bool = False
 
     @property
     def sigmas(self) -> FloatArray:
-        """(7,) standard deviations [rad, m, s]."""
+        """(7,) standard deviations [rad, m, s]; wide ones while there is no estimate."""
+        if self.covariance is None:
+            return UNKNOWN_SIGMAS.copy()
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def to_dict(self) -> dict[str, Any]:
@@ -76,6 +84,8 @@ class TrackUpdate:
             "sigma_rotation_rad": sigmas[:3],
             "sigma_translation_m": sigmas[3:6],
             "sigma_time_offset_s": sigmas[6],
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "covariance_reason": self.covariance_reason,
             "status": self.status,
             "accepted": self.accepted,
             "reason": self.reason,
@@ -87,5 +97,6 @@ class TrackUpdate:
             "unconfirmed_s": self.unconfirmed_s,
             "offset_unconfirmed_s": self.offset_unconfirmed_s,
             "adopted": self.adopted,
+            "settled": self.settled,
             "weak": [weak.sentence for weak in self.weak_directions],
         }

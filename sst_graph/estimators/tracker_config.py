@@ -120,6 +120,7 @@ class TrackerConfig:
     Attributes:
         calibration: classes, preparation, start, matches and limits, as for ``calibrate``.
         window: scans whose matches are renewed.
+        images: most images that are kept, for any number of them may come while no scan does.
         renew: scans of the window matched anew at each frame, besides the newest; the next to leave first.
         renew_most: as many while the estimate moves.
         stale_sigmas: a match is stale where the estimate has moved farther since, in standard deviations.
@@ -139,6 +140,7 @@ class TrackerConfig:
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
     window: int = 60
+    images: int = 600
     renew: int = 1
     renew_most: int = 4
     stale_sigmas: float = 0.3
@@ -157,7 +159,7 @@ class TrackerConfig:
 
     def __post_init__(self) -> None:
         _require_positive(self, "window", "start_scans", "restart_scans", "min_frame_matches", "late_s")
-        _require_positive(self, "settle_scans")
+        _require_positive(self, "settle_scans", "images")
         if self.window < max(self.start_scans, self.restart_scans):
             raise ValueError(f"window {self.window}: expected at least start_scans and restart_scans")
 

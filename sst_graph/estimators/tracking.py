@@ -77,6 +77,7 @@ class Tracking:
         self.arrivals = Arrivals()
         self.trial = Trial(self.config)
         self.doubt = ""
+        self.starts = 0
         self.image_order, self.scan_order = StampOrder("image", True), StampOrder("scan", False)
 
     @property
@@ -122,6 +123,7 @@ class Tracking:
         self.clocks.take_image(image.stamp_ns, self.window.place)
         picture = self.config.calibration.prepare.picture
         self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
+        self._forget_images()
         return self.answer(image.stamp_ns)
 
     def take_scan(self, scan: Scan, moved_ns: int) -> TrackUpdate:
@@ -154,12 +156,13 @@ class Tracking:
     def keep_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
         """Put prepared features of a scan into the window; its number."""
         number = self.window.add_scan(features, motion)
-        oldest = self.window.scans[0][1].stamp_ns
-        margin = round((self.config.late_s + max(0.0, self.point.offset_s)) * 1e9)
-        if not self.started:
-            margin += 10**9
-        self.window.forget_images(oldest - margin)
+        self._forget_images()
         return number
+
+    def _forget_images(self) -> None:
+        """Keep no more images than scans may meet that are there, or still come."""
+        margin_s = self.config.late_s + max(0.0, self.point.offset_s) + (0.0 if self.started else 1.0)
+        self.window.forget_images(round(1e9 * margin_s), self.config.images)
 
     def _start(self, stamp_ns: int) -> TrackUpdate:
         """Some work towards a first estimate; it begins where that is done and holds."""
@@ -175,6 +178,7 @@ class Tracking:
             return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
         self.known, self.smoother = known, smoother
         self.starting.succeeded()
+        self.starts += 1
         self.trial.begin(self.window.next_scan)
         self.watch.begin()
         self.adoption.restart()
@@ -313,11 +317,13 @@ class Tracking:
             weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
             late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
+        found = self.smoother is not None
         return TrackUpdate(
             stamp_ns=stamp_ns,
             T_camera_lidar=point.cTl,
             time_offset_s=point.offset_s,
-            covariance=covariance,
+            covariance=covariance if found else None,
+            covariance_reason="" if found else "no estimate yet: this is the guess",
             status=status,
             accepted=not reason,
             reason=reason,

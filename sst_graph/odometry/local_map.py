@@ -22,7 +22,7 @@ class LocalMap:
     rolls_back = False
 
     def __init__(self, voxel_m: float, age: int) -> None:
-        """voxel_m: edge of the voxels [m]; age: clouds after which one that was not seen again is forgotten."""
+        """voxel_m: edge of the voxels [m]; age: clouds after which one not seen again is forgotten."""
         self._voxels = small_gicp.GaussianVoxelMap(voxel_m)
         self._voxels.set_lru(age, max(1, age // 2))
         self._next = 0
