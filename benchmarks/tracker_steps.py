@@ -122,7 +122,7 @@ def main() -> None:
         )
         drive = simulate(config)
         frames = list(drive)
-        tracker = Tracker(drive.camera, TrackerConfig(), drive.truth.cTl.retract(GUESS))
+        tracker = Tracker(drive.camera, TrackerConfig(start_work=0), drive.truth.cTl.retract(GUESS))
         early = sum(tracker.add(frame).alarm for frame in frames[: args.before])
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = Path(folder) / "tracker.npz"

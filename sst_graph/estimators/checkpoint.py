@@ -67,6 +67,7 @@ def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
         raise DataError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
     if not isinstance(tracker, Tracker):
         raise DataError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
+    tracker.starting.catch_up()
     if setup is not None:
         check_setup(tracker, setup, path)
     return tracker

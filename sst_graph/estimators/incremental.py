@@ -19,11 +19,12 @@ from sst_graph.estimators.known import Known
 from sst_graph.estimators.resume import FirstFrames, Setup
 from sst_graph.estimators.settling import settle_window
 from sst_graph.estimators.snapshot import Snapshot
+from sst_graph.estimators.starting import EXPECTED
 from sst_graph.estimators.track_update import Sensor, TrackUpdate
 from sst_graph.estimators.tracked_marginal import TrackedMarginal, increment, tracked_marginal
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
-from sst_graph.estimators.tracking import EXPECTED, Tracking
+from sst_graph.estimators.tracking import Tracking
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import LATEST_NS, checked_image, checked_scan
 
@@ -146,7 +147,9 @@ class Tracker(Tracking):
         update = dataclasses.replace(self.answer(self.window.last_stamp_ns or 0), settled=self.settled)
         if after is None:
             return update
-        of_frame = ("stamp_ns", "accepted", "reason", "refused", "chi2", "alarm", "adopted")
+        of_frame = ["stamp_ns", "refused", "chi2", "alarm", "adopted"]
+        if after.covariance is not None or update.covariance is None or after.refused:
+            of_frame += ["accepted", "reason"]
         return dataclasses.replace(update, **{name: getattr(after, name) for name in of_frame})
 
     def marginal(self) -> TrackedMarginal:
@@ -203,10 +206,15 @@ class Tracker(Tracking):
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
 
+        A start that is not done yet is brought to its end first.
+
         Returns:
             Whether it rests: the last whole step was below 0.02 standard deviations.
         """
-        smoother, joint = self.smoother, self.config.calibration.joint
+        joint = self.config.calibration.joint
+        if self.smoother is None:
+            self._finish_start()
+        smoother = self.smoother
         if smoother is None:
             return False
         self.stop_settling()
@@ -222,5 +230,16 @@ class Tracker(Tracking):
             _LOG.warning("tracker: not settled: %s", error)
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
+        self.trial.look_now(self.watch, smoother, self.known, self.window.restless())
         self.settled = True
         return rests
+
+    def _finish_start(self) -> None:
+        """All that is left of a start, where one can be made."""
+        try:
+            started = self.starting.finish(self.matcher)
+        except EXPECTED as error:
+            _LOG.warning("tracker: no start: %s", error)
+            return
+        if started is not None:
+            self.begin(started, self.window.last_stamp_ns or 0)

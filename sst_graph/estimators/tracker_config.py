@@ -127,6 +127,8 @@ class TrackerConfig:
         settle_scans: scans matched anew with each frame while a running tracker settles.
         start_scans: scans before the first batch solution is tried, and between attempts.
         restart_scans: the same after an alarm.
+        start_work: work on a start that is done with each frame, in units of about 4 ms; the estimate comes
+            when all is done. 0: all with one frame.
         start_attempts: failed attempts near the last estimate after an alarm before the search begins anew.
         start_share: least share of the pairs that the first solution must still match.
         start_gain: by which fraction of the cost a start whose time offset was searched must be better.
@@ -147,6 +149,7 @@ class TrackerConfig:
     settle_scans: int = 5
     start_scans: int = 12
     restart_scans: int = 8
+    start_work: int = 16
     start_attempts: int = 2
     start_share: float = 0.7
     start_gain: float = 0.1

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from factors.errors import FactorError
-from sst_graph.errors import SstGraphError
 from sst_graph.estimators.admission import StampOrder, check_lateness
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.arrivals import Arrivals
@@ -25,7 +23,7 @@ from sst_graph.estimators.renewal import scans_to_match
 from sst_graph.estimators.rhythm import Clocks, Jump
 from sst_graph.estimators.settling import Milestones, Settling
 from sst_graph.estimators.smoother import WindowSmoother
-from sst_graph.estimators.starting import Starting
+from sst_graph.estimators.starting import EXPECTED, Started, Starting
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
@@ -41,9 +39,6 @@ from sst_graph.uncertainty.common_error import common_covariance
 from sst_graph.uncertainty.observability import open_directions
 
 _LOG = logging.getLogger(__name__)
-
-EXPECTED = (SstGraphError, FactorError, RuntimeError, ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""Errors that numbers alone may lead to; others are errors of the program, and are logged as such."""
 
 FloatArray = NDArray[np.float64]
 
@@ -165,28 +160,35 @@ class Tracking:
         self.window.forget_images(round(1e9 * margin_s), self.config.images)
 
     def _start(self, stamp_ns: int) -> TrackUpdate:
-        """Some work towards a first estimate; it begins where that is done and holds."""
-        if not self.starting.due(self.window):
-            return self.answer(stamp_ns, "collecting frames for a start")
+        """Some work towards a first estimate."""
         try:
-            started = self.starting.attempt(self.matcher)
+            started = self.starting.work(self.matcher)
         except EXPECTED as error:
             self.starting.failed()
             return self.answer(stamp_ns, f"no start yet: {' '.join(str(error).split())}")
-        smoother, known = started.smoother, started.known
-        if why := self.trial.check(self.watch, smoother, known, self.window.restless()):
-            return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
+        if started is not None:
+            return self.begin(started, stamp_ns)
+        search = self.starting.search
+        looks = "collecting frames for a start" if search is None else "looking for a start"
+        return self.answer(stamp_ns, looks)
+
+    def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
+        """Go on from an estimate, if the frames that it is made of agree with it."""
+        smoother, known, window = started.smoother, started.known, self.window
+        if why := self.trial.check(self.watch, smoother, known, window.restless()):
+            return self._refuse_start(stamp_ns, len(window.scans) // 2, why)
         self.known, self.smoother = known, smoother
         self.starting.succeeded()
         self.starts += 1
-        self.trial.begin(self.window.next_scan)
+        self.trial.begin(window.next_scan)
         self.watch.begin()
         self.adoption.restart()
-        self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
+        soon = len(window.scans) + started.scans
+        self.milestones = Milestones(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.arrivals.restart()
-        self.arrivals.take(self.window.next_scan - 1, self.reported())
-        _LOG.info("tracker: started over %d scans", len(smoother.entries))
+        self.arrivals.take(window.next_scan - 1, self.reported())
+        _LOG.info("tracker: started over %d scans", started.scans)
         return self.answer(stamp_ns)
 
     def _refuse_start(self, stamp_ns: int, keep: int, why: str) -> TrackUpdate:

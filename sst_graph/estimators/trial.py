@@ -62,8 +62,13 @@ class Trial:
         Labels that err for a while contradict a start as a step does, so it is not given up any more; but
         until its frames agree it is not called ok.
         """
-        if not self.on or scan - self.first < self.after:
-            return
-        self.after *= 2
-        if not self._contradiction(watch, smoother, known, restless):
+        if self.on and scan - self.first >= self.after:
+            self.after *= 2
+            self.look_now(watch, smoother, known, restless)
+
+    def look_now(
+        self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+    ) -> None:
+        """The same of all frames in the graph, as at the end of a drive."""
+        if self.on and not self._contradiction(watch, smoother, known, restless):
             self.refused, self.on = 0, False

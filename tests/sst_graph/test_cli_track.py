@@ -21,7 +21,8 @@ from sst_graph.cli import main
 from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.result import read_result
 
-OPTIONS = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+SOON = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+OPTIONS = [*SOON, "--set", "start_work=0"]
 
 
 @pytest.fixture(scope="module")
