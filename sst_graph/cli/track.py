@@ -28,6 +28,8 @@ def run(args: argparse.Namespace) -> int:
     last = None
     for number, (frame, is_last) in enumerate(_with_last(frames), 1):
         last = tracker.add(frame)
+        if args.checkpoint is not None:
+            tracker.make_ready()
         if args.checkpoint is not None and (is_last or number % args.checkpoint_every == 0):
             save_checkpoint(tracker, args.checkpoint)
         if is_last:

@@ -86,7 +86,7 @@ class Field:
         parts = []
         for start in range(0, len(poses), some):
             parts.append(self._steps(poses.take(np.arange(start, min(start + some, len(poses)))), scale_px))
-            yield 8
+            yield 3
         names = [field.name for field in fields(Steps)]
         return Steps(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from factors.camera import PinholeCamera
 from sst_graph.errors import DataError, EstimationError
+from sst_graph.estimators.contest import narrowed
 from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.known import Known
 from sst_graph.estimators.resume import FirstFrames, Setup
@@ -203,6 +204,11 @@ class Tracker(Tracking):
         if self.smoother is not None:
             self.smoother.relinearize()
 
+    def make_ready(self) -> None:
+        """Pack what the newest frame brought, so that saving a checkpoint takes no longer than a frame."""
+        if self.window.images:
+            _ = self.window.images[-1].packed
+
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
 
@@ -212,8 +218,7 @@ class Tracker(Tracking):
             Whether it rests: the last whole step was below 0.02 standard deviations.
         """
         joint = self.config.calibration.joint
-        if self.smoother is None:
-            self._finish_start()
+        at_last = self.smoother is None and self._finish_start()
         smoother = self.smoother
         if smoother is None:
             return False
@@ -223,23 +228,25 @@ class Tracker(Tracking):
         alive = self.window.objects.live
         try:
             rests = settle_window(
-                smoother, self.matcher, joint.kernel_px, most, joint.full_steps, alive, self._share
+                smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
-        self.trial.look_now(self.watch, smoother, self.known, self.window.restless())
+        if at_last:
+            self.trial.look_last(self.watch, smoother, self.known, self.window.restless())
         self.settled = True
         return rests
 
-    def _finish_start(self) -> None:
-        """All that is left of a start, where one can be made."""
+    def _finish_start(self) -> bool:
+        """All that is left of a start, where one can be made; whether there is an estimate."""
         try:
             started = self.starting.finish(self.matcher)
         except EXPECTED as error:
             _LOG.warning("tracker: no start: %s", error)
-            return
+            return False
         if started is not None:
             self.begin(started, self.window.last_stamp_ns or 0)
+        return self.started

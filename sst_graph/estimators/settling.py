@@ -19,6 +19,8 @@ from sst_graph.estimators.undersides import UndersideSupport
 
 _RESTS_SIGMAS = 0.02
 """A whole step shorter than this is rest."""
+_INNER = 2
+"""Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
 _PASSES = 2
 """How often a running tracker matches the whole window anew when it settles."""
 
@@ -82,7 +84,7 @@ def settle_window(
         kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         smoother.update(found, missing, 0, alive)
-        smoother.polish()
+        smoother.polish(_INNER)
         rested = i + 1 - len(kernel_px)
         left = smoother.point.core().local(at.core())
         n = len(left)

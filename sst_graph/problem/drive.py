@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,8 @@ from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, So
 from sst_graph.validation import checked_image, checked_scan
 
 FloatArray = NDArray[np.float64]
+_MOST_PIXELS = 10**8
+"""Of a mask that was stored: no camera has more."""
 Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
 
@@ -86,14 +90,27 @@ class ImageFeatures:
     contours: dict[SemanticClass, ContourMap]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The mask and the picture's edges, not the distances that follow from them."""
-        return {**vars(self), "contours": {c: contour.edges for c, contour in self.contours.items()}}
+        """The mask, packed, and the picture's edges, not the distances that follow from them."""
+        edges = {c: contour.edges for c, contour in self.contours.items()}
+        fixed = {"index": self.index, "stamp_ns": self.stamp_ns, "shape": self.mask.shape}
+        return {**fixed, "packed": self.packed, "contours": edges}
+
+    @cached_property
+    def packed(self) -> NDArray[np.uint8]:
+        """(k,) the mask's bytes, compressed once: that takes longer than all else of storing an image."""
+        return np.frombuffer(zlib.compress(self.mask.tobytes(), 1), np.uint8)
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        fields = {c: ContourMap.of(state["mask"], c, edges=edges) for c, edges in state["contours"].items()}
+        height, width = state["shape"]
+        if not (0 < height and 0 < width and height * width <= _MOST_PIXELS):
+            raise ValueError(f"a mask of {height} x {width}")
+        data = zlib.decompressobj().decompress(state["packed"].tobytes(), height * width)
+        mask = np.frombuffer(data, np.uint8).reshape(height, width)
+        fields = {c: ContourMap.of(mask, c, edges=edges) for c, edges in state["contours"].items()}
         contours = {c: field for c, field in fields.items() if field is not None}
-        for name, value in {**state, "contours": contours}.items():
-            object.__setattr__(self, name, value)
+        given = {"index": state["index"], "stamp_ns": state["stamp_ns"], "packed": state["packed"]}
+        for name, value in {**given, "mask": mask, "contours": contours}.items():
+            self.__dict__[name] = value
 
 
 @dataclass(frozen=True)
