@@ -102,7 +102,7 @@ class ImageFeatures:
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         height, width = state["shape"]
-        if not (0 < height and 0 < width and height * width <= _MOST_PIXELS):
+        if min(height, width) <= 0 or height * width > _MOST_PIXELS:
             raise ValueError(f"a mask of {height} x {width}")
         data = zlib.decompressobj().decompress(state["packed"].tobytes(), height * width)
         mask = np.frombuffer(data, np.uint8).reshape(height, width)
