@@ -53,6 +53,28 @@ Classes = Mapping[str, type]
 """Classes and enumerations that may be read, by :func:`class_name`."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PackedArray:
+    """An array of bytes that is compressed already, and stored as it is; it comes back as an array.
+
+    Attributes:
+        shape: of the array.
+        data: its bytes in C order, compressed by zlib.
+    """
+
+    shape: tuple[int, ...]
+    data: bytes
+
+    @staticmethod
+    def of(array: NDArray[np.uint8]) -> PackedArray:
+        """Compress an array; equal ones give equal bytes."""
+        return PackedArray(array.shape, zlib.compress(array.tobytes(), 1))
+
+    def array(self) -> NDArray[np.uint8]:
+        """The array."""
+        return np.frombuffer(zlib.decompress(self.data), np.uint8).reshape(self.shape)
+
+
 def stored(value: object, classes: Classes | None = None) -> tuple[Node, bytes]:
     """A value as JSON (with NaN and Infinity as text) and the bytes of its arrays.
 
@@ -122,6 +144,11 @@ class _Writer:
     def _parts_of(self, value: object) -> list[Node]:
         if isinstance(value, np.ndarray):
             return self._array(value)
+        if isinstance(value, PackedArray):
+            return ["array", "|u1", list(value.shape), "C", True, self._bytes(value.data)]
+        if isinstance(value, set | frozenset):
+            # In an order that does not depend on how it came to be.
+            return [type(value).__name__, [self.node(one) for one in sorted(value, key=repr)]]
         if isinstance(value, _SEQUENCES) and type(value) in _SEQUENCES:
             return [type(value).__name__, [self.node(one) for one in value]]
         if isinstance(value, deque):

@@ -34,12 +34,13 @@ BUDGET = "sigma_budget"
 
 
 _Sigmas = make_dataclass(
-    "_Sigmas",
+    "AssumptionSigmas",
     [
         (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
         for name, each in ASSUMPTIONS.items()
     ],
     bases=(Settings,),
+    namespace={"__module__": __name__},
     frozen=True,
 )
 if TYPE_CHECKING:
