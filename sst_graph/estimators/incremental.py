@@ -26,6 +26,7 @@ from sst_graph.estimators.tracked_marginal import TrackedMarginal, increment, tr
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
 from sst_graph.estimators.tracking import Tracking
+from sst_graph.storage import lay_out
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import LATEST_NS, checked_image, checked_scan
 
@@ -200,6 +201,7 @@ class Tracker(Tracking):
 
         The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
         """
+        lay_out(self)
         self.odometry.rebuild_map()
         if self.smoother is not None:
             self.smoother.relinearize()
