@@ -53,7 +53,8 @@ def test_the_parts_together_are_the_whole(
     told: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
 ) -> None:
     first, parts, tracker = told
-    whole, fused = tracker.marginal(), fuse_marginals([first, *parts])
+    # Parts are no answers of their own: they are added, not compared.
+    whole, fused = tracker.marginal(), fuse_marginals([first, *parts], significance=0.0)
     scale = np.sqrt(np.outer(np.diag(whole.information), np.diag(whole.information)))
     np.testing.assert_allclose(fused.information / scale, whole.information / scale, atol=1e-6)
     assert fused.cTl.equals(whole.cTl, 1e-9)
@@ -85,11 +86,16 @@ def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMargin
 def test_a_part_is_exact_however_far_the_estimate_has_moved(seed: int) -> None:
     """Fused with what was known it is the whole, though extrinsics differ by degrees and decimetres."""
     before, after = _far(seed), _far(seed + 100)
-    fused = fuse_marginals([before, increment(after, before)])
+    part = increment(after, before)
+    fused = fuse_marginals([before, part], significance=0.0)
     np.testing.assert_allclose(fused.information, after.information, rtol=1e-6, atol=1e-3)
     assert fused.cTl.equals(after.cTl, 1e-9) and fused.offset_s == pytest.approx(after.offset_s, abs=1e-10)
     again = seen_from(after, after)
     np.testing.assert_allclose(again.information, after.information, rtol=1e-12)
+    # Some of it is taken back: that is no answer to compare with others.
+    assert np.linalg.eigvalsh(part.information)[0] < 0.0
+    with pytest.raises(EstimationError, match="number 1: found information of -"):
+        fuse_marginals([before, part])
 
 
 def test_before_a_start_and_after_a_change(street: SimulatedDrive, frames: list[Frame]) -> None:
