@@ -183,8 +183,8 @@ def fuse_marginals(
 
     Raises:
         ContradictionError: they contradict one another; the message names the worst and its step.
-        EstimationError: none given, a direction that none of them tells, one that takes information away (to be
-            added with ``significance=0``), or no optimum.
+        EstimationError: none given, a direction that none of them tells, one that takes information away (to
+            be added with ``significance=0``), or no optimum.
     """
     if not marginals:
         raise EstimationError("no marginal to fuse")
