@@ -67,10 +67,10 @@ def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
-def drive_report(path: str, image_shift: int, every: int) -> dict[str, object]:
+def drive_report(path: str, image_shift: int, every: int, start_work: int) -> dict[str, object]:
     """Cost of each frame of a drive, those with a save apart, and of settling at its end."""
     source = open_source(path, image_shift=image_shift)
-    tracker = Tracker(source.camera, initial=source.nominal)
+    tracker = Tracker(source.camera, TrackerConfig(start_work=start_work), source.nominal)
     costs, saved, started = [], [], None
     with tempfile.TemporaryDirectory() as folder:
         for k, frame in enumerate(source):
@@ -109,10 +109,15 @@ def main() -> None:
     parser.add_argument("--drive", help="a drive on disk instead of a street: the cost of all its frames")
     parser.add_argument("--image-shift", type=int, default=0)
     parser.add_argument("--checkpoint-every", type=int, default=0, help="frames between saves; 0: none")
+    parser.add_argument("--start-work", type=int, default=0, help="as the setting start_work")
     args = parser.parse_args()
     if args.drive is not None:
         cv2.setNumThreads(1)
-        print(json.dumps(drive_report(args.drive, args.image_shift, args.checkpoint_every), indent=2))
+        print(
+            json.dumps(
+                drive_report(args.drive, args.image_shift, args.checkpoint_every, args.start_work), indent=2
+            )
+        )
         return
     if args.frames < WARM_UP + 20:
         parser.error(f"--frames {args.frames}: expected {WARM_UP + 20} or more, for {WARM_UP} warm up")
@@ -127,7 +132,11 @@ def main() -> None:
         )
     )
     frames, step = list(drive), STEPS.get(args.step)
-    tracker = Tracker(drive.camera, TrackerConfig(drift=DriftConfig(enabled=args.drift)), drive.nominal)
+    tracker = Tracker(
+        drive.camera,
+        TrackerConfig(start_work=args.start_work, drift=DriftConfig(enabled=args.drift)),
+        drive.nominal,
+    )
     costs, memory, alarms, chi2, settling = [], [], [], [], []
     for frame in endless(frames, args.frames):
         if step is not None and frame.index >= args.step_at:

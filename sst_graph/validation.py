@@ -70,6 +70,8 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         raise DataError(place, f"a {type(image).__name__}", "a CameraImage")
     stamp_ns = checked_stamp(image.stamp_ns, place)
     size = (camera.height, camera.width)
+    for what, array in (("mask", image.mask), ("picture", image.pixels)):
+        _check_size(array, size, what, place)
     mask = _array(image.mask, size, f"{place}: mask", "the camera's size")
     mask = _labels(mask, f"{place}: mask")
     pixels = NO_PICTURE
@@ -82,6 +84,16 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         instances = _array(image.instances, size, f"{place}: instances", "the camera's size")
         instances = _whole(instances, f"{place}: instances")
     return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances)
+
+
+def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:
+    """Height and width, where an array has these; a picture may be missing."""
+    if not isinstance(array, np.ndarray) or array.ndim < 2 or (what == "picture" and not array.size):
+        return
+    if array.shape[:2] != size:
+        (height, width), (h, w) = size, array.shape[:2]
+        expected = f"{width}x{height} px, the camera's size: make masks at the pictures' full size"
+        raise DataError(place, f"a {what} of {w}x{h} px", expected)
 
 
 def checked_stamp(stamp_ns: object, place: str) -> int:

@@ -227,7 +227,7 @@ def prepare_drive(
     tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor = LeftOut(), Surveyor(source.name, source.camera, total)
+    left_out, surveyor = LeftOut(), Surveyor(total)
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)

@@ -16,7 +16,7 @@ from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.errors import DataError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.storage import stored
-from sst_graph.types import CameraImage, Frame, Scan
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
 from sst_graph.validation import checked_image, checked_scan
 
 Rng = np.random.Generator
@@ -326,3 +326,17 @@ def test_a_new_tracker_survives_bad_first_frames(street: SimulatedDrive, frames:
     for frame in _bad(rng, frames, 40):
         update = tracker.add(frame)
         assert tracker.started == (update.status not in ("starting", "alarm"))
+
+
+def test_what_readers_leave_out_is_carried_over(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Points that were left out are counted on; a picture may be missing; a batch's scan may be empty."""
+    scan, image = frames[0].scan, frames[0].image
+    assert scan is not None and image is not None
+    assert checked_scan(dataclasses.replace(scan, left_out=3)).left_out == 3
+    with pytest.raises(DataError, match="left_out"):
+        checked_scan(dataclasses.replace(scan, left_out=-1))
+    assert not checked_image(dataclasses.replace(image, pixels=NO_PICTURE), street.camera).has_picture
+    empty = Scan(5, scan.points[:0], scan.classes[:0].astype(np.int64), left_out=2)
+    assert checked_scan(empty, fewest=0) == Scan(5, scan.points[:0], scan.classes[:0], left_out=2)
+    with pytest.raises(DataError, match="0 points, expected 1 to"):
+        checked_scan(empty)
