@@ -65,7 +65,7 @@ def run(seed: int, frames: int) -> dict[str, float]:
         )
     )
     walk = Walk.random(frames, seed)
-    tracker = Tracker(drive.camera, TrackerConfig(drift=DRIFT), drive.truth.cTl)
+    tracker = Tracker(drive.camera, TrackerConfig(start_work=0, drift=DRIFT), drive.truth.cTl)
     alarms = 0
     for frame in endless(list(drive), frames):
         alarms += tracker.add(drifted(frame, walk, drive)).alarm

@@ -4,6 +4,8 @@
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --street heavy
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
 
+    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --drive DATA --image-shift 1 --checkpoint-every 10
+
 Streets: ``plain`` has about 5,000 labelled points a scan, ``heavy`` twice as many. A simulated drive (no
 time offset) is played forth and back under rising stamps: a drive reversed in time is a drive. Times are
 CPU seconds of this process on one thread, for a busy machine must not count. All after the first hundred do,
@@ -16,6 +18,7 @@ import argparse
 import dataclasses
 import json
 import resource
+import tempfile
 import time
 from collections.abc import Iterator
 
@@ -25,8 +28,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tracker_steps import Step
 
-from sst_graph import Tracker, TrackerConfig
+from sst_graph import Tracker, TrackerConfig, open_source
 from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.estimators.checkpoint import save_checkpoint
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.types import Frame
 
@@ -63,6 +67,37 @@ def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
+def drive_report(path: str, image_shift: int, every: int, start_work: int) -> dict[str, object]:
+    """Cost of each frame of a drive, those with a save apart, and of settling at its end."""
+    source = open_source(path, image_shift=image_shift)
+    tracker = Tracker(source.camera, TrackerConfig(start_work=start_work), source.nominal)
+    costs, saved, started = [], [], None
+    with tempfile.TemporaryDirectory() as folder:
+        for k, frame in enumerate(source):
+            began = time.process_time()
+            tracker.add(frame)
+            if every:
+                tracker.make_ready()
+            saved.append(every > 0 and k % every == every - 1)
+            if saved[-1]:
+                save_checkpoint(tracker, f"{folder}/tracker.npz")
+            costs.append(1e3 * (time.process_time() - began))
+            started = k if started is None and tracker.started else started
+    began = time.process_time()
+    tracker.settle()
+    settled = time.process_time() - began
+    each, saves = np.array(costs), np.array(saved)
+    return {
+        "frames": len(each),
+        "started_with_frame": started,
+        "ms": _quantiles(each[~saves]),
+        "ms_with_a_save": _quantiles(each[saves]),
+        "max_over_median": float(each[~saves].max() / np.median(each)),
+        "settle_s": settled,
+        "status": tracker.current().status,
+    }
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=5000)
@@ -71,7 +106,19 @@ def main() -> None:
     parser.add_argument("--drift", action="store_true")
     parser.add_argument("--step", choices=("none", *STEPS), default="none")
     parser.add_argument("--step-at", type=int, default=0)
+    parser.add_argument("--drive", help="a drive on disk instead of a street: the cost of all its frames")
+    parser.add_argument("--image-shift", type=int, default=0)
+    parser.add_argument("--checkpoint-every", type=int, default=0, help="frames between saves; 0: none")
+    parser.add_argument("--start-work", type=int, default=0, help="as the setting start_work")
     args = parser.parse_args()
+    if args.drive is not None:
+        cv2.setNumThreads(1)
+        print(
+            json.dumps(
+                drive_report(args.drive, args.image_shift, args.checkpoint_every, args.start_work), indent=2
+            )
+        )
+        return
     if args.frames < WARM_UP + 20:
         parser.error(f"--frames {args.frames}: expected {WARM_UP + 20} or more, for {WARM_UP} warm up")
     cv2.setNumThreads(1)
@@ -85,7 +132,11 @@ def main() -> None:
         )
     )
     frames, step = list(drive), STEPS.get(args.step)
-    tracker = Tracker(drive.camera, TrackerConfig(drift=DriftConfig(enabled=args.drift)), drive.nominal)
+    tracker = Tracker(
+        drive.camera,
+        TrackerConfig(start_work=args.start_work, drift=DriftConfig(enabled=args.drift)),
+        drive.nominal,
+    )
     costs, memory, alarms, chi2, settling = [], [], [], [], []
     for frame in endless(frames, args.frames):
         if step is not None and frame.index >= args.step_at:

@@ -84,7 +84,8 @@ def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: Simulat
         error = np.append(
             gtsam.Pose3.Logmap(update.T_camera_lidar.between(truth)), offset_s - update.time_offset_s
         )
-        nees = error @ np.linalg.solve(update.covariance, error) / 7.0
+        known = np.diag(update.sigmas**2) if update.covariance is None else update.covariance
+        nees = error @ np.linalg.solve(known, error) / 7.0
         silent += update.status == "ok" and not update.doubt and nees > SILENT_NEES
         if k == 0 and tracker.window.motions:
             motion = tracker.window.motions[-1]
@@ -121,7 +122,7 @@ def main() -> None:
         )
         drive = simulate(config)
         frames = list(drive)
-        tracker = Tracker(drive.camera, TrackerConfig(), drive.truth.cTl.retract(GUESS))
+        tracker = Tracker(drive.camera, TrackerConfig(start_work=0), drive.truth.cTl.retract(GUESS))
         early = sum(tracker.add(frame).alarm for frame in frames[: args.before])
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = Path(folder) / "tracker.npz"

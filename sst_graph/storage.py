@@ -53,6 +53,28 @@ Classes = Mapping[str, type]
 """Classes and enumerations that may be read, by :func:`class_name`."""
 
 
+@dataclasses.dataclass(frozen=True)
+class PackedArray:
+    """An array of bytes that is compressed already, and stored as it is; it comes back as an array.
+
+    Attributes:
+        shape: of the array.
+        data: its bytes in C order, compressed by zlib.
+    """
+
+    shape: tuple[int, ...]
+    data: bytes
+
+    @staticmethod
+    def of(array: NDArray[np.uint8]) -> PackedArray:
+        """Compress an array; equal ones give equal bytes."""
+        return PackedArray(array.shape, zlib.compress(array.tobytes(), 1))
+
+    def array(self) -> NDArray[np.uint8]:
+        """The array."""
+        return np.frombuffer(zlib.decompress(self.data), np.uint8).reshape(self.shape)
+
+
 def stored(value: object, classes: Classes | None = None) -> tuple[Node, bytes]:
     """A value as JSON (with NaN and Infinity as text) and the bytes of its arrays.
 
@@ -92,6 +114,52 @@ def restored(node: Node, data: bytes | memoryview, classes: Classes) -> Any:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
+def lay_out(root: object) -> None:
+    """Give the arrays in an object the memory layout, and its sets the order, that they are read back with.
+
+    How NumPy rounds depends on the layout: only so what was stored and what is read back go on alike, to the
+    last bit.
+    """
+    known: dict[int, tuple[object, object]] = {}  # the object too, so that its id is not used again
+
+    def laid_out(value: object) -> object:
+        if isinstance(value, (*_PLAIN, enum.Enum)):
+            return value
+        if id(value) not in known:
+            known[id(value)] = (value, value)
+            known[id(value)] = (value, _laid_out(value, laid_out))
+        return known[id(value)][1]
+
+    laid_out(root)
+
+
+def _laid_out(value: Any, part: Callable[[Any], Any]) -> Any:
+    """A value with its parts laid out, in place where that goes."""
+    if isinstance(value, np.ndarray):
+        dense = value.flags.c_contiguous or value.flags.f_contiguous
+        return value if dense else np.ascontiguousarray(value)
+    if type(value) is tuple:
+        parts = tuple(part(one) for one in value)
+        return value if all(a is b for a, b in zip(parts, value, strict=True)) else parts
+    if type(value) is set:
+        ordered = sorted(value, key=repr)
+        value.clear()
+        value.update(ordered)
+    elif isinstance(value, list | deque):
+        for place, one in enumerate(value):
+            value[place] = part(one)
+    elif type(value) is dict:
+        for key, one in value.items():
+            value[key] = part(one)
+    elif class_name(type(value)).startswith(_PACKAGES):
+        attributes = vars(value) if hasattr(value, "__dict__") else {}
+        for name, one in _state(value).items():
+            # What is stored otherwise than it is kept is made anew when it is read.
+            if attributes.get(name) is one and part(one) is not one:
+                object.__setattr__(value, name, part(one))
+    return value
+
+
 def class_name(cls: type) -> str:
     """The name under which a class or an enumeration is stored: "module:name"."""
     return f"{cls.__module__}:{cls.__qualname__}"
@@ -122,6 +190,11 @@ class _Writer:
     def _parts_of(self, value: object) -> list[Node]:
         if isinstance(value, np.ndarray):
             return self._array(value)
+        if isinstance(value, PackedArray):
+            return ["array", "|u1", list(value.shape), "C", True, self._bytes(value.data)]
+        if isinstance(value, set | frozenset):
+            # In an order that does not depend on how it came to be.
+            return [type(value).__name__, [self.node(one) for one in sorted(value, key=repr)]]
         if isinstance(value, _SEQUENCES) and type(value) in _SEQUENCES:
             return [type(value).__name__, [self.node(one) for one in value]]
         if isinstance(value, deque):

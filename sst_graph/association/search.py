@@ -20,6 +20,7 @@ from factors.camera import PinholeCamera
 from sst_graph.association.votes import CELLS, Judge, Level, SearchFrame, States, Votes
 from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -100,6 +101,18 @@ def search_start(
     offset_s: float = 0.0,
     config: SearchConfig | None = None,
 ) -> list[Candidate]:
+    """All steps of :func:`searching_start`."""
+    return whole(searching_start(frames, camera, classes, guess, offset_s, config))
+
+
+def searching_start(
+    frames: Sequence[SearchFrame],
+    camera: PinholeCamera,
+    classes: Sequence[SemanticClass],
+    guess: gtsam.Pose3 | None,
+    offset_s: float = 0.0,
+    config: SearchConfig | None = None,
+) -> Stepwise[list[Candidate]]:
     """Refined candidates of several families in turn, best first in each.
 
     A family is one score with the translation held or free.
@@ -113,10 +126,14 @@ def search_start(
     config = config or SearchConfig()
     rng = np.random.default_rng(config.seed)
     votes = Votes.gather(frames, camera, classes, config.points_per_class, rng)
+    yield 5
     families = []
     for judge in config.judges:
-        levels = [votes.level(*pair, judge) for pair in zip(config.blurs_px, config.shares, strict=True)]
-        families += _families(levels, guess, offset_s, votes.moving, config, rng)
+        levels = []
+        for blur_px, share in zip(config.blurs_px, config.shares, strict=True):
+            levels.append(votes.level(blur_px, share, judge))
+            yield 5
+        families += yield from _families(levels, guess, offset_s, votes.moving, config, rng)
     found = [c for several in itertools.zip_longest(*families) for c in several if c is not None]
     cells = len(frames) * CELLS[0] * CELLS[1]
     return [replace(candidate, score=candidate.score / cells) for candidate in found]
@@ -129,14 +146,15 @@ def _families(
     moving: bool,
     config: SearchConfig,
     rng: np.random.Generator,
-) -> list[list[Candidate]]:
+) -> Stepwise[list[list[Candidate]]]:
     """Candidates under one score: with the translation held near the guess, and free."""
     # 1. A grid of rotations on the most blurred masks.
     rotations, translation = _grid(guess, config)
     states = States(rotations, np.tile(translation, (len(rotations), 1)), np.full(len(rotations), offset_s))
     breadth = config.free_breadth if guess is None else 1
     apart = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
-    best, _ = _peaks(states, levels[0].score(states), breadth * config.candidates[0], 1.5 * apart)
+    scores = yield from levels[0].scoring(states)
+    best, _ = _peaks(states, scores, breadth * config.candidates[0], 1.5 * apart)
     # 2. Refined at every blur, fewer surviving each: with the translation held near the guess, and free.
     #    The first is hard to mislead, for it has less to give way with; the second reaches farther.
     spread_r = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
@@ -145,7 +163,7 @@ def _families(
     for spread_t in (config.held_translation_m, free_t):
         scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s * moving])
         limits = _Limits(translation, spread_t, offset_s, config.delay_s)
-        families.append(_refined(best, levels, guess, scale, limits, config, rng))
+        families.append((yield from _refined(best, levels, guess, scale, limits, config, rng)))
     return families
 
 
@@ -157,16 +175,17 @@ def _refined(
     limits: _Limits,
     config: SearchConfig,
     rng: np.random.Generator,
-) -> list[Candidate]:
+) -> Stepwise[list[Candidate]]:
     """Candidates after all blurs, the best first, with their plain scores."""
     breadth = config.free_breadth if guess is None else 1
     scores = np.zeros(len(best))
     for number, (level, blur) in enumerate(zip(levels, config.blurs_px, strict=True)):
         shrunk = scale * (blur / config.blurs_px[0]) ** 0.7
-        moved = _cross_entropy(level, best, shrunk, limits, config, rng)
+        moved = yield from _cross_entropy(level, best, shrunk, limits, config, rng)
         near = moved.take(_within(moved, guess, np.radians(config.reach_deg)))
         keep = breadth * config.candidates[min(number + 1, len(config.candidates) - 1)]
-        best, scores = _peaks(near, level.score(near), keep, np.radians(config.apart_deg))
+        found = yield from level.scoring(near)
+        best, scores = _peaks(near, found, keep, np.radians(config.apart_deg))
     return [
         Candidate(gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t), float(offset), float(score))
         for R, t, offset, score in zip(best.rotations, best.translations, best.offsets, scores, strict=True)
@@ -262,21 +281,21 @@ def _cross_entropy(
     limits: _Limits,
     config: SearchConfig,
     rng: np.random.Generator,
-) -> States:
+) -> Stepwise[States]:
     """Each state moved to a better one nearby, sorted by score."""
     elite = max(4, config.population // 8)
     m, n = len(states), config.population
     sigmas = np.tile(scale, (m, 1))
-    incumbent, scores = states, level.score(states)
+    incumbent, scores = states, (yield from level.scoring(states))
     for _ in range(config.rounds):
         delta = rng.standard_normal((m, n, 7)) * sigmas[:, None, :]
         delta[:, 0] = 0.0
         samples = limits.clip(_perturbed(incumbent, delta))
-        values = level.score(samples).reshape(m, n)
+        values = (yield from level.scoring(samples)).reshape(m, n)
         order = np.argsort(-values, axis=1, kind="stable")[:, :elite]
         chosen = np.take_along_axis(delta, order[:, :, None], axis=1)
         mean = limits.clip(_perturbed(incumbent, chosen.mean(axis=1, keepdims=True)))
-        mean_scores = level.score(mean)
+        mean_scores = yield from level.scoring(mean)
         top = samples.take(np.arange(m) * n + order[:, 0])
         top_scores = np.take_along_axis(values, order[:, :1], axis=1)[:, 0]
         use_mean = mean_scores >= top_scores

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from sst_graph.errors import EstimationError
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -109,10 +110,15 @@ class Level:
 
     def score(self, states: States) -> FloatArray:
         """(m,) scores of poses."""
+        return whole(self.scoring(states))
+
+    def scoring(self, states: States) -> Stepwise[FloatArray]:
+        """(m,) scores of poses, step by step."""
         chunk = max(1, _BATCH_POINTS // max(1, len(self.lPs)))
-        scores = [
-            self._score(states.take(slice(start, start + chunk))) for start in range(0, len(states), chunk)
-        ]
+        scores = []
+        for start in range(0, len(states), chunk):
+            scores.append(self._score(states.take(slice(start, start + chunk))))
+            yield 2
         return np.concatenate(scores)
 
     def _score(self, states: States) -> FloatArray:

@@ -155,7 +155,6 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
     track.add_argument(
         "--init",
         metavar="dataset|none|FILE",
-        default="dataset",
         help="start: the data's nominal calibration (default), no guess at all, or a file",
     )
     track.add_argument("--classes", metavar="vehicle|all|A,B", help="classes to align")
@@ -167,7 +166,8 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
     track.add_argument(
         "--resume",
         action="store_true",
-        help="go on from the checkpoint, if it is there, with the frames after it",
+        help="go on from the checkpoint, if it is there, with the frames after it; the drive must be the one "
+        "it was saved on, and options that are given those it was made with",
     )
     track.add_argument("--out", type=Path, metavar="FILE", help="write the last estimate as calibration.json")
     track.add_argument("--overwrite", action="store_true", help="replace the checkpoint and the result")

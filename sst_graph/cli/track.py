@@ -12,9 +12,10 @@ from sst_graph.cli.inputs import chosen_classes, settings, starting_point
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
-from sst_graph.errors import ConfigError, DataError
+from sst_graph.errors import ConfigError
 from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.resume import Setup, check_setup, frames_to_come
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_result import tracker_result
@@ -22,6 +23,8 @@ from sst_graph.files import output_file
 from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
 from sst_graph.result import CalibrationResult, Status
 from sst_graph.types import Frame, Source
+
+_OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,37 +39,53 @@ def run(args: argparse.Namespace) -> int:
             replace = args.resume or args.overwrite
             outputs.enter_context(output_file(args.checkpoint, replace, CHECKPOINT_FILE))
         read_as = options_of(args)
-        source = open_drive(args, args.data)
-        tracker = _tracker(args, source)
-        source = with_sweep(source, tracker.config.calibration.sweep)
-        tracker = _track(args, source, tracker)
-        tracker.settle()
+        tracker, source, frames = _begun(args, open_drive(args, args.data))
+        tracker, last = _track(args, source, tracker, frames)
         result = _with_decision(tracker_result(tracker, source.name, args.camera), source)
         result = dataclasses.replace(result, read_as=read_as)
         if out is not None:
             out.write_text(result.to_json())
-    return _verdict(tracker.current(), result)
+    return _verdict(last, result)
 
 
-def _track(args: argparse.Namespace, source: Source, tracker: Tracker) -> Tracker:
-    """Add the frames that the tracker has not seen, and save it as it goes; the tracker after the last.
+def _track(
+    args: argparse.Namespace, source: SweptSource, tracker: Tracker, frames: Iterator[Frame]
+) -> tuple[Tracker, TrackUpdate]:
+    """Add the frames, and save the tracker as it goes; the settled tracker after the last, and its answer.
 
-    With a checkpoint it is the one that the file holds, its arrays laid out as in the file: the result is the
-    same to the last bit whether the run was broken off and resumed or not.
+    What the last line says is what is written. With a checkpoint the tracker that settles is the one that the
+    file holds, its arrays laid out as in the file: the result is the same to the last bit whether the run was
+    broken off and resumed or not.
     """
+    update = None
+    for number, (frame, is_last) in enumerate(_with_last(frames), 1):
+        update = tracker.add(frame)
+        if args.checkpoint is not None:
+            tracker.make_ready()
+            if is_last or number % args.checkpoint_every == 0:
+                save_checkpoint(tracker, args.checkpoint)
+        if is_last:
+            tracker, update = _settled(args, source, tracker, update)
+        say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
+    if update is not None:
+        return tracker, update
     # A save consolidates the tracker: what is saved already is not saved again.
-    unsaved = args.checkpoint is not None and not args.checkpoint.exists()
-    for number, frame in enumerate(_after(source, tracker.window.last_stamp_ns), 1):
-        say(json.dumps({"frame": frame.index, **tracker.add(frame).to_dict()}, allow_nan=False))
-        unsaved = args.checkpoint is not None
-        if unsaved and number % args.checkpoint_every == 0:
-            save_checkpoint(tracker, args.checkpoint)
-            unsaved = False
-    if unsaved:
+    if args.checkpoint is not None and not args.checkpoint.exists():
         save_checkpoint(tracker, args.checkpoint)
-    if args.checkpoint is None:
-        return tracker
-    return load_checkpoint(args.checkpoint)
+    return _settled(args, source, tracker, None)
+
+
+def _settled(
+    args: argparse.Namespace, source: SweptSource, tracker: Tracker, update: TrackUpdate | None
+) -> tuple[Tracker, TrackUpdate]:
+    """The tracker that is saved, or the one given where none is, settled; and the last answer from it."""
+    if args.checkpoint is not None:
+        tracker = load_checkpoint(args.checkpoint)
+    tracker.settle()
+    last = tracker.current(update)
+    if last.status == "ok" and _is_open(source):
+        last = dataclasses.replace(last, status="unconfirmed", doubt=_OPEN_SWEEP)
+    return tracker, last
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -82,45 +101,63 @@ def _check(args: argparse.Namespace) -> None:
     )
 
 
-def _tracker(args: argparse.Namespace, source: Source) -> Tracker:
-    """The tracker of the checkpoint where one is resumed and exists, else a new one."""
-    if args.resume and args.checkpoint.exists():
-        tracker = load_checkpoint(args.checkpoint)
-        if tracker.camera != source.camera:
-            raise DataError(args.checkpoint, "another camera", f"the camera of {source.name}")
-        return tracker
-    default = TrackerConfig()
-    config = settings(default, args, {"calibration.classes": chosen_classes(args.classes)})
-    warn_of_other_pairs(args.init, options_of(args))
-    initial, offset_s = starting_point(args.init, source, args.camera)
-    return Tracker(source.camera, config, initial, offset_s)
+def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSource, Iterator[Frame]]:
+    """The tracker of the checkpoint where one is resumed and exists, else a new one; its drive and frames.
+
+    Raises:
+        DataError: the checkpoint is of another drive, other sensors, settings or another guess.
+    """
+    flags = {"calibration.classes": chosen_classes(args.classes)}
+    config = settings(TrackerConfig(), args, flags)
+    if args.init is not None:
+        warn_of_other_pairs(args.init, options_of(args))
+    if not (args.resume and args.checkpoint.exists()):
+        initial, offset_s = starting_point(args.init or "dataset", source, args.camera)
+        tracker = Tracker(source.camera, config, initial, offset_s)
+        swept = with_sweep(source, config.calibration.sweep)
+        return tracker, swept, iter(swept)
+    tracker = load_checkpoint(args.checkpoint)
+    made = tracker.setup
+    initial, offset_s = made.initial, made.initial_offset_s
+    if args.init is not None:
+        initial, offset_s = starting_point(args.init, source, args.camera)
+    # What is not asked for is the checkpoint's.
+    asked = settings(made.config, args, flags)
+    check_setup(tracker, Setup(source.camera, asked, initial, offset_s), args.checkpoint)
+    swept = with_sweep(source, made.config.calibration.sweep)
+    return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 
 
-def _after(source: Source, stamp_ns: int | None) -> Iterator[Frame]:
-    """Frames of a drive later than a scan's stamp; earlier ones are read past."""
-    for frame in source:
-        newest = frame.scan.stamp_ns if frame.scan is not None else None
-        if newest is None and frame.image is not None:
-            newest = frame.image.stamp_ns
-        if stamp_ns is None or (newest is not None and newest > stamp_ns):
-            yield frame
+def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:
+    """Each frame, and whether it is the last; it is given before an error of the one behind it is raised."""
+    waiting = next(frames, None)
+    while waiting is not None:
+        try:
+            following = next(frames, None)
+        except Exception:
+            yield waiting, False
+            raise
+        yield waiting, following is None
+        waiting = following
 
 
 def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
     """The result with what was decided of the sweep; not to be trusted where the scans did not tell it."""
-    decision = source.sweep_decision
-    diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: decision.to_dict()}}
+    diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: source.sweep_decision.to_dict()}}
     result = dataclasses.replace(result, diagnostics=diagnostics)
-    if decision.kind != "undecided" or not decision.others:
+    if not _is_open(source):
         return result
-    reason = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
     status: Status = "not_converged" if result.status == "ok" else result.status
-    return dataclasses.replace(result, status=status, reasons=(*result.reasons, reason))
+    return dataclasses.replace(result, status=status, reasons=(*result.reasons, _OPEN_SWEEP))
+
+
+def _is_open(source: SweptSource) -> bool:
+    """Whether the scans leave it open, and it makes a difference."""
+    return source.sweep_decision.kind == "undecided" and bool(source.sweep_decision.others)
 
 
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
-    if last.status == result.status == "ok":
+    if last.status == "ok":
         return 0
-    status = result.status if last.status == "ok" else last.status
-    complain(f"{status}: {'; '.join(result.reasons)}")
+    complain(f"{last.status}: {'; '.join(result.reasons)}")
     return 3

@@ -25,13 +25,14 @@ import numpy as np
 from sst_graph.checked import checked_camera
 from sst_graph.errors import CheckpointError, DataError
 from sst_graph.estimators.incremental import Tracker
+from sst_graph.estimators.resume import Setup, check_memory, check_setup
 from sst_graph.files import atomic_write_bytes
 from sst_graph.input_files import FileKind, parse_json, read_file
 from sst_graph.storage import class_name, restored, stored
 from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
-VERSION = 15
+VERSION = 16
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -48,6 +49,7 @@ _MAX_DEPTH = 200
 
 _PACKAGES = (
     "factors",
+    "sst_graph.assumptions",
     "sst_graph.association",
     "sst_graph.estimators",
     "sst_graph.odometry",
@@ -79,11 +81,18 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
     atomic_write_bytes(path, stream.getvalue())
 
 
-def load_checkpoint(path: str | Path) -> Tracker:
+def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
+
+    Whether it goes on with the drive that it was saved on, :func:`sst_graph.estimators.resume.frames_to_come`
+    tells.
+
+    Args:
+        setup: camera, settings and guess that it must have been made with; None for any.
 
     Raises:
         CheckpointError: no such file, not a checkpoint of this version, or one that was changed or damaged.
+        DataError: one of a tracker that was made with another camera, other settings or another guess.
     """
     try:
         head, data = _members(read_file(path, CHECKPOINT), path)
@@ -101,7 +110,11 @@ def load_checkpoint(path: str | Path) -> Tracker:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         _rehearse(_tracker(document.get("tracker"), data, path), path)
-        return _tracker(document.get("tracker"), data, path)
+        tracker = _tracker(document.get("tracker"), data, path)
+        tracker.starting.catch_up()
+    if setup is not None:
+        check_setup(tracker, setup, path)
+    return tracker
 
 
 def _tracker(node: Any, data: memoryview, path: str | Path) -> Tracker:
@@ -122,6 +135,8 @@ def _rehearse(tracker: Tracker, path: str | Path) -> None:
     """
     try:
         checked_camera(tracker.camera, "camera")
+        check_memory(tracker)
+        tracker.starting.catch_up()
         tracker.current().to_dict()
         tracker.consolidate()
         _again(tracker)
@@ -151,8 +166,8 @@ def checkpoint_classes() -> dict[str, type]:
     modules = []
     for package in map(importlib.import_module, _PACKAGES):
         modules.append(package)
-        names = (info.name for info in pkgutil.iter_modules(getattr(package, "__path__", ())))
-        modules += [importlib.import_module(f"{package.__name__}.{name}") for name in names]
+        found = pkgutil.walk_packages(getattr(package, "__path__", ()), f"{package.__name__}.")
+        modules += [importlib.import_module(info.name) for info in found]
     return {
         class_name(cls): cls
         for module in modules

@@ -13,12 +13,13 @@ from sst_graph.association.crowd import Poses, Steps
 from sst_graph.association.search import Candidate, SearchConfig
 from sst_graph.association.votes import States
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.heats import Field, hold_heat
+from sst_graph.estimators.heats import Field, holding_heat
 from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, solve_joint
-from sst_graph.estimators.start import StartConfig, find_start, label_scores
+from sst_graph.estimators.start import StartConfig, finding_start, scoring_labels
 from sst_graph.problem.drive import Drive, Progress
 from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.state import State
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -60,6 +61,20 @@ def choose_start(
     joint: JointConfig,
     config: StartConfig,
 ) -> Contest:
+    """All steps of :func:`choosing_start`."""
+    steps = choosing_start(drives, tracks, classes, guess_cTl, guess_offset_s, joint, config)
+    return whole(steps)
+
+
+def choosing_start(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    joint: JointConfig,
+    config: StartConfig,
+) -> Stepwise[Contest]:
     """Search for a start and let the candidates compete.
 
     Without a guess a second search looks closer around the best of the first that are far from each other.
@@ -68,15 +83,17 @@ def choose_start(
         EstimationError: no candidate leads anywhere.
     """
     coarse = replace(config, search=_coarse(config))
-    candidates = find_start(drives, tracks, classes, guess_cTl, guess_offset_s, coarse)
-    contest = hold_contest(drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config)
+    candidates = yield from finding_start(drives, tracks, classes, guess_cTl, guess_offset_s, coarse)
+    contest = yield from holding_contest(
+        drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config
+    )
     if guess_cTl is not None:
         return contest
     closer = []
     for cTl, offset_s in contest.leads:
-        around = find_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
+        around = yield from finding_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
         closer += [Candidate(cTl, offset_s, contest.score), *around[: config.contenders]]
-    return hold_contest(drives, tracks, classes, closer, None, guess_offset_s, joint, config)
+    return (yield from holding_contest(drives, tracks, classes, closer, None, guess_offset_s, joint, config))
 
 
 def hold_contest(
@@ -89,6 +106,21 @@ def hold_contest(
     joint: JointConfig,
     config: StartConfig,
 ) -> Contest:
+    """All steps of :func:`holding_contest`."""
+    steps = holding_contest(drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config)
+    return whole(steps)
+
+
+def holding_contest(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    candidates: Sequence[Candidate],
+    guess_cTl: gtsam.Pose3 | None,
+    guess_offset_s: float,
+    joint: JointConfig,
+    config: StartConfig,
+) -> Stepwise[Contest]:
     """Solve the best candidates on a few scans; the solution that the labels agree with most wins.
 
     Raises:
@@ -101,20 +133,22 @@ def hold_contest(
     few = [_thinned(drive, config.contest_scans) for drive in drives]
     field = Field.of(few, tracks, classes, _simple(joint.graph, config))
     quick = field.thinned(config.heat_points)
+    yield 10
     contenders = config.free_contenders if guess_cTl is None else config.contenders
     poses = _poses(_with_offsets(candidates[:contenders], guess_offset_s), field.biases)
     centres = _centres(poses, guess_cTl, guess_offset_s)
     for kernels_px in _wide_heats(joint):
-        poses = hold_heat(quick, poses, centres, kernels_px)
-        kept = _survivors(poses, quick.steps(poses, kernels_px[-1]), config)
+        poses = yield from holding_heat(quick, poses, centres, kernels_px)
+        steps = yield from quick.stepping(poses, kernels_px[-1])
+        kept = _survivors(poses, steps, config)
         poses, centres = poses.take(kept), centres.take(kept)
     # 2. What is left under narrow ones, on all points.
     narrow = narrowed(joint).kernel_px
-    poses = hold_heat(field, poses, centres, (*narrow, *[narrow[-1]] * config.settling))
+    poses = yield from holding_heat(field, poses, centres, (*narrow, *[narrow[-1]] * config.settling))
     # 3. The best that stayed within reach, by boundaries and by all labels.
-    steps = field.steps(poses, narrow[-1])
+    steps = yield from field.stepping(poses, narrow[-1])
     states = States(poses.rotations, poses.translations, poses.offsets)
-    scores = label_scores(drives, tracks, classes, states, guess_offset_s, config)
+    scores = yield from scoring_labels(drives, tracks, classes, states, guess_offset_s, config)
     ranks = _agreements(steps) * np.sqrt(np.maximum(scores, 0.0)) * _within(poses, guess_cTl, config)
     order = _different(poses, ranks)
     if ranks[order[0]] <= 0.0:

@@ -8,7 +8,7 @@ the winner is only a start.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import gtsam
 import numpy as np
@@ -21,6 +21,7 @@ from sst_graph.association.search import rotation_matrices
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.trajectory import TwistSample
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -30,6 +31,8 @@ _LONGEST_RAD, _LONGEST_M, _LONGEST_S, _LONGEST_PX = 0.1, 0.3, 0.1, 3.0
 """Longest step of one iteration."""
 _NEAR_NS = 4_000_000
 """Twists this close in time are one [ns]."""
+_POINTS_A_STEP = 32_000
+"""Boundary points, times poses, that are matched in one step."""
 _DAMPING = 1e-3
 """Of a Gauss-Newton step, as a share of the diagonal of the normal equations."""
 
@@ -73,7 +76,21 @@ class Field:
         return Field(parts, self._tracks, self.config)
 
     def steps(self, poses: Poses, scale_px: float) -> Steps:
-        """Normal equations of all drives, one mask bias for each class in each drive."""
+        """All steps of :meth:`stepping`."""
+        return whole(self.stepping(poses, scale_px))
+
+    def stepping(self, poses: Poses, scale_px: float) -> Stepwise[Steps]:
+        """Normal equations of all drives, one mask bias for each class in each drive; some poses a step."""
+        points = max(1, sum(len(part.outlines) for part in self._parts))
+        some = max(1, _POINTS_A_STEP // points)
+        parts = []
+        for start in range(0, len(poses), some):
+            parts.append(self._steps(poses.take(np.arange(start, min(start + some, len(poses)))), scale_px))
+            yield 3
+        names = [field.name for field in fields(Steps)]
+        return Steps(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def _steps(self, poses: Poses, scale_px: float) -> Steps:
         kernel = RobustKernel("geman_mcclure", scale_px)
         m, k = len(poses), 7 + self.biases
         H, g, support, seen = np.zeros((m, k, k)), np.zeros((m, k)), np.zeros(m), np.zeros(m)
@@ -117,6 +134,11 @@ class Field:
 
 
 def hold_heat(field: Field, poses: Poses, centres: Poses, kernels_px: Sequence[float]) -> Poses:
+    """All steps of :func:`holding_heat`."""
+    return whole(holding_heat(field, poses, centres, kernels_px))
+
+
+def holding_heat(field: Field, poses: Poses, centres: Poses, kernels_px: Sequence[float]) -> Stepwise[Poses]:
     """The poses after one step under each kernel.
 
     Args:
@@ -124,7 +146,8 @@ def hold_heat(field: Field, poses: Poses, centres: Poses, kernels_px: Sequence[f
         kernels_px: scales of the robust kernel, step by step [px].
     """
     for scale_px in kernels_px:
-        poses = _stepped(poses, centres, field.steps(poses, scale_px), field.config)
+        steps = yield from field.stepping(poses, scale_px)
+        poses = _stepped(poses, centres, steps, field.config)
     return poses
 
 

@@ -5,51 +5,43 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import deque
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
-from factors.errors import FactorError
-from sst_graph.errors import EstimationError
-from sst_graph.estimators.admission import check_image, check_scan
-from sst_graph.estimators.adoption import Adoption
-from sst_graph.estimators.arrivals import Arrivals
-from sst_graph.estimators.gaussian import Point
-from sst_graph.estimators.history import History, HistoryEntry
+from sst_graph.errors import DataError, EstimationError
+from sst_graph.estimators.contest import narrowed
+from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.known import Known
-from sst_graph.estimators.matcher import WindowMatcher
-from sst_graph.estimators.renewal import scans_to_match
-from sst_graph.estimators.rhythm import Clocks, Jump
-from sst_graph.estimators.settling import Milestones, Settling, settle_window
-from sst_graph.estimators.smoother import WindowSmoother
-from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
+from sst_graph.estimators.resume import FirstFrames, Setup
+from sst_graph.estimators.settling import settle_window
+from sst_graph.estimators.snapshot import Snapshot
+from sst_graph.estimators.starting import EXPECTED
+from sst_graph.estimators.track_update import Sensor, TrackUpdate
+from sst_graph.estimators.tracked_marginal import TrackedMarginal, increment, tracked_marginal
 from sst_graph.estimators.tracker_config import TrackerConfig
-from sst_graph.estimators.tracker_start import Guess, first_estimate, prior_belief
-from sst_graph.estimators.trial import Trial
-from sst_graph.estimators.undersides import without_undersides
-from sst_graph.estimators.watch import Watch
-from sst_graph.estimators.window import Window
-from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
-from sst_graph.result import WeakDirection
-from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan
-from sst_graph.uncertainty.common_error import common_covariance
-from sst_graph.uncertainty.observability import open_directions
+from sst_graph.estimators.tracker_start import Guess
+from sst_graph.estimators.tracking import Tracking
+from sst_graph.storage import lay_out
+from sst_graph.types import CameraImage, Frame, Scan
+from sst_graph.validation import LATEST_NS, checked_image, checked_scan
 
 _LOG = logging.getLogger(__name__)
 
-FloatArray = NDArray[np.float64]
+_MOST_FAILURES = 10
+"""After so many scans or images in a row that could not be taken in, what is kept is the likely reason."""
 
 
-class Tracker:
+class Tracker(Tracking):
     """Extrinsic and time offset of one LiDAR and one camera, frame by frame.
 
     Frames, or scans and images on their own, come in the order of their stamps (images may come a little
-    late). Nothing that a frame brings raises: a frame that cannot be used leaves the estimate as it was,
-    and the answer says why.
+    late). Nothing that they bring raises: what cannot be used, whatever its arrays hold, leaves everything as
+    it was, and the answer says why.
     """
 
     def __init__(
@@ -60,101 +52,142 @@ class Tracker:
         initial_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        self.camera = camera
-        self.config = config or TrackerConfig()
-        calibration = self.config.calibration
-        self.classes = calibration.classes
-        self.window = Window(camera, self.config.window)
-        self.matcher = WindowMatcher(self.window, self.config)
-        self.odometry = LidarOdometry(calibration.prepare.lidar_odometry)
-        self.last_scan: Scan | None = None
-        self.guess = Guess(initial, initial_offset_s, calibration.start.enabled)
-        self.smoother: WindowSmoother | None = None
-        self.known = Known.nothing()
-        sigma_px = calibration.joint.graph.object_bias_sigma_px
-        self.watch = Watch(self.matcher, self.config.alarm, sigma_px)
-        self.clocks = Clocks(self.config.alarm.chi2)
-        self.adoption = Adoption(self.config.adoption)
-        self.history_store = History(self.config.drift.history)
-        self.entered: deque[int] = deque(maxlen=4 * self.config.window)
-        self.milestones = Milestones(0, self.config.window, self.config.window)
-        self.settling: Settling | None = None
-        self.arrivals = Arrivals()
-        self.alarmed = False
-        self.attempts = 0
-        self.waited = 0
-        self.trial = Trial(self.config)
-        self.doubt = ""
+        super().__init__(camera, config or TrackerConfig(), Guess(initial, initial_offset_s))
+        self.setup = Setup(camera, self.config, initial, initial_offset_s)
+        self.first_frames = FirstFrames()
+        self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
+        self.settled = False
 
     @property
-    def started(self) -> bool:
-        """Whether there is an estimate beyond the guess."""
-        return self.smoother is not None
+    def newest_ns(self) -> int | None:
+        """Stamp of the newest scan that was taken in [ns]."""
+        return self.scan_order.newest_ns
 
-    @property
-    def point(self) -> Point:
-        """The present estimate, or the guess."""
-        if self.smoother is not None:
-            return self.smoother.point
-        return Point.unbiased(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, self.classes)
-
-    @property
-    def covariance(self) -> FloatArray:
-        """(m, m) of extrinsic [rad, m], time offset [s] and mask biases [px]; wide before the start."""
-        return self.known.covariance
-
-    @property
-    def adopted(self) -> Point | None:
-        """The calibration in use: the last candidate that its covariance and held-out frames spoke for."""
-        return self.adoption.adopted
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what failed."""
+        return {**vars(self), "failures": deque(maxlen=_MOST_FAILURES)}
 
     def add(self, frame: Frame) -> TrackUpdate:
-        """Take in a frame; its image, or its scan, may be missing."""
-        if frame.image is None and frame.scan is None:
-            return self._answer(0, "a frame without scan and without image")
-        reason = ""
-        if frame.image is not None:
-            update = self.add_image(frame.image)
-            if frame.scan is None:
-                return update
-            reason = update.reason
-        assert frame.scan is not None
+        """Take in a frame; its image, or its scan, may be missing, and either may be refused alone."""
+        if not isinstance(frame, Frame) or (frame.image is None and frame.scan is None):
+            return self.answer(0, "a frame without scan and without image")
+        of_image = None if frame.image is None else self.add_image(frame.image)
+        if frame.scan is None:
+            assert of_image is not None
+            return of_image
         update = self.add_scan(frame.scan)
-        if reason and update.accepted:
-            return dataclasses.replace(update, accepted=False, reason=reason)
-        return update
+        if of_image is None or of_image.accepted:
+            return update
+        reason = "; ".join(filter(None, (of_image.reason, update.reason)))
+        return dataclasses.replace(
+            update, accepted=False, reason=reason, refused=(*of_image.refused, *update.refused)
+        )
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Take in an image; it is used as soon as a scan close to it in true time is there."""
         try:
-            check_image(image, self.camera, self.window, self.point.offset_s, self.config.late_s)
-            self.clocks.take_image(image.stamp_ns, self.window.place)
-            picture = self.config.calibration.prepare.picture
-            self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
-        except Exception as error:
-            return self._answer(image.stamp_ns, str(error))
-        return self._answer(image.stamp_ns)
+            checked = checked_image(image, self.camera)
+            moved_ns = self.image_order.check(checked.stamp_ns)
+        except DataError as error:
+            return self._refused("image", image, str(error))
+        return self._whole("image", checked, partial(self.take_image, checked, moved_ns))
 
     def add_scan(self, scan: Scan) -> TrackUpdate:
         """Take in a scan, match it and whatever of the window is to be renewed, and estimate."""
         try:
-            check_scan(scan, self.window)
-            jump = self.clocks.take_scan(scan.stamp_ns, self.window.place)
-            number = self._take_scan(scan)
-        except Exception as error:
-            return self._answer(scan.stamp_ns, str(error))
-        try:
-            if jump is not None and self.config.alarm.enabled and self.config.alarm.stamps:
-                return self._jumped(jump, scan.stamp_ns)
-            if self.smoother is None:
-                return self._start(scan.stamp_ns)
-            return self._track(scan.stamp_ns, number)
-        except Exception as error:
-            return self._answer(scan.stamp_ns, " ".join(str(error).split()))
+            checked = checked_scan(scan)
+            moved_ns = self.scan_order.check(checked.stamp_ns)
+        except DataError as error:
+            return self._refused("scan", scan, str(error))
+        return self._whole("scan", checked, partial(self.take_scan, checked, moved_ns))
 
-    def current(self) -> TrackUpdate:
-        """The present estimate as an answer, without a frame."""
-        return self._answer(self.window.last_stamp_ns or 0)
+    def _whole(
+        self, sensor: Sensor, data: Scan | CameraImage, take: Callable[[], TrackUpdate]
+    ) -> TrackUpdate:
+        """Take in a sensor's data whole; where anything fails, everything is as it was."""
+        before = Snapshot(self)
+        try:
+            self.settled = False
+            update = take()
+            self.first_frames.take(data)
+        except DataError as error:
+            before.restore()
+            return self._refused(sensor, data, str(error))
+        except Exception as error:
+            before.restore()
+            if not isinstance(error, EXPECTED):
+                _LOG.exception("tracker: an error while a %s was taken in", sensor)
+            return self._failed(sensor, data, " ".join(f"{type(error).__name__}: {error}".split())[:300])
+        except BaseException:
+            before.restore()
+            raise
+        if sensor == "scan":
+            self.failures.clear()
+        return update
+
+    def _refused(self, sensor: Sensor, data: object, why: str) -> TrackUpdate:
+        """The answer to data that are not taken in."""
+        stamp_ns = getattr(data, "stamp_ns", 0)
+        known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
+        return dataclasses.replace(self.answer(int(stamp_ns) if known else 0, why), refused=(sensor,))
+
+    def _failed(self, sensor: Sensor, data: object, why: str) -> TrackUpdate:
+        """The answer to data that could not be taken in; if that goes on, the window is given up."""
+        self.failures.append(why)
+        if len(self.failures) == self.failures.maxlen:
+            _LOG.warning("tracker: begins anew after %d failures: %s", len(self.failures), why)
+            self.forget_all(Guess(self.point.cTl, self.point.offset_s, self.guess.search))
+            why = f"{why}; the tracker begins anew"
+        return self._refused(sensor, data, why)
+
+    def current(self, after: TrackUpdate | None = None) -> TrackUpdate:
+        """The present estimate as an answer, without a frame.
+
+        Args:
+            after: answer to the last frame; what it says of that frame stays.
+        """
+        update = dataclasses.replace(self.answer(self.window.last_stamp_ns or 0), settled=self.settled)
+        if after is None:
+            return update
+        of_frame = ["stamp_ns", "refused", "chi2", "alarm", "adopted"]
+        if after.covariance is not None or update.covariance is None or after.refused:
+            of_frame += ["accepted", "reason"]
+        return dataclasses.replace(update, **{name: getattr(after, name) for name in of_frame})
+
+    def marginal(self) -> TrackedMarginal:
+        """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
+
+        Linearized at the estimate, as sure as the reported covariance.
+
+        Raises:
+            EstimationError: there is no estimate yet.
+        """
+        if self.smoother is None:
+            raise EstimationError("the tracker has no estimate yet: no marginal")
+        return tracked_marginal(self.point.cTl, self.point.offset_s, self.reported(), self.starts)
+
+    def marginal_since(self, previous: TrackedMarginal) -> TrackedMarginal:
+        """What to add to an earlier marginal for the present one: nothing counts twice.
+
+        ``known = tracker.marginal()`` once; then, whenever wanted, ``more = tracker.marginal_since(known)``
+        into the graph and ``known = known.plus(more)``. All parts are linearized at the first one's point,
+        and their sum is the tracker's information. A part alone may be negative in some direction: frames
+        may also show that less is known than it seemed.
+
+        Args:
+            previous: an earlier marginal of this tracker, with what was added since.
+
+        Raises:
+            EstimationError: there is no estimate, or the calibration has changed since: take the parts told
+                before out of the graph, and begin with :meth:`marginal`.
+        """
+        whole = self.marginal()
+        if previous.start != whole.start:
+            raise EstimationError(
+                f"found a marginal of start {previous.start}, expected one of start {whole.start}: "
+                "the calibration has changed since"
+            )
+        return increment(whole, previous)
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
@@ -163,153 +196,32 @@ class Tracker:
         entries = self.history_store.smoothed(self.smoother)
         return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
 
-    def _reported(self) -> FloatArray:
-        """(7, 7) covariance of the present estimate, with what all contours may err by together."""
-        return self.covariance[:7, :7] + self._common(self.point.cTl)
-
-    def _common(self, cTl: gtsam.Pose3) -> FloatArray:
-        return common_covariance(cTl, self.camera, self.config.calibration.assumptions)
-
     def consolidate(self) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
 
         The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
         """
+        lay_out(self)
         self.odometry.rebuild_map()
         if self.smoother is not None:
             self.smoother.relinearize()
 
-    def _take_scan(self, scan: Scan) -> int:
-        """Features and motion of a scan into the window; its number."""
-        prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
-        if self.config.calibration.undersides.use == "never":
-            prepare = without_undersides(prepare)
-        features = scan_features(self.window.next_scan, scan, self.classes, prepare)
-        motion = self.odometry.add(scan)
-        self.last_scan = scan
-        return self.keep_scan(features, motion)
-
-    def keep_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
-        """Put prepared features of a scan into the window; its number."""
-        number = self.window.add_scan(features, motion)
-        oldest = self.window.scans[0][1].stamp_ns
-        margin = round((self.config.late_s + max(0.0, self.point.offset_s)) * 1e9)
-        if not self.started:
-            margin += 10**9
-        self.window.forget_images(oldest - margin)
-        return number
-
-    def _start(self, stamp_ns: int) -> TrackUpdate:
-        """Try the first batch solution where enough has been seen."""
-        config = self.config
-        self.waited += 1
-        needed = config.restart_scans if self.alarmed else config.start_scans
-        if self.waited < needed or self.waited % max(1, needed // 2) or not self.window.images:
-            return self._answer(stamp_ns, "collecting frames for a start")
-        drive, _ = self.window.drive()
-        try:
-            point = first_estimate(drive, self.guess, config)
-        except (EstimationError, FactorError, RuntimeError, np.linalg.LinAlgError) as error:
-            self.attempts += 1
-            if self.attempts >= config.start_attempts:
-                # The last estimate leads nowhere: look all around it.
-                self.guess = Guess(self.guess.cTl, self.guess.offset_s)
-            return self._answer(stamp_ns, f"no start yet: {error}")
-        graph = config.calibration.joint.graph
-        self.matcher.look_below(point)
-        prior = prior_belief(point, self.guess, self.classes, graph)
-        smoother = WindowSmoother(prior, drive.scans[0].stamp_ns, self.classes, graph, config.drift)
-        found, _ = self.matcher.match(point, None, share=self._share)
-        smoother.update(found, set(), self.window.first_scan, self.window.objects.live)
-        known = Known.of(smoother)
-        if why := self.trial.check(self.watch, smoother, known, self.window.restless()):
-            return self._refuse_start(stamp_ns, len(self.window.scans) // 2, why)
-        self.known, self.smoother, self.alarmed, self.attempts, self.waited = known, smoother, False, 0, 0
-        self.trial.begin(self.window.next_scan)
-        self.watch.begin()
-        self.adoption.restart()
-        self.milestones = Milestones(self.window.first_scan, 2 * len(self.window.scans), self.config.window)
-        self.entered.extend(found)
-        self.arrivals.restart()
-        self.arrivals.take(self.window.next_scan - 1, self._reported())
-        _LOG.info("tracker: started over %d scans, %d pairs", len(drive.scans), len(found))
-        return self._answer(stamp_ns)
-
-    def _refuse_start(self, stamp_ns: int, keep: int, why: str) -> TrackUpdate:
-        """A start that does not hold: the calibration changed among its frames, or it was none."""
-        _LOG.info("tracker: %s", why)
-        self.trial.refused += 1
-        guess = self.guess if self.smoother is None else Guess(self.point.cTl, self.point.offset_s)
-        self._begin_anew(guess, keep)
-        return self._answer(stamp_ns, why)
-
-    def _track(self, stamp_ns: int, number: int) -> TrackUpdate:
-        """One frame of the running tracker."""
-        smoother = self.smoother
-        assert smoother is not None
-        before = smoother.point
-        # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
-        chosen = scans_to_match(
-            number, self.matcher, smoother, self.entered, self.covariance, self.config, self.settling
-        )
-        sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
-        found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
-        waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
-        new = [scan for scan in waiting if scan in found]
-        # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
-        chi2 = self.watch.take(sorted(waiting), matches, before, self.known.joint, smoother.model, restless)
-        changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
-        if changed is not None:
-            since = self.watch.since
-            if self.trial.over(number):
-                return self._change(changed, stamp_ns, since, chi2, "the calibration has changed")
-            return self._refuse_start(stamp_ns, since, "new frames contradict the start: it begins anew")
-        if new:
-            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, self.guess.point(self.classes))
-        # 3. The graph takes all in, or nothing.
-        first = self.window.first_scan
-        if new or not missing <= {number}:
-            smoother.update(found, missing, first, self.window.objects.live)
-            self.window.judged_anew -= chosen
-        self.entered.extend(new)
-        self._begin_or_end_settling(number)
-        self.known = Known.of(smoother)
-        if new:
-            self.arrivals.take(number, self._reported())
-        # 4. Does a new start hold?
-        self.trial.look_again(number, self.watch, smoother, self.known, restless)
-        # 5. A candidate that shows itself is adopted.
-        self.history_store.take(smoother)
-        reason = "" if new else "no match: no scan met an image that shows the same objects"
-        return self._answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not self.doubt)
-
-    def begin_settling(self) -> None:
-        """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
-        self.window.judge_all()
-        self.settling = Settling(self.matcher, self.config.settle_scans)
-        self.window.held = self.window.first_scan == self.milestones.first
-
-    def stop_settling(self) -> None:
-        """Leave a settling, if there is one, as it is."""
-        self.settling, self.window.held = None, False
-
-    def _begin_or_end_settling(self, number: int) -> None:
-        """Begin to settle where it is time to."""
-        if self.settling is not None and self.settling.ended:
-            # What came while it settled has been matched, too.
-            self.milestones.reached(number)
-            self.stop_settling()
-        elif self.settling is None and not self.config.drift.enabled and self.milestones.reached(number):
-            self.begin_settling()
+    def make_ready(self) -> None:
+        """Pack what the newest frame brought, so that saving a checkpoint takes no longer than a frame."""
+        if self.window.images:
+            _ = self.window.images[-1].packed
 
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
 
+        A start that is not done yet is brought to its end first.
+
         Returns:
             Whether it rests: the last whole step was below 0.02 standard deviations.
         """
-        smoother, joint = self.smoother, self.config.calibration.joint
+        joint = self.config.calibration.joint
+        at_last = self.smoother is None and self._finish_start()
+        smoother = self.smoother
         if smoother is None:
             return False
         self.stop_settling()
@@ -318,82 +230,25 @@ class Tracker:
         alive = self.window.objects.live
         try:
             rests = settle_window(
-                smoother, self.matcher, joint.kernel_px, most, joint.full_steps, alive, self._share
+                smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
+        if at_last:
+            self.trial.look_last(self.watch, smoother, self.known, self.window.restless())
+        self.settled = True
         return rests
 
-    @property
-    def _share(self) -> float:
-        """In drift mode matches count as little as their clusters allow, so that the walk has its say."""
-        return 1.0 / self.known.inflation if self.config.drift.enabled else 1.0
-
-    def _jumped(self, jump: Jump, stamp_ns: int) -> TrackUpdate:
-        """A sensor's stamps have jumped: what came before says nothing of the time offset."""
-        image, scan = jump.place
-        if jump.sensor == "image":
-            self.window.forget_images_before(image)
-        since = self.window.next_scan - scan
-        if self.started:
-            before = self.watch.before(scan) or self.point
-            # Most likely the clock was set.
-            near = dataclasses.replace(before, offset_s=before.offset_s + jump.offset_s)
-            return self._change(near, stamp_ns, since, jump.chi2, jump.sentence)
-        self.window.keep_scans(since)
-        self.waited = len(self.window.scans)
-        return self._answer(stamp_ns, jump.sentence)
-
-    def _change(self, near: Point, stamp_ns: int, since: int, chi2: float | None, why: str) -> TrackUpdate:
-        """The calibration has changed: begin anew from the ``since`` latest scans, near an estimate before.
-
-        Where the labels have left what ought to be in view, it is looked for all around.
-        """
-        _LOG.warning("tracker: alarm at %d ns, chi-square %.0f: %s", stamp_ns, chi2 or 0.0, why)
-        self._begin_anew(Guess(near.cTl, near.offset_s, search=self.watch.far), since)
-        self.alarmed = True
-        return dataclasses.replace(self._answer(stamp_ns, why, chi2=chi2), alarm=True)
-
-    def _begin_anew(self, guess: Guess, keep: int) -> None:
-        """Give up the estimate and all scans but the last few."""
-        self.guess = guess
-        self.stop_settling()
-        self.smoother, self.doubt, self.known = None, "", Known.nothing()
-        self.window.keep_scans(keep)
-        self.waited = len(self.window.scans)
-        self.entered.clear()
-        self.history_store.cut()
-        self.watch.restart()
-        self.adoption.restart()
-
-    def _answer(
-        self, stamp_ns: int, reason: str = "", *, chi2: float | None = None, offer: bool = False
-    ) -> TrackUpdate:
-        point, config, alarm = self.point, self.config.calibration, self.config.alarm
-        covariance = self._reported()
-        status: TrackStatus = "alarm" if self.alarmed else "starting"
-        weak: tuple[WeakDirection, ...] = ()
-        since = self.watch.confirmation
-        if self.smoother is not None:
-            weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
-            late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
-            status = "unobservable" if weak else "unconfirmed" if late else "ok"
-        return TrackUpdate(
-            stamp_ns=stamp_ns,
-            T_camera_lidar=point.cTl,
-            time_offset_s=point.offset_s,
-            covariance=covariance,
-            status=status,
-            accepted=not reason,
-            reason=reason,
-            matches=0 if self.smoother is None else self.smoother.matches,
-            chi2=chi2,
-            doubt=self.doubt,
-            unconfirmed_s=since.turn_s,
-            offset_unconfirmed_s=since.offset_s,
-            adopted=offer and self.adoption.offer(point, status == "ok"),
-            weak_directions=weak,
-        )
+    def _finish_start(self) -> bool:
+        """All that is left of a start, where one can be made; whether there is an estimate."""
+        try:
+            started = self.starting.finish(self.matcher)
+        except EXPECTED as error:
+            _LOG.warning("tracker: no start: %s", error)
+            return False
+        if started is not None:
+            self.begin(started, self.window.last_stamp_ns or 0)
+        return self.started

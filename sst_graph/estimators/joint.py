@@ -24,6 +24,7 @@ from sst_graph.problem.graph import (
 )
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
@@ -94,7 +95,20 @@ def solve_joint(
     tracks: Tracks | None = None,
     belief: gtsam.NonlinearFactor | None = None,
 ) -> JointSolution:
-    """Re-pair, re-match, optimise, until nothing moves.
+    """All steps of :func:`solving_joint`."""
+    return whole(solving_joint(drives, start, config, progress, guess, tracks, belief))
+
+
+def solving_joint(
+    drives: Sequence[Drive],
+    start: State,
+    config: JointConfig,
+    progress: Progress | None = None,
+    guess: State | None = None,
+    tracks: Tracks | None = None,
+    belief: gtsam.NonlinearFactor | None = None,
+) -> Stepwise[JointSolution]:
+    """Re-pair, re-match, optimise, until nothing moves: an outer iteration a step.
 
     Args:
         guess: what the weak priors are centred on; the start where it is None.
@@ -126,6 +140,7 @@ def solve_joint(
         last, state = state, state.towards(state_from(values, state, pairs), share)
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
+        yield len(pairs)
         # 4. Stop when the step is small at the last scale.
         if rested >= 0:
             step = _step_sigmas(last, pairs, graph, values)

@@ -11,11 +11,9 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.alarm import Joint
 from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
+from sst_graph.estimators.track_update import UNKNOWN_SIGMAS
 
 FloatArray = NDArray[np.float64]
-
-_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
-"""Of an estimate that does not exist yet [rad, m, s]."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +34,7 @@ class Known:
     @classmethod
     def nothing(cls) -> Known:
         """Before there is an estimate."""
-        return cls(Joint(np.diag(np.square(_UNKNOWN_SIGMAS)), (), len(_UNKNOWN_SIGMAS)))
+        return cls(Joint(np.diag(np.square(UNKNOWN_SIGMAS)), (), len(UNKNOWN_SIGMAS)))
 
     @classmethod
     def of(cls, smoother: WindowSmoother) -> Known:

@@ -41,7 +41,9 @@ def scans_to_match(
     chosen = {number, *waiting[-4:], *(n for n in numbers[-2:] if n in smoother.entries)}
     staleness = _staleness(smoother, covariance)
     leaving = [n for n in window.leaving() if staleness.get(n, 1.0) > _FRESH_SIGMAS]
-    turn = None if settling is None else settling.advance(smoother.point)
+    # Those that wait for a first match take the place of those in turn: a frame costs no more for them.
+    late = max(0, len(waiting[-4:]) - 1)
+    turn = None if settling is None else settling.advance(smoother.point, late)
     if settling is not None:
         # No others: all of the window come in their turn, and to look below them costs as much.
         return chosen | set(leaving) | (set(turn or ()) & set(staleness))

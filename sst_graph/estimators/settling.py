@@ -19,6 +19,8 @@ from sst_graph.estimators.undersides import UndersideSupport
 
 _RESTS_SIGMAS = 0.02
 """A whole step shorter than this is rest."""
+_INNER = 2
+"""Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
 _PASSES = 2
 """How often a running tracker matches the whole window anew when it settles."""
 
@@ -82,7 +84,7 @@ def settle_window(
         kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         smoother.update(found, missing, 0, alive)
-        smoother.polish()
+        smoother.polish(_INNER)
         rested = i + 1 - len(kernel_px)
         left = smoother.point.core().local(at.core())
         n = len(left)
@@ -121,15 +123,20 @@ class Settling:
         """Whether all is done."""
         return self.passes == 0
 
-    def advance(self, point: Point) -> list[int] | None:
-        """The scans to match with this frame; None while the edges towards the ground are looked at."""
+    def advance(self, point: Point, fewer: int = 0) -> list[int] | None:
+        """The scans to match with this frame; None while the edges towards the ground are looked at.
+
+        Args:
+            fewer: how many fewer than usual, for others are matched in their place; one at least.
+        """
         numbers = [number for number, _ in self._matcher.window.scans]
         # The newest is matched as it comes.
         self.done.update(numbers[-1:])
         waiting = [number for number in numbers if number not in self.done]
         looking, below = self.below is not None, self.below
         # To look below is to match twice.
-        some = waiting[: (self._scans + 1) // 2 if looking else self._scans]
+        most = max(1, self._scans - fewer)
+        some = waiting[: (most + 1) // 2 if looking else most]
         if below is not None:
             self.below = below.plus(self._matcher.support_below(point, some))
         self.done.update(some)

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from factors.camera import PinholeCamera
 from sst_graph.association.pairing import pair_by_time
-from sst_graph.association.search import Candidate, SearchConfig, search_start
+from sst_graph.association.search import Candidate, SearchConfig, searching_start
 from sst_graph.association.votes import SearchFrame, States, Votes
 from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -92,6 +93,18 @@ def find_start(
     offset_s: float,
     config: StartConfig,
 ) -> list[Candidate]:
+    """All steps of :func:`finding_start`."""
+    return whole(finding_start(drives, tracks, classes, guess, offset_s, config))
+
+
+def finding_start(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    guess: gtsam.Pose3 | None,
+    offset_s: float,
+    config: StartConfig,
+) -> Stepwise[list[Candidate]]:
     """Candidates from the drive that shows most, best first.
 
     Raises:
@@ -102,7 +115,7 @@ def find_start(
             raise EstimationError("no guess to start from, and the search is switched off")
         return [Candidate(guess, offset_s, 0.0)]
     frames, camera = _looked_at(drives, tracks, classes, offset_s, config)
-    candidates = search_start(frames, camera, classes, guess, offset_s, config.search)
+    candidates = yield from searching_start(frames, camera, classes, guess, offset_s, config.search)
     _LOG.info("start: %d frames, best scores %s", len(frames), [round(c.score, 4) for c in candidates[:5]])
     return candidates
 
@@ -115,6 +128,18 @@ def label_scores(
     offset_s: float,
     config: StartConfig,
 ) -> FloatArray:
+    """All steps of :func:`scoring_labels`."""
+    return whole(scoring_labels(drives, tracks, classes, states, offset_s, config))
+
+
+def scoring_labels(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    classes: Sequence[SemanticClass],
+    states: States,
+    offset_s: float,
+    config: StartConfig,
+) -> Stepwise[FloatArray]:
     """(m,) how much the labels of all points depend on those of their pixels, under each of the states.
 
     Silhouettes compare only where LiDAR shows an object; this also hears of masks without points.
@@ -125,7 +150,10 @@ def label_scores(
     frames, camera = _looked_at(drives, tracks, classes, offset_s, config)
     rng = np.random.default_rng(config.search.seed)
     votes = Votes.gather(frames, camera, classes, config.search.points_per_class, rng)
-    return votes.level(config.label_blur_px, 1.0, "dependence").score(states)
+    yield 5
+    level = votes.level(config.label_blur_px, 1.0, "dependence")
+    yield 5
+    return (yield from level.scoring(states))
 
 
 def _looked_at(

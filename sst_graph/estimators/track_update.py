@@ -13,6 +13,9 @@ from sst_graph.result import WeakDirection
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
+Sensor = Literal["image", "scan"]
+UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""Of an estimate that does not exist yet [rad, m, s]."""
 TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
 
 
@@ -24,12 +27,13 @@ class TrackUpdate(ByValue):
         stamp_ns: of the scan or image that was added.
         T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
         time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
-        covariance: (7, 7) cluster-robust.
+        covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
             converged again; ``unconfirmed`` where no frames have lately confirmed it; else whether the limits
             of observability are met.
-        accepted: the frame was taken into the estimate; else ``reason`` says why not.
+        accepted: all of the frame was taken into the estimate; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
+        refused: the sensors of it whose data were not taken in: they have changed nothing.
         matches: silhouette matches in the window.
         chi2: statistic of the change test, over its usual size, or None where it can't be told.
         doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
@@ -41,15 +45,18 @@ class TrackUpdate(ByValue):
             ``alarm.confirm_offset_s`` [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
+        covariance_reason: why there is no covariance; empty where there is.
+        settled: the window was solved as a whole after this frame (:meth:`Tracker.settle`).
     """
 
     stamp_ns: int
     T_camera_lidar: gtsam.Pose3
     time_offset_s: float
-    covariance: FloatArray
+    covariance: FloatArray | None
     status: TrackStatus
     accepted: bool
     reason: str = ""
+    refused: tuple[Sensor, ...] = ()
     matches: int = 0
     chi2: float | None = None
     doubt: str = ""
@@ -58,10 +65,14 @@ class TrackUpdate(ByValue):
     offset_unconfirmed_s: float = 0.0
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
+    covariance_reason: str = ""
+    settled: bool = False
 
     @property
     def sigmas(self) -> FloatArray:
-        """(7,) standard deviations [rad, m, s]."""
+        """(7,) standard deviations [rad, m, s]; wide ones while there is no estimate."""
+        if self.covariance is None:
+            return UNKNOWN_SIGMAS.copy()
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def to_dict(self) -> dict[str, Any]:
@@ -74,9 +85,12 @@ class TrackUpdate(ByValue):
             "sigma_rotation_rad": sigmas[:3],
             "sigma_translation_m": sigmas[3:6],
             "sigma_time_offset_s": sigmas[6],
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "covariance_reason": self.covariance_reason,
             "status": self.status,
             "accepted": self.accepted,
             "reason": self.reason,
+            "refused": list(self.refused),
             "matches": self.matches,
             "chi2": self.chi2,
             "doubt": self.doubt,
@@ -84,5 +98,6 @@ class TrackUpdate(ByValue):
             "unconfirmed_s": self.unconfirmed_s,
             "offset_unconfirmed_s": self.offset_unconfirmed_s,
             "adopted": self.adopted,
+            "settled": self.settled,
             "weak": [weak.sentence for weak in self.weak_directions],
         }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from sst_graph.config import to_dict
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.track_update import TrackUpdate
@@ -12,7 +14,7 @@ from sst_graph.uncertainty.gained import KEY, to_document
 def tracker_result(
     tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
 ) -> CalibrationResult:
-    """The present estimate with its covariance; frames used are those of the window."""
+    """The present estimate as :meth:`Tracker.current` answers it; frames used are those of the window."""
     last = tracker.current()
     status: Status = "ok" if last.status == "ok" else "not_converged"
     reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
@@ -28,7 +30,7 @@ def tracker_result(
     return CalibrationResult(
         T_camera_lidar=last.T_camera_lidar,
         time_offset_s=last.time_offset_s,
-        covariance=last.covariance,
+        covariance=np.diag(last.sigmas**2) if last.covariance is None else last.covariance,
         status=status,
         camera=tracker.camera,
         camera_name=camera_name,

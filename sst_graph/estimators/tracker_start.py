@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import gtsam
 import numpy as np
@@ -14,13 +13,14 @@ from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
-from sst_graph.estimators.contest import choose_start
+from sst_graph.estimators.contest import choosing_start
 from sst_graph.estimators.gaussian import Gaussian, Point
-from sst_graph.estimators.joint import JointConfig, explained, solve_joint
+from sst_graph.estimators.joint import JointConfig, explained, solving_joint
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
 from sst_graph.problem.state import State
+from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
 _OTHER_BASIN_RAD = float(np.radians(2.0))
@@ -68,7 +68,12 @@ class _Unsettled(EstimationError):
 
 
 def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
-    """The batch solution of the window.
+    """All steps of :func:`estimating_first`."""
+    return whole(estimating_first(drive, guess, config))
+
+
+def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
+    """The batch solution of some scans of the window, step by step.
 
     A short stretch of driving at one speed does not tell the time offset. So the offset stays with the
     guess unless the labels clearly say otherwise: a solution whose search left the offset free must
@@ -81,7 +86,7 @@ def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     reach = config.calibration.start.search.delay_s
     free = guess.search and reach > 0.0
     delays = (0.0, reach) if free else (0.0,)
-    solved, failed = _tried([partial(_best, drive, guess, config, delay_s) for delay_s in delays])
+    solved, failed = yield from _tried([_best(drive, guess, config, delay_s) for delay_s in delays])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -92,12 +97,12 @@ def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
     return best.point
 
 
-def _tried(ways: Sequence[Callable[[], _Solved]]) -> tuple[list[_Solved], list[EstimationError]]:
+def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
     """The solutions, and why there are no others."""
     solved, failed = [], []
     for way in ways:
         try:
-            solved.append(way())
+            solved.append((yield from way))
         except EstimationError as error:
             failed.append(error)
     return solved, failed
@@ -121,14 +126,14 @@ def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: Tra
             )
 
 
-def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> _Solved:
+def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[_Solved]:
     """The best of the solutions from all candidates with offsets within ``delay_s`` of the guess's.
 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    starts = _starts(drive, guess, config, delay_s)
-    solved, failed = _tried([partial(_solution, drive, start, config) for start in starts])
+    starts = yield from _starts(drive, guess, config, delay_s)
+    solved, failed = yield from _tried([_solution(drive, start, config) for start in starts])
     if not solved:
         if reached := _unsettled(failed):
             raise _Unsettled(str(failed[0]), min(reached, key=lambda one: one.cost))
@@ -143,7 +148,7 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
     return best
 
 
-def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> list[State]:
+def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
     """Where the solutions begin: the winners of the batch's contest, or the guess itself.
 
     Raises:
@@ -154,7 +159,7 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -
     enabled = guess.search or guess.cTl is None
     start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
     joint = _damped(config) if delay_s == 0.0 else calibration.joint
-    contest = choose_start(
+    contest = yield from choosing_start(
         [drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, joint, start
     )
     return [State(cTl, (offset_s,)) for cTl, offset_s in contest.finalists]
@@ -167,10 +172,10 @@ def _damped(config: TrackerConfig) -> JointConfig:
     return dataclasses.replace(joint, graph=graph)
 
 
-def _solution(drive: Drive, start: State, config: TrackerConfig) -> _Solved:
+def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_Solved]:
     """The joint method from a start, its offset damped."""
     calibration = config.calibration
-    solution = solve_joint([drive], start, _damped(config))
+    solution = yield from solving_joint([drive], start, _damped(config))
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))

@@ -47,12 +47,17 @@ class Trial:
         return f"frames of the start contradict each other (chi-square {value:.0f}): it begins anew"
 
     def _contradiction(
-        self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+        self,
+        watch: Watch,
+        smoother: WindowSmoother,
+        known: Known,
+        restless: Collection[int],
+        limit: float | None = None,
     ) -> float:
-        """The statistic of the frames in the graph, where it is past the limit; else 0."""
+        """The statistic of the frames in the graph, where it is past the limit (a start's own); else 0."""
         scans = sorted(smoother.entries)
         value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, restless)
-        return value if value > self.alarm.start_chi2 else 0.0
+        return value if value > (self.alarm.start_chi2 if limit is None else limit) else 0.0
 
     def look_again(
         self, scan: int, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
@@ -62,8 +67,26 @@ class Trial:
         Labels that err for a while contradict a start as a step does, so it is not given up any more; but
         until its frames agree it is not called ok.
         """
-        if not self.on or scan - self.first < self.after:
-            return
-        self.after *= 2
-        if not self._contradiction(watch, smoother, known, restless):
+        if self.on and scan - self.first >= self.after:
+            self.after *= 2
+            self._look(watch, smoother, known, restless)
+
+    def look_last(
+        self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+    ) -> None:
+        """At the end of a drive, the same of all frames in the graph for a start that no frame came after.
+
+        They are more, in more parts, than a start is made of: they contradict it as new frames would.
+        """
+        self._look(watch, smoother, known, restless, self.alarm.chi2)
+
+    def _look(
+        self,
+        watch: Watch,
+        smoother: WindowSmoother,
+        known: Known,
+        restless: Collection[int],
+        limit: float | None = None,
+    ) -> None:
+        if self.on and not self._contradiction(watch, smoother, known, restless, limit):
             self.refused, self.on = 0, False

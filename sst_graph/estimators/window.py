@@ -77,19 +77,25 @@ class Window:
 
     def __init__(self, camera: PinholeCamera, scans: int) -> None:
         self.camera = camera
-        self.size, self.held = scans, False
+        self.size = scans
+        self.objects = ObjectTracker(memory=OBJECT_MEMORY)
+        self.next_scan = 0
+        self.next_image = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all scans, images and motions; numbers go on."""
+        self.held = False
+        self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
         self.tracks: dict[int, dict[ObjectName, int]] = {}
-        self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.sightings: dict[int, list[Sighting]] = {}
         self.moving: dict[int, dict[ObjectName, float]] = {}
         self.persistence = Persistence()
         self.velocities = Velocities()
         self.judged_anew: set[int] = set()
-        self.next_scan = 0
-        self.next_image = 0
         self.wTl = gtsam.Pose3()
 
     @property
@@ -259,10 +265,26 @@ class Window:
         self.images.insert(place, dataclasses.replace(features, index=self.next_image))
         self.next_image += 1
 
-    def forget_images(self, before_ns: int) -> None:
-        """Drop images of a camera stamp before ``before_ns``, but never the newest two."""
-        while len(self.images) > 2 and self.images[0].stamp_ns < before_ns:
-            del self.images[0]
+    def forget_images(self, margin_ns: int, most: int) -> None:
+        """Drop images that no scan can meet: those near the window's scans stay, and the newest ones.
+
+        Args:
+            margin_ns: how far from a scan of the window, or behind the newest image, an image may lie.
+            most: of all; beyond it the oldest go, whatever they lie near. Two always stay.
+        """
+        if not self.images:
+            return
+        newest = self.images[-1].stamp_ns
+        stamps = [scan.stamp_ns for _, scan in self.scans] or [newest]
+        kept = [
+            image
+            for image in self.images
+            if stamps[0] - margin_ns <= image.stamp_ns <= stamps[-1] + margin_ns
+            or image.stamp_ns >= newest - margin_ns
+        ]
+        if len(kept) < 2:
+            kept = self.images[-2:]
+        self.images = kept[-max(2, most) :]
 
     def forget_images_before(self, number: int) -> None:
         """Drop all images that came before the one of a number."""

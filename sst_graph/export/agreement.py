@@ -9,13 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from sst_graph.errors import ContradictionError
+from sst_graph.errors import ContradictionError, EstimationError
 from sst_graph.uncertainty.contradiction import Difference, PartAnswer, combined, name_step
 
 FloatArray = NDArray[np.float64]
 
 SIGNIFICANCE = 1e-3
 """Probability that marginals which agree, with covariances that hold, are refused."""
+_ROUNDING = 1e-6
+"""Information below zero by this share of the whole is rounding."""
 _FAR_SIGMA = 1e3
 """A direction that a marginal does not tell has this sigma [rad, m, s]."""
 
@@ -36,9 +38,11 @@ def check_agreement(
 
     Raises:
         ContradictionError: they do not.
+        EstimationError: one is no answer of its own: it takes information away.
     """
     if len(parts) < 2 or significance <= 0.0:
         return
+    _check_answers([information for information, _ in parts], names)
     answers = [_answer(information, vector) for information, vector in parts]
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
     common = combined(answers)
@@ -58,6 +62,19 @@ def check_agreement(
             f"differs from the others in {name_step(against[worst], cTl).sentence}; fuse what was recorded "
             "with one mount and one clock, or give significance=0 to fuse all the same"
         )
+
+
+def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:
+    """That each is an answer of its own, and no difference of two as a growing marginal's parts are."""
+    scale = np.sqrt(np.maximum(np.diag(np.sum(informations, axis=0)), 1e-300))
+    for k, information in enumerate(informations):
+        least = float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0])
+        if least < -_ROUNDING:
+            name = repr(names[k]) if names else f"number {k}"
+            raise EstimationError(
+                f"marginal {name}: found information of {least:.2g} of the whole in a direction, expected at "
+                "least 0; parts of a marginal that grows are added (plus), or give significance=0"
+            )
 
 
 def _answer(information: FloatArray, vector: FloatArray) -> PartAnswer:

@@ -10,163 +10,33 @@ docs/export.md tells how a C++ program rebuilds it from the JSON.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError, EstimationError
+from sst_graph.errors import EstimationError
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
-from sst_graph.input_files import MARGINAL, parse_json, read_text
-from sst_graph.json_table import JsonTable, json_table
+from sst_graph.marginal import DELAY, EXTRINSIC, FORMAT, VERSION, CalibrationMarginal, read_marginal
+from sst_graph.marginal import carried as _carried
+from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
-from sst_graph.types import ByValue
+
+__all__ = [
+    "DELAY",
+    "EXTRINSIC",
+    "FORMAT",
+    "VERSION",
+    "CalibrationMarginal",
+    "fuse_graphs",
+    "fuse_marginals",
+    "marginal_of_graph",
+    "marginal_of_result",
+    "read_marginal",
+]
 
 FloatArray = NDArray[np.float64]
-
-FORMAT = "sst-graph/marginal"
-VERSION = 1
-
-MAX_INFORMATION = 1e24
-"""Of a sigma of 1e-12 rad, m or s."""
-
-EXTRINSIC = int(gtsam.symbol("E", 0))
-"""Default key of the extrinsic cTl (Pose3)."""
-DELAY = int(gtsam.symbol("D", 0))
-"""Default key of the time offset (``Vector(1)``)."""
-
-_ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
-
-
-@dataclass(frozen=True, eq=False)
-class CalibrationMarginal(ByValue):
-    """A quadratic cost on extrinsic and time offset; the equation is the module's.
-
-    Attributes:
-        cTl, offset_s: linearization point.
-        information: (7, 7) symmetric, positive semi-definite.
-        vector: (7,) information times the optimum's d; zero where the point is the optimum.
-        constant: twice the cost at d = 0.
-    """
-
-    cTl: gtsam.Pose3
-    offset_s: float
-    information: FloatArray
-    vector: FloatArray
-    constant: float = 0.0
-
-    def factor(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> gtsam.LinearContainerFactor:
-        """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only."""
-        L, g = self.information, self.vector
-        hessian = gtsam.HessianFactor(
-            E_key, D_key, L[:6, :6], L[:6, 6:], g[:6], L[6:, 6:], g[6:], self.constant
-        )
-        return gtsam.LinearContainerFactor(hessian, self.point(E_key, D_key))
-
-    def point(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> gtsam.Values:
-        """The linearization point as values."""
-        values = gtsam.Values()
-        values.insert(E_key, self.cTl)
-        values.insert(D_key, np.array([self.offset_s]))
-        return values
-
-    def covariance(self) -> FloatArray:
-        """(7, 7) inverse of the information.
-
-        Raises:
-            EstimationError: a direction that the information does not tell.
-        """
-        return _inverse(self.information, "information of a marginal")
-
-    def best(self) -> tuple[gtsam.Pose3, float]:
-        """cTl and offset [s] of the least cost.
-
-        Raises:
-            EstimationError: a direction that the information does not tell.
-        """
-        d = self.covariance() @ self.vector
-        return self.cTl.retract(d[:6]), self.offset_s + float(d[6])
-
-    def to_json(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> str:
-        """The marginal as documented in docs/export.md."""
-        document = {
-            "format": FORMAT,
-            "version": VERSION,
-            "variables": [_variable("extrinsic", E_key, "Pose3", 6), _variable("offset", D_key, "Vector", 1)],
-            "error": "0.5 d'*information*d - vector'*d + 0.5*constant, "
-            "d = [Logmap(T0^-1 * T_camera_lidar), time_offset_s - offset0]",
-            "order": _ORDER,
-            "perturbation": "right, as gtsam has it: T_camera_lidar = T0 * Pose3::Expmap(d[0:6])",
-            "conventions": "p_camera = T_camera_lidar * p_lidar; t_lidar = t_camera_stamp + time_offset_s",
-            "linearization_point": {
-                "T_camera_lidar": self.cTl.matrix().tolist(),
-                "time_offset_s": self.offset_s,
-            },
-            "information": self.information.tolist(),
-            "vector": self.vector.tolist(),
-            "constant": self.constant,
-            "gtsam_serialized": self.factor(E_key, D_key).serialize(),
-        }
-        return _dump(document)
-
-    @staticmethod
-    def from_json(text: str, place: str | Path = "marginal.json") -> CalibrationMarginal:
-        """The marginal in the text of such a file; the numbers count, not the serialized factor.
-
-        Raises:
-            DataError: no such file's text.
-        """
-        table = json_table(parse_json(text, place, MARGINAL.name), place, FORMAT, VERSION)
-        point = table.table("linearization_point")
-        return CalibrationMarginal(
-            point.pose("T_camera_lidar"),
-            point.offset_s("time_offset_s"),
-            _information(table),
-            _bounded(table, "vector", table.matrix("vector", (7,))),
-            float(_bounded(table, "constant", np.array(table.number("constant")))),
-        )
-
-
-def read_marginal(path: str | Path) -> CalibrationMarginal:
-    """The marginal in a file.
-
-    Raises:
-        DataError: missing, unreadable or no such file.
-    """
-    return CalibrationMarginal.from_json(read_text(path, MARGINAL), path)
-
-
-def _bounded(table: JsonTable, key: str, values: FloatArray) -> FloatArray:
-    """Numbers that can be squared and added up."""
-    if np.abs(values).max() > MAX_INFORMATION:
-        place = f"{table.place}: {key}"
-        raise DataError(place, f"{np.abs(values).max():.3g}", f"at most {MAX_INFORMATION:g}")
-    return values
-
-
-def _information(table: JsonTable) -> FloatArray:
-    """(7, 7) symmetric, positive semi-definite but for rounding."""
-    place = f"{table.place}: information"
-    L = table.matrix("information", (7, 7))
-    if np.abs(L).max() > MAX_INFORMATION:
-        raise DataError(place, f"{np.abs(L).max():.3g}", f"entries of at most {MAX_INFORMATION:g}")
-    diagonal = np.diag(L)
-    if (diagonal < 0.0).any():
-        raise DataError(place, f"{diagonal.min():.3g} on the diagonal", "at least 0")
-    # Of a direction that nothing tells there is no information: rounding is measured by the largest entry.
-    scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
-    unit = L / scale[:, None] / scale
-    if (np.abs(unit - unit.T) > 1e-6).any():
-        raise DataError(place, "a matrix that is not symmetric", "an information matrix")
-    least = float(np.linalg.eigvalsh(unit)[0])
-    if least < -1e-6:
-        raise DataError(place, f"the eigenvalue {least:.3g} (scaled)", "a positive semi-definite matrix")
-    return L
 
 
 def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
@@ -313,7 +183,8 @@ def fuse_marginals(
 
     Raises:
         ContradictionError: they contradict one another; the message names the worst and its step.
-        EstimationError: none given, a direction that none of them tells, or no optimum.
+        EstimationError: none given, a direction that none of them tells, one that takes information away (to
+            be added with ``significance=0``), or no optimum.
     """
     if not marginals:
         raise EstimationError("no marginal to fuse")
@@ -343,57 +214,3 @@ def fuse_marginals(
 
 _MAX_ROUNDS, _STANDSTILL_SIGMAS = 50, 1e-6
 """Most rounds of a fusion, which ends when its optimum moves by less than so many sigmas."""
-
-
-def _carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> CalibrationMarginal:
-    """The same cost about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T Exp(d))."""
-    J = np.eye(7)
-    step, J[:6, :6] = _log(marginal.cTl.between(cTl))
-    shift = np.append(step, offset_s - marginal.offset_s)
-    L, g = marginal.information, marginal.vector
-    constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
-    return CalibrationMarginal(cTl, offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant)
-
-
-def _log(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
-    """Log of a pose and its derivative (6, 6) by a right perturbation."""
-    xi = np.asarray(gtsam.Pose3.Logmap(pose))
-    return xi, np.asarray(gtsam.Pose3.LogmapDerivative(xi))
-
-
-def _inverse(matrix: FloatArray, what: str) -> FloatArray:
-    """Inverse of a symmetric positive-definite matrix, scaled to a unit diagonal first."""
-    if not len(matrix):
-        return matrix
-    variances = np.diag(matrix)
-    if not (variances > 0.0).all():
-        raise EstimationError(f"{what}: found {variances.min():.3g} on the diagonal, expected above 0")
-    scale = 1.0 / np.sqrt(variances)
-    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
-    if values[0] < 1e-13:
-        raise EstimationError(f"{what}: found a singular matrix ({values[0]:.1e}), expected an inverse")
-    return np.asarray(((vectors / values) @ vectors.T) * np.outer(scale, scale))
-
-
-def _variable(name: str, key: int, kind: str, dim: int) -> dict[str, Any]:
-    """A variable's entry; the key as text, for it is past the whole numbers that a JSON double holds."""
-    symbol = gtsam.Symbol(key)
-    return {
-        "name": name,
-        "key": str(key),
-        "symbol": {"character": chr(symbol.chr()), "index": symbol.index()},
-        "type": kind,
-        "dim": dim,
-    }
-
-
-def _dump(document: dict[str, Any]) -> str:
-    """Strict JSON, one key a line, the rows of lists one a line."""
-    lines = []
-    for key, value in document.items():
-        text = json.dumps(value, allow_nan=False)
-        if isinstance(value, list) and isinstance(value[0], list | dict):
-            rows = ",\n  ".join(json.dumps(row, allow_nan=False) for row in value)
-            text = f"[\n  {rows}\n ]"
-        lines.append(f" {json.dumps(key)}: {text}")
-    return "{\n" + ",\n".join(lines) + "\n}\n"

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
+from sst_graph.odometry.local_map import LocalMap, MappedCloud
 from sst_graph.odometry.movers import MoverConfig, StandingObjects
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
@@ -103,8 +104,9 @@ class LidarOdometry:
 
     def __init__(self, config: LidarOdometryConfig | None = None) -> None:
         self.config = config or LidarOdometryConfig()
-        self._map: small_gicp.GaussianVoxelMap | None = None
-        self._mapped: deque[tuple[small_gicp.PointCloud, FloatArray]] = deque(maxlen=self.config.map_age)
+        self._map: LocalMap | None = None
+        self._mapped: deque[MappedCloud] = deque(maxlen=self.config.map_age)
+        self._clouds = 0
         self._objects = StandingObjects(self.config.movers)
         self._last: Scan | None = None
         self._wTl = np.eye(4)
@@ -195,8 +197,9 @@ class LidarOdometry:
         self, cloud: small_gicp.PointCloud, wTl: FloatArray, iterations: int
     ) -> small_gicp.RegistrationResult:
         """A cloud registered to the map from a start."""
+        assert self._map is not None
         return small_gicp.align(
-            self._map,
+            self._map.with_all(self._mapped),
             cloud,
             wTl,
             max_correspondence_distance=self.config.max_distance_m,
@@ -257,30 +260,26 @@ class LidarOdometry:
         self._map = None
         self._mapped.clear()
         if len(points) >= config.min_points:
-            self._map = _empty_map(config)
+            self._map = LocalMap(config.map_voxel_m, config.map_age)
             self._insert(registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio))
 
     def _insert(self, cloud: small_gicp.PointCloud) -> None:
         """Put a cloud into the map at the current pose."""
-        assert self._map is not None
-        self._map.insert(cloud, self._wTl)
-        self._mapped.append((cloud, self._wTl.copy()))
+        self._mapped.append((self._clouds, cloud, self._wTl.copy()))
+        self._clouds += 1
 
     def rebuild_map(self) -> None:
         """Make the map anew of the latest scans alone, as one that was stored makes it."""
-        made = _empty_map(self.config)
-        for cloud, wTl in self._mapped:
-            made.insert(cloud, wTl)
-        self._map = made if self._mapped else None
+        self._map = LocalMap(self.config.map_voxel_m, self.config.map_age) if self._mapped else None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the map; of the scans in it, points and poses."""
-        points = [(np.asarray(cloud.points())[:, :3], wTl) for cloud, wTl in self._mapped]
+        points = [(n, np.asarray(cloud.points())[:, :3], wTl) for n, cloud, wTl in self._mapped]
         return {**vars(self), "_map": None, "_parted": None, "_mapped": points}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         vars(self).update(state)
-        clouds = [(surfaces(points, self.config.neighbours), wTl) for points, wTl in state["_mapped"]]
+        clouds = [(n, surfaces(points, self.config.neighbours), wTl) for n, points, wTl in state["_mapped"]]
         self._mapped = deque(clouds, maxlen=self.config.map_age)
         self.rebuild_map()
 
@@ -353,12 +352,6 @@ def _registration_covariance(
     variance = 2.0 * result.error / max(result.num_inliers - 6, 1)
     hessian = np.asarray(result.H) + 1e-6 * np.eye(6)
     return np.asarray(config.inflation**2 * variance * np.linalg.inv(hessian))
-
-
-def _empty_map(config: LidarOdometryConfig) -> small_gicp.GaussianVoxelMap:
-    found = small_gicp.GaussianVoxelMap(config.map_voxel_m)
-    found.set_lru(config.map_age, max(1, config.map_age // 2))
-    return found
 
 
 _AROUND = 8

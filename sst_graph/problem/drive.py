@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,9 @@ from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
+from sst_graph.storage import PackedArray
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.validation import checked_image, checked_scan
 
 _LOG = logging.getLogger(__name__)
 
@@ -92,13 +95,22 @@ class ImageFeatures:
     contours: dict[SemanticClass, ContourMap]
 
     def __getstate__(self) -> dict[str, Any]:
-        """The mask and the picture's edges, not the distances that follow from them."""
-        return {**vars(self), "contours": {c: contour.edges for c, contour in self.contours.items()}}
+        """The mask, packed, and the picture's edges, not the distances that follow from them."""
+        edges = {c: contour.edges for c, contour in self.contours.items()}
+        return {"index": self.index, "stamp_ns": self.stamp_ns, "mask": self.packed, "contours": edges}
+
+    @cached_property
+    def packed(self) -> PackedArray:
+        """The mask, compressed once: that takes longer than all else of storing an image."""
+        return PackedArray.of(self.mask)
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        fields = {c: ContourMap.of(state["mask"], c, edges=edges) for c, edges in state["contours"].items()}
+        mask = state["mask"]
+        if isinstance(mask, PackedArray):
+            mask = mask.array()
+        fields = {c: ContourMap.of(mask, c, edges=edges) for c, edges in state["contours"].items()}
         contours = {c: field for c, field in fields.items() if field is not None}
-        for name, value in {**state, "contours": contours}.items():
+        for name, value in {**state, "mask": mask, "contours": contours}.items():
             object.__setattr__(self, name, value)
 
 
@@ -207,15 +219,17 @@ def prepare_drive(
     """Read every frame of a source once and keep what calibration needs.
 
     Raises:
-        DataError: the source has no scan or no image, or its stamps do not rise.
+        DataError: the source has no scan or no image, its stamps do not rise, or the arrays of one are not
+            what they must be (:mod:`sst_graph.validation`).
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
     tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor = LeftOut(), Surveyor(source.name, source.camera, total)
+    left_out, surveyor = LeftOut(), Surveyor(total)
     for position, frame in enumerate(source):
+        frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
         surveyor.add(frame)
         if frame.scan is not None:
@@ -251,6 +265,13 @@ def prepare_drive(
         follower.chains(),
         sweep,
     )
+
+
+def _checked(frame: Frame, camera: PinholeCamera, place: str) -> Frame:
+    """The frame with checked arrays; odometry bridges a scan without points."""
+    scan = None if frame.scan is None else checked_scan(frame.scan, place, fewest=0)
+    image = None if frame.image is None else checked_image(frame.image, camera, place)
+    return Frame(frame.index, scan, image)
 
 
 def scan_features(

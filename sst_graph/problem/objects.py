@@ -70,6 +70,11 @@ class ObjectTracker:
         self.scans = 0
         self.following = 0
 
+    def forget(self) -> None:
+        """Forget all tracks; their numbers are not used again."""
+        self.live.clear()
+        self.last_seen.clear()
+
     def add(
         self, boundaries: Mapping[SemanticClass, Boundaries], wTl: gtsam.Pose3
     ) -> dict[tuple[SemanticClass, int], int]:

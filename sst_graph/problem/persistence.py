@@ -131,7 +131,9 @@ class Persistence:
         for name, share in found.items():
             shares = self.shares.get(number, {}).get(name)
             if shares is not None:
-                shares[horizon] = np.fmax(shares[horizon], share)
+                better = shares.copy()
+                better[horizon] = np.fmax(shares[horizon], share)
+                self.shares[number][name] = better
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.association.mask_shift import ContourProfile, contour_profiles
-from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -107,40 +105,22 @@ class Surveyor:
         total: number of frames to come; the dearer looks are spread over them.
     """
 
-    def __init__(self, name: str, camera: PinholeCamera, total: int) -> None:
-        self._name, self._camera = name, camera
+    def __init__(self, total: int) -> None:
         self._scans: list[ScanFacts] = []
         self._images: list[ImageFacts] = []
         self._every_scan, self._every_image = -(-total // _SCANS), -(-total // _IMAGES)
 
     def add(self, frame: Frame) -> None:
-        """Look at one frame.
-
-        Raises:
-            DataError: a mask or picture of another size than the camera's.
-        """
+        """Look at one frame, checked by :mod:`sst_graph.validation`."""
         if frame.scan is not None:
             closely = len(self._scans) % self._every_scan == 0
             self._scans.append(scan_facts(frame.index, frame.scan, closely))
         if frame.image is not None:
-            self._check_sizes(frame.index, frame.image)
             closely = len(self._images) % self._every_image == 0
             self._images.append(image_facts(frame.index, frame.image, closely))
 
     def survey(self) -> Survey:
         return Survey(tuple(self._scans), tuple(self._images))
-
-    def _check_sizes(self, index: int, image: CameraImage) -> None:
-        width, height = self._camera.width, self._camera.height
-        shapes = [("mask", image.mask.shape)]
-        shapes += [("picture", image.pixels.shape[:2])] if image.has_picture else []
-        for what, shape in shapes:
-            if shape[:2] != (height, width):
-                raise DataError(
-                    f"{self._name}: frame {index}",
-                    f"a {what} of {shape[1]}x{shape[0]} px",
-                    f"{width}x{height} px, the camera's size: make masks at the pictures' full size",
-                )
 
 
 def scan_facts(index: int, scan: Scan, closely: bool = True) -> ScanFacts:

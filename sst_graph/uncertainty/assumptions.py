@@ -39,6 +39,7 @@ _Sigmas = make_dataclass(
         for name, each in ASSUMPTIONS.items()
     ],
     bases=(Settings,),
+    namespace={"__module__": __name__},
     frozen=True,
     namespace={"__module__": __name__},
 )

@@ -53,7 +53,8 @@ def prepared_street(label_noise: float = 1.0) -> Drive:
     return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
 
 
-EARLY_START = TrackerConfig(start_scans=8)
+EARLY_START = TrackerConfig(start_scans=8, start_work=0)
+"""The first estimate comes with the eighth frame, at once."""
 
 
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:

@@ -139,6 +139,11 @@ def _nodes(node: Any, tag: str) -> list[Any]:
     return found + [one for part in (node if isinstance(node, list) else []) for one in _nodes(part, tag)]
 
 
+def _attribute(node: Any, name: str) -> Any:
+    """The [name, value] of an object's node."""
+    return next(pair for pair in node[2][1] if pair[0] == name)
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -158,6 +163,13 @@ def _nodes(node: Any, tag: str) -> list[Any]:
         lambda tracker: _nodes(tracker, "pose")[0].__setitem__(1, ["list", [], 9999]),
         lambda tracker: _nodes(tracker, "object")[1].__setitem__(1, "sst_graph.types:Scan"),
         lambda tracker: tracker.clear(),
+        lambda tracker: _attribute(tracker, "setup").__setitem__(1, None),
+        lambda tracker: _attribute(tracker, "first_frames").__setitem__(1, None),
+        lambda tracker: _attribute(_attribute(tracker, "first_frames")[1], "digests")[1][1][0].__setitem__(
+            1, 7
+        ),
+        lambda tracker: _attribute(_attribute(tracker, "scan_order")[1], "newest_ns").__setitem__(1, "late"),
+        lambda tracker: _attribute(_attribute(tracker, "setup")[1], "camera").__setitem__(1, None),
     ],
 )
 def test_a_forged_tracker_is_refused(tmp_path: Path, good: bytes, change: Callable[[Any], Any]) -> None:

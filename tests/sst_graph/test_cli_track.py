@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,7 +21,8 @@ from sst_graph.cli import main
 from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.result import read_result
 
-OPTIONS = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+SOON = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+OPTIONS = [*SOON, "--set", "start_work=0"]
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +63,15 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert lines[-1]["sigma_time_offset_s"] < lines[0]["sigma_time_offset_s"]
     result = read_result(out)
     assert result.method == "track" and result.frames_used
+    # The file says what the last line says.
+    last = lines[-1]
+    assert last["settled"] and not any(line["settled"] for line in lines[:-1])
+    np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
+    assert last["time_offset_s"] == result.time_offset_s
+    np.testing.assert_array_equal(last["covariance"], result.covariance)
+    assert {"unconfirmed": "not_converged"}.get(last["status"], last["status"]) == result.status
+    np.testing.assert_allclose(np.sqrt(np.diag(last["covariance"]))[6], last["sigma_time_offset_s"])
+    assert lines[0]["covariance"] is None and "no estimate yet" in lines[0]["covariance_reason"]
     assert code == {"ok": 0}.get(result.status, 3)
     assert (captured.err == "") == (code == 0)
     assert main(["track", str(street), "--out", str(out)]) == 2
@@ -93,7 +104,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     for line, own in zip(unbroken[-len(resumed) :], resumed, strict=True):
         assert own.keys() == line.keys()
         for name, value in line.items():
-            if isinstance(value, float | list) and name != "weak":
+            if isinstance(value, float | list) and name not in ("weak", "refused"):
                 np.testing.assert_allclose(own[name], value, rtol=1e-4, atol=1e-7)
             elif name != "weak":
                 assert own[name] == value
@@ -102,6 +113,68 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
         gtsam.Pose3.Logmap(a.T_camera_lidar.between(b.T_camera_lidar)), b.time_offset_s - a.time_offset_s
     )
     assert np.abs(step / np.sqrt(np.diag(a.covariance))).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint after eight frames of the street."""
+    path = tmp_path_factory.mktemp("saved") / "tracker.npz"
+    main(["track", str(street), "--frames", "0:8", *OPTIONS, "--checkpoint", str(path)])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "bogus=1"], "unknown setting 'bogus'"),
+        (["--set", "window=40"], "setting window = 60, expected 40"),
+        (
+            ["--classes", "vehicle,pole"],
+            "setting calibration.classes = ['vehicle'], expected ['vehicle', 'pole']",
+        ),
+        (["--init", "none"], "a start from T_camera_lidar"),
+        (["--init", "none"], "expected no guess (--init none)"),
+        (["--frames", "1:20"], "another drive (no image of 0 ns in"),
+        (["--image-shift", "1"], "another drive (another image of 0 ns in"),
+    ],
+)
+def test_resumed_on_other_frames_or_settings(
+    street: Path, saved: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    """Refused in one line before a frame is taken; the checkpoint stays as it is."""
+    before = saved.read_bytes()
+    assert main(["track", str(street), *options, "--checkpoint", str(saved), "--resume"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err
+    assert saved.read_bytes() == before
+
+
+def test_resumed_on_another_drive(
+    street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same sensors, stamps and masks, one point of the newest scan or of an early one changed."""
+    for scan in (0, 7):
+        other = tmp_path / f"other{scan}"
+        shutil.copytree(street, other)
+        path = sorted(other.rglob("velodyne/*.bin"))[scan]
+        points = np.fromfile(path, "<f4")
+        points[0] += 0.01
+        points.tofile(path)
+        assert main(["track", str(other), "--checkpoint", str(saved), "--resume"]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == "" and "another drive (another scan of" in captured.err
+
+
+def test_resumed_with_nothing_said_or_the_same_said(
+    street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Settings that are not named are the checkpoint's; those that are, are its own."""
+    for options in ([], [*OPTIONS, "--init", "dataset"]):
+        copy = tmp_path / "tracker.npz"
+        shutil.copy(saved, copy)
+        command = ["track", str(street), "--frames", "0:9", "--checkpoint", str(copy), "--resume"]
+        assert main([*command, *options]) in (0, 3)
+        assert [line["frame"] for line in _lines(capsys.readouterr().out)] == [8]
 
 
 @pytest.mark.parametrize(

@@ -23,9 +23,9 @@ from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.odometry import LidarOdometry
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import image_features
-from sst_graph.storage import restored, stored
+from sst_graph.storage import PackedArray, lay_out, restored, stored
 from sst_graph.typed import wrong_fields
-from sst_graph.types import CameraImage, SemanticClass
+from sst_graph.types import CameraImage, RelativeMotion, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 CLASSES = checkpoint_classes()
@@ -34,6 +34,35 @@ CLASSES = checkpoint_classes()
 def _again(value: object) -> Any:
     node, data = stored(value)
     return restored(json.loads(json.dumps(node, allow_nan=False)), data, CLASSES)
+
+
+def test_what_is_laid_out_is_laid_out_as_what_is_read_back() -> None:
+    """Views, transposes and sets, in containers and objects: the same strides and order, the same values."""
+    root = np.random.default_rng(2).normal(size=(4, 5, 6))
+    swapped, column = np.swapaxes(root, 1, 2), root[:, :, 0]
+    motion = RelativeMotion(0, 1, gtsam.Pose3(), np.asfortranarray(root[0, :, :5]))
+    value = {"list": [swapped, column], "pair": (swapped, root[1].T), "motion": motion, "set": {64, 0, 8}}
+    before = [array.copy() for array in (swapped, column, root[1].T, motion.covariance)]
+    lay_out(value)
+    found = _again(value)
+    parts = [
+        (one["list"][0], one["list"][1], one["pair"][1], one["motion"].covariance) for one in (value, found)
+    ]
+    for live, read, old in zip(*parts, before, strict=True):
+        assert live.strides == read.strides and np.array_equal(live, old) and np.array_equal(read, old)
+    assert value["list"][0] is value["pair"][0] and not np.shares_memory(value["list"][0], root)  # type: ignore[index]
+    assert list(value["set"]) == list(found["set"])
+    assert motion.covariance.flags.f_contiguous
+
+
+def test_packed_arrays_come_back_and_count() -> None:
+    mask = np.zeros((300, 400), np.uint8)
+    node, data = stored(PackedArray.of(mask))
+    assert len(data) < 1000 and np.array_equal(restored(node, data, CLASSES), mask)
+    # What it says to unpack to is checked before memory is taken, and all of them together are.
+    node[2] = [2**20, 2**10]
+    with pytest.raises(ValueError, match="arrays of more than"):
+        restored(node, data, CLASSES)
 
 
 def test_plain_values_and_containers() -> None:

@@ -37,7 +37,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
             moving_fraction=0.3 if by_object else 0.0,
         )
     )
-    default = TrackerConfig(start_scans=10)
+    default = TrackerConfig(start_scans=10, start_work=0)
     search = dataclasses.replace(default.calibration.start, enabled=False)
     joint = default.calibration.joint
     graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)

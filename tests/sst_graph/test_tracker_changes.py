@@ -145,7 +145,7 @@ def test_a_jump_before_the_start_begins_the_window_anew(street: SimulatedDrive, 
         image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + late)
         update = tracker.add(dataclasses.replace(frame, image=image))
     assert not tracker.started and not update.alarm and "jumped by +30 ms" in update.reason
-    assert tracker.window.first_scan == STEP and len(tracker.window.scans) == tracker.waited == 5
+    assert tracker.window.first_scan == STEP and len(tracker.window.scans) == tracker.starting.waited == 5
     assert len(tracker.window.images) == 5
 
 

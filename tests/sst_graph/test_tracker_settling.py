@@ -24,7 +24,7 @@ def _street() -> SimulatedDrive:
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     """Checkpoint of a tracker that has settled for a frame, begun at the truth, and the frames to come."""
-    street, config = _street(), TrackerConfig(start_scans=8, window=18, settle_scans=8)
+    street, config = _street(), TrackerConfig(start_scans=8, start_work=0, window=18, settle_scans=8)
     tracker = tracker_from_truth(street, config)
     frames = list(street)
     for k, frame in enumerate(frames):

@@ -16,6 +16,7 @@ from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_start import Guess, first_estimate
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.state import State
+from sst_graph.stepwise import Stepwise
 
 PARKED = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_2011_09_26_parked"
 
@@ -34,10 +35,12 @@ def test_a_better_pose_that_has_not_settled_stands_in_the_way(
     """It must be clearly better, and of another basin: else it is the same answer on its way."""
     drive = Drive("none", None, (), (), (), ())  # type: ignore[arg-type]
 
-    def starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> list[State]:
+    def starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
+        yield 1
         return [State(gtsam.Pose3(), (delay_s,))]
 
-    def solution(drive: Drive, start: State, config: TrackerConfig) -> tracker_start._Solved:
+    def solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[tracker_start._Solved]:
+        yield 1
         if start.offset_s(0) > 0.0:
             raise tracker_start._Unsettled("still moved", _solved(turn_deg, cost))
         return _solved(0.0, 3.0)
@@ -60,7 +63,7 @@ def test_a_real_drive_three_images_off_starts_in_the_right_basin() -> None:
     assert source.truth is not None and source.truth.cTl is not None
     truth = source.truth
     rough = truth.cTl.retract(np.array([0.02, -0.02, 0.02, 0.05, 0.05, -0.05]))
-    tracker = Tracker(source.camera, TrackerConfig(), rough)
+    tracker = Tracker(source.camera, TrackerConfig(start_work=0), rough)
     for frame in source:
         tracker.add(frame)
     assert tracker.started

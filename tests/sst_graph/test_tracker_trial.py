@@ -58,7 +58,7 @@ def test_labels_that_always_contradict_are_no_way_without_end(
 ) -> None:
     """A limit that any frames are past: two starts are refused, the third stays."""
     tracker = tracker_from_truth(street)
-    tracker.trial.alarm = dataclasses.replace(tracker.config.alarm, start_chi2=1e-6)
+    tracker.trial.alarm = dataclasses.replace(tracker.config.alarm, start_chi2=0.1)
     updates = [tracker.add(frame) for frame in frames[:30]]
     assert sum("begins anew" in update.reason for update in updates) == 2
     assert tracker.started

@@ -110,7 +110,7 @@ def tracker() -> Tracker:
             motion="stop_and_go",
         )
     )
-    default = TrackerConfig(start_scans=8, window=10)
+    default = TrackerConfig(start_scans=8, start_work=0, window=10)
     start = dataclasses.replace(default.calibration.start, enabled=False)
     calibration = dataclasses.replace(default.calibration, start=start)
     tracker = Tracker(

@@ -1,0 +1,77 @@
+"""What a tracker knows so far as a cost on (E, D), and what it has learnt since it told it last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.marginal import CalibrationMarginal, inverse
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedMarginal(CalibrationMarginal):
+    """A tracker's marginal.
+
+    Attributes:
+        start: number of the start that its estimate comes from: what another start told is of another
+            calibration.
+    """
+
+    start: int = 0
+
+
+def tracked_marginal(
+    cTl: gtsam.Pose3, offset_s: float, covariance: FloatArray, start: int
+) -> TrackedMarginal:
+    """An estimate and its covariance (7, 7), about itself.
+
+    Raises:
+        EstimationError: the covariance has no inverse.
+    """
+    information = inverse(covariance, "covariance of the tracker")
+    return TrackedMarginal(cTl, offset_s, information, np.zeros(7), start=start)
+
+
+def seen_from(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMarginal:
+    """A marginal about its own optimum as the cost about another point that leads back to it exactly.
+
+    With s = Log(T0^-1 T) from the other point T0 to the optimum T, and J the derivative of
+    Log(T0^-1 T Exp(d)) at d = 0, information about T0 is J^-T L J^-1: the inverse of
+    :func:`sst_graph.marginal.carried`.
+    """
+    step = previous.cTl.between(whole.cTl)
+    xi = np.asarray(gtsam.Pose3.Logmap(step))
+    back = np.eye(7)
+    back[:6, :6] = np.linalg.inv(np.asarray(gtsam.Pose3.LogmapDerivative(xi)))
+    shift = np.append(xi, whole.offset_s - previous.offset_s)
+    information = back.T @ whole.information @ back
+    information = 0.5 * (information + information.T)
+    vector = information @ shift
+    return replace(
+        whole,
+        cTl=previous.cTl,
+        offset_s=previous.offset_s,
+        information=information,
+        vector=vector,
+        constant=float(shift @ vector),
+    )
+
+
+def increment(whole: TrackedMarginal, previous: TrackedMarginal) -> TrackedMarginal:
+    """What to add to a marginal to come to another, about the former's point.
+
+    It may take back: where later frames show that labels err more than they seemed to, the tracker is less
+    sure than it was, and the difference is negative there. The sum is the tracker's own information.
+    """
+    there = seen_from(whole, previous)
+    return replace(
+        there,
+        information=there.information - previous.information,
+        vector=there.vector - previous.vector,
+        constant=there.constant - previous.constant,
+    )

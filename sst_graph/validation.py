@@ -1,0 +1,165 @@
+"""What a scan or an image must be, checked once where it enters an estimator.
+
+Both functions answer the same data in the documented dtypes (:mod:`sst_graph.types`), without a copy where
+nothing has to change. Whole numbers and floats of any width and byte order are converted where every value
+fits; everything else is refused with what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from factors.camera import PinholeCamera
+from sst_graph.errors import DataError
+from sst_graph.types import NO_PICTURE, CameraImage, Scan, SemanticClass
+
+MOST_POINTS = 10_000_000
+"""Points of a scan; ten times what the densest spinning LiDAR gives in a sweep."""
+FARTHEST_M = 1e5
+"""No LiDAR sees farther; a larger coordinate is another unit or a broken packet [m]."""
+LONGEST_SWEEP_S = 2.0
+"""Times of points are relative to the scan's stamp; a larger one is an absolute time [s]."""
+LATEST_NS = 2**62
+"""Stamps lie within +-146 years of zero, so that no difference of two leaves int64 [ns]."""
+
+_IS_CLASS = np.isin(np.arange(256), [int(c) for c in SemanticClass])
+
+
+def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
+    """A scan whose arrays agree with each other and hold nothing but usable numbers.
+
+    Args:
+        fewest: points that it must have.
+
+    Raises:
+        DataError: they do not.
+    """
+    if not isinstance(scan, Scan):
+        raise DataError(place, f"a {type(scan).__name__}", "a Scan")
+    stamp_ns = checked_stamp(scan.stamp_ns, place)
+    points = _array(scan.points, (None, 3), f"{place}: points")
+    n = len(points)
+    if not fewest <= n <= MOST_POINTS:
+        raise DataError(f"{place}: points", f"{n} points", f"{fewest} to {MOST_POINTS}")
+    points = _reals(points, FARTHEST_M, f"{place}: points", "m")
+    classes = _labels(_array(scan.classes, (n,), f"{place}: classes"), f"{place}: classes")
+    instances, rings = (
+        None if value is None else _whole(_array(value, (n,), f"{place}: {name}"), f"{place}: {name}")
+        for name, value in (("instances", scan.instances), ("rings", scan.rings))
+    )
+    offsets_s = None
+    if scan.offsets_s is not None:
+        times = _array(scan.offsets_s, (n,), f"{place}: point times")
+        offsets_s = _reals(times, LONGEST_SWEEP_S, f"{place}: point times", "s after the stamp")
+    left_out = scan.left_out
+    if not isinstance(left_out, int | np.integer) or left_out < 0:
+        raise DataError(f"{place}: left_out", f"{left_out!r:.60}", "a number of points")
+    return Scan(stamp_ns, points, classes, instances, offsets_s, rings, int(left_out))
+
+
+def checked_image(image: object, camera: PinholeCamera, place: str = "image") -> CameraImage:
+    """An image whose mask, picture and instances have the camera's size; the picture may be missing.
+
+    Raises:
+        DataError: they have not, or hold other than labels and 8-bit colours.
+    """
+    if not isinstance(image, CameraImage):
+        raise DataError(place, f"a {type(image).__name__}", "a CameraImage")
+    stamp_ns = checked_stamp(image.stamp_ns, place)
+    size = (camera.height, camera.width)
+    for what, array in (("mask", image.mask), ("picture", image.pixels)):
+        _check_size(array, size, what, place)
+    mask = _array(image.mask, size, f"{place}: mask", "the camera's size")
+    mask = _labels(mask, f"{place}: mask")
+    pixels = NO_PICTURE
+    if not isinstance(image.pixels, np.ndarray) or image.has_picture:
+        pixels = _array(image.pixels, (*size, 3), f"{place}: pixels", "the camera's size in BGR")
+    if pixels.dtype != np.uint8:
+        raise DataError(f"{place}: pixels", f"dtype {pixels.dtype}", "uint8")
+    instances = None
+    if image.instances is not None:
+        instances = _array(image.instances, size, f"{place}: instances", "the camera's size")
+        instances = _whole(instances, f"{place}: instances")
+    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances)
+
+
+def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:
+    """Height and width, where an array has these; a picture may be missing."""
+    if not isinstance(array, np.ndarray) or array.ndim < 2 or (what == "picture" and not array.size):
+        return
+    if array.shape[:2] != size:
+        (height, width), (h, w) = size, array.shape[:2]
+        expected = f"{width}x{height} px, the camera's size: make masks at the pictures' full size"
+        raise DataError(place, f"a {what} of {w}x{h} px", expected)
+
+
+def checked_stamp(stamp_ns: object, place: str) -> int:
+    """A stamp as a plain int [ns].
+
+    Raises:
+        DataError: it is no whole number, or one that no clock shows.
+    """
+    if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
+        raise DataError(place, f"a stamp that is a {type(stamp_ns).__name__}", "whole nanoseconds")
+    if abs(int(stamp_ns)) > LATEST_NS:
+        raise DataError(place, "a stamp of more than 146 years", "nanoseconds that fit into int64")
+    return int(stamp_ns)
+
+
+def _array(value: object, shape: tuple[int | None, ...], place: str, why: str = "") -> NDArray[Any]:
+    """A plain array of a shape, in which None stands for any length."""
+    if not isinstance(value, np.ndarray):
+        raise DataError(place, f"a {type(value).__name__}", "a NumPy array")
+    fits = value.ndim == len(shape) and all(
+        b is None or a == b for a, b in zip(value.shape, shape, strict=True)
+    )
+    if not fits:
+        wanted = f"({', '.join('n' if length is None else str(length) for length in shape)})"
+        raise DataError(place, f"shape {value.shape}", f"{wanted}{f', {why}' if why else ''}")
+    return np.asarray(value)
+
+
+def _reals(array: NDArray[Any], most: float, place: str, unit: str) -> NDArray[np.float32]:
+    """As float32, all finite and within +-``most``."""
+    if array.dtype.kind not in "fiu":
+        raise DataError(place, f"dtype {array.dtype}", "float32")
+    if not array.size:
+        return np.ascontiguousarray(array, np.float32)
+    # NaN and inf make the largest or the smallest value NaN or inf, and no copy is needed to see it.
+    low, high = float(array.min()), float(array.max())
+    if not (np.isfinite(low) and np.isfinite(high)):
+        bad = int(np.count_nonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1)))
+        raise DataError(place, f"{bad} of {len(array)} that are NaN or inf", "finite numbers")
+    if max(-low, high) > most:
+        worst = low if -low > high else high
+        raise DataError(place, f"{worst:.6g}", f"at most {most:g} {unit}")
+    return np.ascontiguousarray(array, np.float32)
+
+
+def _labels(array: NDArray[Any], place: str) -> NDArray[np.uint8]:
+    """As uint8, nothing but classes."""
+    if array.dtype.kind not in "iu":
+        raise DataError(place, f"dtype {array.dtype}", "uint8 of SemanticClass")
+    if not array.size:
+        return np.ascontiguousarray(array, np.uint8)
+    if array.dtype != np.uint8 and (int(array.min()) < 0 or int(array.max()) > 255):
+        raise DataError(place, f"labels {int(array.min())} to {int(array.max())}", "values of SemanticClass")
+    labels = np.ascontiguousarray(array, np.uint8)
+    known = _IS_CLASS.take(labels)
+    if not known.all():
+        raise DataError(place, f"label {int(labels[~known][0])}", "values of SemanticClass")
+    return labels
+
+
+def _whole(array: NDArray[Any], place: str) -> NDArray[np.uint16]:
+    """As uint16."""
+    if array.dtype.kind not in "iu":
+        raise DataError(place, f"dtype {array.dtype}", "uint16")
+    if not array.size:
+        return np.ascontiguousarray(array, np.uint16)
+    if array.dtype not in (np.uint8, np.uint16) and (int(array.min()) < 0 or int(array.max()) > 0xFFFF):
+        raise DataError(place, f"numbers {int(array.min())} to {int(array.max())}", "0 to 65535")
+    return np.ascontiguousarray(array, np.uint16)
