@@ -41,7 +41,6 @@ _Sigmas = make_dataclass(
     bases=(Settings,),
     namespace={"__module__": __name__},
     frozen=True,
-    namespace={"__module__": __name__},
 )
 if TYPE_CHECKING:
 
