@@ -75,7 +75,7 @@ class ImageFacts:
 
     Attributes:
         index: of its frame.
-        picture_digest, mask_digest: equal ones are the same.
+        picture_digest, mask_digest: equal ones are the same; the mask's for a missing picture.
         labelled: number of pixels by class.
         rows: mean row of each class's pixels, as a share of the image's height.
         profiles: what the picture shows along the mask's contours, and beside them.
@@ -143,12 +143,13 @@ def scan_facts(index: int, scan: Scan, closely: bool = True) -> ScanFacts:
 
 def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFacts:
     """Facts of an image; the picture along the contours only where it is looked at closely."""
+    shown = image.pixels if image.has_picture else image.mask
     labelled = _counts(image.mask)
     height = image.mask.shape[0]
     rows = {c: float(np.flatnonzero(image.mask == c).mean() // image.mask.shape[1]) for c in labelled}
     return ImageFacts(
         index,
-        zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()),
+        zlib.crc32(np.ascontiguousarray(shown).tobytes()),
         zlib.crc32(np.ascontiguousarray(image.mask).tobytes()),
         labelled,
         {c: row / height for c, row in rows.items()},
