@@ -15,7 +15,8 @@ import pytest
 from sst_graph.data import Loader, loader_names, open_source, register_loader
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.problem.drive import prepare_drive
-from sst_graph.types import SemanticClass
+from sst_graph.problem.survey import image_facts
+from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
 
 FRAMES, POINTS, WIDTH, HEIGHT = 5, 12, 8, 6
 Damage = Callable[[Path], object]
@@ -331,3 +332,10 @@ def test_a_name_that_would_write_to_the_terminal_is_shown(drive: Path) -> None:
     with pytest.raises(DataError) as caught:
         open_source(evil)
     assert str(caught.value).isprintable()
+
+
+def test_missing_pictures_are_no_repeated_picture() -> None:
+    """What the survey compares of images without pictures is their masks."""
+    masks = [np.full((6, 8), c, np.uint8) for c in (0, 1, 1)]
+    a, b, c = (image_facts(k, CameraImage(k, mask, NO_PICTURE)) for k, mask in enumerate(masks))
+    assert a.picture_digest != b.picture_digest == c.picture_digest and not a.profiles
