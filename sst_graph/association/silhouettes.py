@@ -16,11 +16,14 @@ from factors.motion import move_points
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
 from sst_graph.association.contour import ContourMap
-from sst_graph.assumptions.model import Effect
+from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, setting
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+
+_OUTWARD, _LEAST_STRETCH = 0.01, 0.1
+"""A pixel this share farther from the principal point must come to lie farther out by this part of it."""
 
 SIDES = 4
 """An object has a left, a right, a top and a bottom side."""
@@ -64,6 +67,9 @@ class Motion:
 
 class PointDeviation(Protocol):
     """What points and pixels differ by from what is assumed of them (:mod:`sst_graph.assumptions`)."""
+
+    @property
+    def scene(self) -> Scene: ...
 
     def effect(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> Effect:
         """On points (n, 3) [m] with times (n,) [s] and ideal pixels (n, 2) [px]."""
@@ -171,9 +177,20 @@ def _deviated(
 
 
 def _pixel_shift(deviation: PointDeviation, points: Boundaries, uvs: FloatArray) -> FloatArray:
-    """(n, 2) by how much the pixels of points lie beside the ideal ones ``uvs`` [px]."""
+    """(n, 2) by how much the pixels of points lie beside the ideal ones ``uvs`` [px].
+
+    NaN where the picture would fold over: beyond the radius at which a polynomial lens turns back, points
+    far outside the view come to lie inside the image.
+    """
     shift = deviation.effect(points.lPs, points.offsets_s, uvs).pixel_shift
-    return np.zeros_like(uvs) if shift is None else shift
+    if shift is None:
+        return np.zeros_like(uvs)
+    arms = uvs - deviation.scene.centre
+    farther = deviation.effect(points.lPs, points.offsets_s, uvs + _OUTWARD * arms).pixel_shift
+    assert farther is not None
+    stretch = ((_OUTWARD * arms + farther - shift) * arms).sum(axis=1)
+    folded = stretch < _LEAST_STRETCH * _OUTWARD * (arms**2).sum(axis=1)
+    return np.where(folded[:, None], np.nan, shift)
 
 
 def _has_a_mask(

@@ -116,6 +116,11 @@ class Scene:
     image_s: float
     period_s: float
 
+    @property
+    def centre(self) -> FloatArray:
+        """(2,) the principal point [px]."""
+        return np.array([self.camera.cx, self.camera.cy])
+
     def view(self, lPs: FloatArray, offsets_s: FloatArray, uvs: FloatArray) -> View:
         """Points of the scan as the image sees them; arguments as in :class:`View`."""
         return View(lPs, offsets_s, uvs, self.camera, self.l_twist, self.image_s, self.period_s)

@@ -48,7 +48,7 @@ from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 from sst_graph.types import Source
-from sst_graph.uncertainty.assumptions import BUDGET, budget, consider, motion_covariance
+from sst_graph.uncertainty.assumptions import BUDGET, budget, consider, motion_covariance, remainder
 from sst_graph.uncertainty.covariance import RobustCovariance, robust_covariance
 from sst_graph.uncertainty.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.uncertainty.frame_information import to_document
@@ -204,6 +204,7 @@ def answer_joint(
     parts_of_sigma = budget(covariance, motion, considered)
     covariance = covariance[:size, :size] + considered.covariance(size)
     sweeps = _with_sweeps(drives, solution, covariance, config)
+    parts_of_sigma |= remainder(sweeps.covariance, covariance)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],

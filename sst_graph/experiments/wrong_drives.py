@@ -28,11 +28,13 @@ class KeptDrive:
     nominal: gtsam.Pose3 | None
     truth: GroundTruth | None
     frames: Sequence[Frame]
+    sweep: str = "auto"
 
     @classmethod
     def of(cls, source: Source) -> KeptDrive:
-        """All frames of a source, read now."""
-        return cls(source.name, source.camera, source.nominal, source.truth, tuple(source))
+        """All frames of a source, read now; a word of the source on its sweep is kept."""
+        sweep = getattr(source, "sweep", "auto")
+        return cls(source.name, source.camera, source.nominal, source.truth, tuple(source), sweep)
 
     def __len__(self) -> int:
         return len(self.frames)

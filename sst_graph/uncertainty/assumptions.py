@@ -179,3 +179,14 @@ def budget(
     parts = {"matches": np.diag(covariance)[:7] - moved, "motion": moved}
     parts |= {name: np.diag(considered.part(name))[:7] for name in considered.sigmas}
     return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}
+
+
+def remainder(total: FloatArray, told: FloatArray) -> dict[str, list[float]]:
+    """JSON-able part of a budget: what a covariance (7, 7) has beyond another (n, n), where there is any.
+
+    The motion around single scans that nothing measures, and sweeps that nothing tells.
+    """
+    left = np.clip(np.diag(total) - np.diag(told)[:7], 0.0, None)
+    if not left.any():
+        return {}
+    return {"unmeasured motion and sweep": [float(f"{value:.6g}") for value in np.sqrt(left)]}
