@@ -22,11 +22,9 @@ from factors.robust import RobustKernel
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
-from sst_graph.odometry.lens import lens_from_chains
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks, associate, joint_graph
 from sst_graph.problem.objects import ObjectId
-from sst_graph.problem.path import SensorPath
 from sst_graph.problem.state import State, nuisance_key
 from sst_graph.uncertainty.assumptions import AssumptionConfig, Considered, columns_of, weighted_columns
 from sst_graph.uncertainty.covariance import RobustCovariance, match_table, robust_covariance
@@ -99,26 +97,8 @@ def check_assumptions(problem: TestedProblem, config: AssumptionConfig) -> tuple
     found = []
     for name, score in zip(names, scores(problem, names), strict=True):
         if abs(score) > _HINT_SIGMAS and (finding := _estimated(problem, name, config)) is not None:
-            found.append(finding if name != "k1" else _with_corners(finding, problem, config))
+            found.append(finding)
     return tuple(sorted(found, key=lambda finding: -abs(finding.value) / finding.sigma))
-
-
-def _with_corners(finding: Finding, problem: TestedProblem, config: AssumptionConfig) -> Finding:
-    """The finding about the lens, with what corners that the camera follows say of it."""
-    state, value, information = problem.solution.state, finding.value, finding.sigma**-2.0
-    for number, drive in enumerate(problem.drives):
-        path, offset_ns = SensorPath(drive.lidar_motions), round(state.offset_s(number) * 1e9)
-        poses = [path.at(image.stamp_ns + offset_ns) for image in drive.images]
-        lTc = state.cTl.inverse()
-        wTcs = {k: pose[0].compose(lTc) for k, pose in enumerate(poses) if pose is not None}
-        lens = lens_from_chains(drive.chains, wTcs, drive.camera)
-        if lens is not None:
-            more = lens.sigma**-2.0
-            value = (information * value + more * lens.k1) / (information + more)
-            information += more
-    sigma = information**-0.5
-    contradicted = abs(value) > config.threshold * sigma
-    return replace(finding, value=value, sigma=sigma, contradicted=contradicted)
 
 
 def scores(problem: TestedProblem, names: Sequence[str]) -> FloatArray:

@@ -17,7 +17,6 @@ from sst_graph.association.contour import ContourMap
 from sst_graph.association.picture_edges import PictureConfig
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
-from sst_graph.odometry.chains import ChainTracker, FeatureChain
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
@@ -162,7 +161,6 @@ class Drive:
         image_pairs: tracks between consecutive images; empty for a single image.
         left_out: what the data lacked.
         survey: what the raw frames show, for the search for causes; None where nobody looked.
-        chains: corners followed through several images, where image features are tracked.
         sweep: what was decided of the times of the points, or None where nobody asked.
     """
 
@@ -174,7 +172,6 @@ class Drive:
     image_pairs: tuple[ImagePair, ...]
     left_out: LeftOut = field(default_factory=LeftOut)
     survey: Survey | None = None
-    chains: tuple[FeatureChain, ...] = ()
     sweep: SweepDecision | None = None
 
     @property
@@ -224,7 +221,7 @@ def prepare_drive(
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
-    tracker, follower = FeatureTracker(config.visual_odometry.features), ChainTracker()
+    tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
     left_out, surveyor = LeftOut(), Surveyor(total)
@@ -239,7 +236,6 @@ def prepare_drive(
             scans.append(scan_features(frame.index, frame.scan, classes, config))
         if frame.image is not None:
             if config.use_visual_odometry:
-                follower.add(frame.image)
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
@@ -262,7 +258,6 @@ def prepare_drive(
         tuple(pairs),
         left_out,
         surveyor.survey(),
-        follower.chains(),
         sweep,
     )
 
