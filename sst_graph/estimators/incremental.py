@@ -52,8 +52,9 @@ class Tracker(Tracking):
         initial_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        super().__init__(camera, config or TrackerConfig(), Guess(initial, initial_offset_s))
-        self.setup = Setup(camera, self.config, initial, initial_offset_s)
+        config = config or TrackerConfig()
+        super().__init__(camera, config, Guess(initial, initial_offset_s))
+        self.setup = Setup(camera, config, initial, initial_offset_s)
         self.first_frames = FirstFrames()
         self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
         self.settled = False
@@ -194,7 +195,8 @@ class Tracker(Tracking):
         if self.smoother is None:
             return []
         entries = self.history_store.smoothed(self.smoother)
-        return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
+        beside = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
 
     def consolidate(self) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.

@@ -35,7 +35,7 @@ from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, RelativeMotion, Scan
-from sst_graph.uncertainty.common_error import common_covariance
+from sst_graph.uncertainty.assumptions import Considered, considered
 from sst_graph.uncertainty.observability import open_directions
 
 _LOG = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ class Tracking:
 
     def __init__(self, camera: PinholeCamera, config: TrackerConfig, guess: Guess) -> None:
         self.camera = camera
-        self.config = config
+        self.config = config = dataclasses.replace(config, calibration=config.calibration.estimating)
         calibration = self.config.calibration
         self.classes = calibration.classes
         self.window = Window(camera, self.config.window)
@@ -90,11 +90,13 @@ class Tracking:
         """The present estimate, or the guess."""
         if self.smoother is not None:
             return self.smoother.point
-        return Point.unbiased(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, self.classes)
+        guess, names = self.guess, self.estimated_names
+        return Point.unbiased(guess.cTl or gtsam.Pose3(), guess.offset_s, self.classes, names)
 
     @property
     def covariance(self) -> FloatArray:
-        """(m, m) of extrinsic [rad, m], time offset [s] and mask biases [px]; wide before the start."""
+        """(m, m) of extrinsic [rad, m], time offset [s], mask biases [px] and estimated parameters of
+        assumptions; of the first two only, and wide, before the start."""
         return self.known.covariance
 
     @property
@@ -103,11 +105,17 @@ class Tracking:
         return self.adoption.adopted
 
     def reported(self) -> FloatArray:
-        """(7, 7) covariance of the present estimate, with what all contours may err by together."""
-        return self.covariance[:7, :7] + self._common(self.point.cTl)
+        """(7, 7) covariance of the present estimate, with what assumptions that may be wrong add to it."""
+        return self.covariance[:7, :7] + self.considered().covariance(7)
 
-    def _common(self, cTl: gtsam.Pose3) -> FloatArray:
-        return common_covariance(cTl, self.camera, self.config.calibration.assumptions)
+    def considered(self) -> Considered:
+        """How the present estimate follows the assumptions that are not estimated beside it."""
+        return considered(self.known.steps, self.config.calibration.assumptions)
+
+    @property
+    def estimated_names(self) -> tuple[str, ...]:
+        """Assumptions whose parameters are estimated."""
+        return tuple(name for name, _ in self.config.calibration.assumptions.estimated)
 
     def take_image(self, image: CameraImage, moved_ns: int) -> TrackUpdate:
         """A checked image into the window; ``moved_ns``: the stamps have moved by as much for good."""
@@ -222,7 +230,8 @@ class Tracking:
                 return self._change(changed, stamp_ns, since, chi2, "the calibration has changed")
             return self._refuse_start(stamp_ns, since, "new frames contradict the start: it begins anew")
         if new:
-            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, self.guess.point(self.classes))
+            in_use = self.guess.point(self.classes, self.estimated_names)
+            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, in_use)
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
         if new or not missing <= {number}:
