@@ -158,7 +158,8 @@ class Tracker(Tracking):
     def marginal(self) -> TrackedMarginal:
         """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
 
-        Linearized at the estimate, as sure as the reported covariance.
+        Linearized at the estimate, as sure as the reported covariance: parameters of assumptions that are
+        estimated are marginalized out, those that are not are considered.
 
         Raises:
             EstimationError: there is no estimate yet.
@@ -235,6 +236,7 @@ class Tracker(Tracking):
                 smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
+            self.tests.look(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False

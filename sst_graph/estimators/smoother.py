@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import delay_drift, extrinsic_drift
+from sst_graph.association.silhouettes import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
@@ -258,6 +259,16 @@ class WindowSmoother:
         unknowns of ``past`` and what it holds."""
         return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
 
+    def whole(self) -> Gaussian:
+        """All that past and window say of the last epoch, at the estimate, what ``past`` holds included."""
+        belief = self.past.at(self._point)
+        for i, epoch in enumerate(self._epochs):
+            if i > 0:
+                belief = belief.drifted(self.walk(self._seconds(i)))
+            seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
+            belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
+        return belief
+
     def information_of_standing(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
         alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
@@ -296,16 +307,39 @@ class WindowSmoother:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        point, scores = self.past.point, [entry.score for entry in self.entries.values()]
-        columns = [point.columns(score.belief.point.tracks) for score in scores]
-        robust = naive + naive @ self.sums.surplus(scores, columns, self.model) @ naive
+        scores = [entry.score for entry in self.entries.values()]
+        robust = naive + naive @ self.surplus() @ naive
         spread = None
         if not self.drift.enabled:
             found = [score.objects for score in scores if score.objects is not None]
             point_now = self.past.at(self._point).point
             spread = self.sums.objects.spread(found, naive, point_now)
-        robust = composed(robust, spread, self.sums.flatness(scores))
+        robust = composed(robust, spread, self.flatness)
         return 0.5 * (robust + robust.T), naive
+
+    def surplus(self, with_held: bool = False) -> FloatArray:
+        """(n, n) variance of the score of past and window beyond that of independent matches.
+
+        Args:
+            with_held: over what ``past`` holds, too.
+        """
+        scores, point = [entry.score for entry in self.entries.values()], self.past.point
+        held = self.past.held if with_held else 0
+        columns = [point.columns(score.belief.point.tracks, held) for score in scores]
+        return self.sums.surplus(scores, columns, self.model, with_held)
+
+    @property
+    def flatness(self) -> float:
+        """Mean robust weight over mean curvature, of all matches of past and window."""
+        return self.sums.flatness([entry.score for entry in self.entries.values()])
+
+    @property
+    def objects(self) -> int:
+        """How many objects past and window have seen."""
+        sides = [np.array(list(self.sums.live), np.intp)]
+        sides += [entry.score.sides.sides for entry in self.entries.values()]
+        live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
+        return self.sums.objects.count + len(live)
 
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""
