@@ -32,7 +32,7 @@ from sst_graph.storage import class_name, restored, stored
 from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
-VERSION = 16
+VERSION = 17
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
