@@ -203,7 +203,7 @@ class WindowSmoother:
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
         values = self.isam.calculateEstimate()
-        isam = gtsam.ISAM2(_parameters())
+        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
         self._go_on_with(isam, list(isam.update(self._held(), values).getNewFactorsIndices()))
 
     def _held(self) -> gtsam.NonlinearFactorGraph:
