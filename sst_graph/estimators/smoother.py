@@ -19,6 +19,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
+from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
@@ -33,7 +34,7 @@ from sst_graph.problem.state import (
 )
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
-from sst_graph.uncertainty.object_spread import composed
+from sst_graph.uncertainty.object_spread import ObjectSpread, composed
 
 FloatArray = NDArray[np.float64]
 
@@ -81,9 +82,9 @@ class WindowSmoother:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
         self.held_names = held_at_zero(graph.estimate)
-        self.prior = self.bent = self.alone = prior
-        self.past = prior.holding(len(self.held_names))
-        self.undecided = Undecided.none(prior.point.size)
+        self.prior = self.alone = prior
+        self.past = self.bent = prior.holding(len(self.held_names))
+        self.undecided = Undecided.none(len(self.bent.vector))
         self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, Entry] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
@@ -218,7 +219,8 @@ class WindowSmoother:
     def _whole(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the window: the past, the walks, the pairs, the twists."""
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(self.bent.factor(self.keys(self._epochs[0].number, self.past.point.tracks)))
+        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
+        graph.add(self.bent.without_held().factor(keys))
         for old, new in pairwise(self._epochs):
             for factor in self.drift_factors(old, new):
                 graph.add(factor)
@@ -270,15 +272,16 @@ class WindowSmoother:
         unknowns of ``past`` and what it holds."""
         return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
 
-    def whole(self) -> Gaussian:
-        """All that past and window say of the last epoch, at the estimate, what ``past`` holds included."""
-        belief = self.past.at(self._point)
+    def vector(self) -> FloatArray:
+        """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
+        unknowns of ``past`` and what it holds."""
+        belief = self.bent.at(self._point)
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 belief = belief.drifted(self.walk(self._seconds(i)))
             seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
             belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
-        return belief
+        return belief.vector
 
     def information_of_standing(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
@@ -318,15 +321,31 @@ class WindowSmoother:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        scores = [entry.score for entry in self.entries.values()]
         robust = naive + naive @ self.surplus() @ naive
         spread = None
         if not self.drift.enabled:
-            found = [score.objects for score in scores if score.objects is not None]
             point_now = self.past.at(self._point).point
-            spread = self.sums.objects.spread(found, naive, point_now)
+            spread = self.sums.objects.spread(self._objects(), naive, point_now)
         robust = composed(robust, spread, self.flatness)
         return 0.5 * (robust + robust.T), naive
+
+    def _objects(self) -> list[ObjectBeliefs]:
+        """What each object says in each scan of the window."""
+        scores = [entry.score for entry in self.entries.values()]
+        return [score.objects for score in scores if score.objects is not None]
+
+    def score_spread(
+        self, directions: FloatArray, information: FloatArray, values: FloatArray
+    ) -> tuple[ObjectSpread | None, ...]:
+        """How estimates of held parameters vary with the objects; None where objects are not kept (drift).
+
+        Args:
+            directions, information, values: as of :meth:`ObjectSums.score_spread`.
+        """
+        if self.drift.enabled:
+            return (None,) * len(information)
+        point = self.past.at(self._point).point
+        return self.sums.objects.score_spread(self._objects(), point, directions, information, values)
 
     def surplus(self, with_held: bool = False) -> FloatArray:
         """(n, n) variance of the score of past and window beyond that of independent matches.
