@@ -108,20 +108,12 @@ class ContourMap:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
         return nearest_contours([self], [(0, len(uvs))], uvs)
 
-    def is_unknown(self, feet: FloatArray) -> NDArray[np.bool_]:
-        """Whether nothing is known of the contour at points of it, (n, 2)."""
-        return self.is_unknown_at(np.rint(feet - [self.left, self.top]).astype(np.intp).T)
-
     def is_unknown_at(self, places: IntArray) -> NDArray[np.bool_]:
-        """The same at columns and rows of the box (2, n)."""
+        """(n,) whether nothing is known of the contour at columns and rows (2, n) of the box."""
         rows, columns = self.unknown.shape
         column, row = places
         found = self.unknown[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
         return np.asarray(found > 0, np.bool_)
-
-    def well_inside(self, u: FloatArray, v: FloatArray) -> NDArray[np.bool_]:
-        """Whether columns and rows are on the image and not close to its border; False for NaN."""
-        return _well_inside(u, v, self.width, self.height)
 
 
 def nearest_contours(
@@ -143,7 +135,7 @@ def nearest_contours(
         if len(sizes) == 1
         else np.repeat([(contour.width, contour.height) for contour in contours], counts, axis=0).T
     )
-    valid = _well_inside(uvs[:, 0], uvs[:, 1], width, height)
+    valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
     corners = np.array([(contour.left, contour.top) for contour in contours])
     corner = corners.T if len(contours) == 1 else np.repeat(corners, counts, axis=0).T
     safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
@@ -167,9 +159,10 @@ def nearest_contours(
     return ContourFeet(centre, normals.T, feet.T, valid)
 
 
-def _well_inside(
+def well_inside(
     u: FloatArray, v: FloatArray, width: IntArray | int, height: IntArray | int
 ) -> NDArray[np.bool_]:
+    """Whether columns u and rows v are on an image and not close to its border; False for NaN."""
     with np.errstate(invalid="ignore"):
         inside = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
         inside &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)

@@ -290,26 +290,29 @@ class FrozenProblem:
     def _add(self, frames: _Frames, system: NormalEquations, point: Point) -> float:
         """Add the matches of a drive to the normal equations; their cost."""
         # 1. Weighted rows: 13 of the motion, the parameters that are estimated, bias, residual.
-        t, alignment = len(frames.terms), frames.alignment
+        alignment = frames.alignment
         offset_s, biases_px = point.scalars[frames.clock - 6], point.scalars[frames.biases - 6]
         twists = point.twists[frames.images].T
         evaluated = evaluate(alignment, point.cTl, float(offset_s), twists, biases_px, True)
-        if t:
+        if self._terms:
             steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
             evaluated = evaluated.with_terms(frames.terms, steps, True)
         constant = weigh(alignment, evaluated)
         rows = evaluated.rows[:, 0]
         # 2. Of each image the sums of the products of its rows.
-        columns = [*range(6), frames.clock, *self._terms]
-        shared, twist = [*range(7), *range(13, 13 + t)], slice(7, 13)
-        for image, start, end in frames.spans:
+        products = np.empty((len(frames.spans), len(rows), len(rows)))
+        for G, (_, start, end) in zip(products, frames.spans, strict=True):
             own = rows[:, start:end]
-            G = own @ own.T
-            system.H[np.ix_(columns, columns)] += G[np.ix_(shared, shared)]
-            system.g[columns] += G[shared, -1]
-            system.H_twists[image] += G[twist, twist]
-            system.g_twists[image] += G[twist, -1]
-            system.H_mixed[image][:, columns] += G[twist, shared]
+            np.matmul(own, own.T, out=G)
+        places = [image for image, _, _ in frames.spans]
+        columns = [*range(6), frames.clock, *self._terms]
+        shared, twist = [*range(7), *range(13, 13 + len(frames.terms))], slice(7, 13)
+        total = products.sum(axis=0)
+        system.H[np.ix_(columns, columns)] += total[np.ix_(shared, shared)]
+        system.g[columns] += total[shared, -1]
+        system.H_twists[places] += products[:, twist, twist]
+        system.g_twists[places] += products[:, twist, -1]
+        system.H_mixed[np.ix_(places, range(6), columns)] += products[:, twist][:, :, shared]
         # 3. The same of the matches of an image that share a bias, with the bias.
         cells = np.add.reduceat(rows * rows[-2], frames.cells, axis=1)
         bias, image_of = frames.biases[frames.cells], frames.images[frames.cells]

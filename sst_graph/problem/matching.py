@@ -492,7 +492,7 @@ class DriveMatches:
             motion,
             {
                 c: SilhouetteMatches(
-                    self.alignment.of_one_image(own, motion.c_acceleration),
+                    self._alignment_of(own, motion),
                     objects[self.points[own]],
                     self.found.sides[own],
                     self.places[own],
@@ -508,6 +508,11 @@ class DriveMatches:
                 if self.terms
             },
         )
+
+    def _alignment_of(self, own: slice, motion: Motion) -> Alignment:
+        """Of one group."""
+        alone = own == slice(0, len(self)) and self.alignment.c_acceleration.ndim == 1
+        return self.alignment if alone else self.alignment.of_one_image(own, motion.c_acceleration)
 
 
 def _own_motion(
