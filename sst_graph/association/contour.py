@@ -108,13 +108,6 @@ class ContourMap:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
         return nearest_contours([self], [(0, len(uvs))], uvs)
 
-    def is_unknown_at(self, places: IntArray) -> NDArray[np.bool_]:
-        """(n,) whether nothing is known of the contour at columns and rows (2, n) of the box."""
-        rows, columns = self.unknown.shape
-        column, row = places
-        found = self.unknown[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        return np.asarray(found > 0, np.bool_)
-
 
 def nearest_contours(
     contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], uvs: FloatArray
@@ -152,11 +145,24 @@ def nearest_contours(
     normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
     feet = safe - centre * normals
     valid &= length > MIN_GRADIENT
-    places = np.rint(feet - corner).astype(np.intp)
-    for contour, (a, b) in zip(contours, spans, strict=True):
-        if b > a:
-            valid[a:b] &= ~contour.is_unknown_at(places[:, a:b])
+    valid &= ~are_unknown(contours, spans, feet - corner)
     return ContourFeet(centre, normals.T, feet.T, valid)
+
+
+def are_unknown(
+    contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], places: FloatArray
+) -> NDArray[np.bool_]:
+    """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
+    :func:`nearest_contours`."""
+    counts = [b - a for a, b in spans]
+    columns, rows = np.repeat([contour.unknown.shape[::-1] for contour in contours], counts, axis=0).T
+    column, row = np.rint(places).astype(np.intp)
+    at = np.minimum(np.maximum(row, 0), rows - 1) * columns
+    at += np.minimum(np.maximum(column, 0), columns - 1)
+    found = np.empty(places.shape[1], np.uint8)
+    for contour, (a, b) in zip(contours, spans, strict=True):
+        found[a:b] = contour.unknown.reshape(-1)[at[a:b]]
+    return found > 0
 
 
 def well_inside(

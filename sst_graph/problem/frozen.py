@@ -44,7 +44,7 @@ _SMALL = 1e-7
 
 
 @dataclass(frozen=True)
-class Point:
+class FrozenPoint:
     """Values of all unknowns.
 
     Attributes:
@@ -167,7 +167,7 @@ class FrozenProblem:
         self.state = state
         self._classes = sorted({(own.number, c) for own in matches for c in own.classes})
         self._objects = sorted({each for own in matches for each in own.tracked})
-        self._priors, self._values = prior_graph(self._classes, self._objects, state, config, guess)
+        self._priors, values = prior_graph(self._classes, self._objects, state, config, guess)
         if belief is not None:
             self._priors.add(belief)
         # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
@@ -183,15 +183,15 @@ class FrozenProblem:
         self._images = _images(matches, state, self._columns, config)
         places = {key: number for number, key in enumerate(self._images.keys)}
         self._frames = [self._frames_of(own, places) for own in matches]
-        scalars = [float(self._values.atVector(key)[0]) for key in self._keys]
-        self.start = Point(state.cTl, np.array(scalars), self._images.twists)
+        scalars = [float(values.atVector(key)[0]) for key in self._keys]
+        self.start = FrozenPoint(state.cTl, np.array(scalars), self._images.twists)
 
     @property
     def ordering(self) -> gtsam.Ordering:
         """Of all unknowns, as they stand in the normal equations, the twists last."""
         return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
 
-    def optimum(self, iterations: int) -> tuple[Point, NormalEquations]:
+    def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:
         """By at most so many Levenberg-Marquardt steps from the start; and the problem linearized there."""
         point, damping = self.start, _DAMPING
         system = self.linearized(point)
@@ -211,11 +211,11 @@ class FrozenProblem:
                 break
         return point, system
 
-    def moved(self, point: Point, x: FloatArray, twists: FloatArray) -> Point:
+    def moved(self, point: FrozenPoint, x: FloatArray, twists: FloatArray) -> FrozenPoint:
         """A point after a step, as :meth:`NormalEquations.step` gives it."""
-        return Point(point.cTl.retract(x[:6]), point.scalars + x[6:], point.twists + twists)
+        return FrozenPoint(point.cTl.retract(x[:6]), point.scalars + x[6:], point.twists + twists)
 
-    def state_at(self, point: Point) -> State:
+    def state_at(self, point: FrozenPoint) -> State:
         """The state of a point; mask biases of classes and objects that had no match stay."""
         value = dict(zip(self._keys, point.scalars.tolist(), strict=True))
         state = self.state
@@ -227,14 +227,14 @@ class FrozenProblem:
             {**state.nuisances, **{name: value[nuisance_key(name)] for name in self._names}},
         )
 
-    def values_at(self, point: Point) -> gtsam.Values:
+    def values_at(self, point: FrozenPoint) -> gtsam.Values:
         """A point as values of the graph's variables."""
         values = self._prior_values(point)
         for key, twist in zip(self._images.keys, point.twists, strict=True):
             values.insert(key, twist)
         return values
 
-    def step_sigmas(self, point: Point, system: NormalEquations) -> float:
+    def step_sigmas(self, point: FrozenPoint, system: NormalEquations) -> float:
         """Length of the step from the state to a point in extrinsic and offsets, in standard deviations of
         the problem linearized there."""
         clocks = len(self.state.offsets_s)
@@ -243,7 +243,7 @@ class FrozenProblem:
         covariance = system.covariance()[: 6 + clocks, : 6 + clocks]
         return float(np.sqrt(step @ np.linalg.solve(covariance, step)))
 
-    def linearized(self, point: Point) -> NormalEquations:
+    def linearized(self, point: FrozenPoint) -> NormalEquations:
         """The normal equations at a point, those of the graph of
         :func:`~sst_graph.problem.graph.joint_graph`."""
         values = self._prior_values(point)
@@ -260,14 +260,14 @@ class FrozenProblem:
         cost = system.cost + self._add_motion(system, point)
         return replace(system, cost=cost + sum(self._add(frames, system, point) for frames in self._frames))
 
-    def _prior_values(self, point: Point) -> gtsam.Values:
+    def _prior_values(self, point: FrozenPoint) -> gtsam.Values:
         values = gtsam.Values()
         values.insert(EXTRINSIC, point.cTl)
         for key, value in zip(self._keys, point.scalars.reshape(-1, 1), strict=True):
             values.insert(key, value)
         return values
 
-    def _add_motion(self, system: NormalEquations, point: Point) -> float:
+    def _add_motion(self, system: NormalEquations, point: FrozenPoint) -> float:
         """Add the measured twists to the normal equations; their cost."""
         images = self._images
         since_s = point.scalars[images.clocks - 6] - images.offsets_s
@@ -287,7 +287,7 @@ class FrozenProblem:
             system.H_mixed[np.ix_(own, range(6), columns)] += WJ[own]
         return 0.5 * float((error * weighted).sum())
 
-    def _add(self, frames: _Frames, system: NormalEquations, point: Point) -> float:
+    def _add(self, frames: _Frames, system: NormalEquations, point: FrozenPoint) -> float:
         """Add the matches of a drive to the normal equations; their cost."""
         # 1. Weighted rows: 13 of the motion, the parameters that are estimated, bias, residual.
         alignment = frames.alignment
