@@ -154,27 +154,23 @@ def _rows(
     V_key = twist_key(pair.drive, pair.pair.image)
     c_twist, response = motion.values.atVector(V_key), motion.responses[V_key]
     alignment = pair.matches[c].alignment
-    block = np.zeros((len(alignment), unknowns.size))
-    roots, residuals = np.zeros(len(alignment)), np.zeros(len(alignment))
-    clock = unknowns.column(delay_key(state.clock(pair.drive)))
-    for key, some in bias_groups(pair, c):
-        index = np.arange(len(alignment)) if some is None else some
-        bias = state.biases_px.get((pair.drive, c), 0.0)
+    groups = bias_groups(pair, c)
+    of_class = state.biases_px.get((pair.drive, c), 0.0)
+    biases_px, columns = np.full(len(alignment), of_class), np.zeros(len(alignment), np.intp)
+    for key, some in groups:
+        own: slice | IntArray = slice(None) if some is None else some
+        columns[own] = unknowns.column(key)
         if some is not None:
-            bias = state.object_bias_px(pair.drive, int(pair.tracks[c][index[0]]), c)
-        r, J, _ = weighted_residuals(
-            alignment.take(index), state.cTl, state.offset_s(pair.drive), c_twist, bias
-        )
-        root = np.abs(J[:, 13]) * alignment.sigmas_px[index]
-        block[index] = J[:, 7:13] @ response
-        block[index, :6] += J[:, :6]
-        block[index, clock] += J[:, 6]
-        block[index, unknowns.column(key)] += J[:, 13]
-        for name, column in pair.terms.get(c, {}).items():
-            block[index, unknowns.column(nuisance_key(name))] += column[index] * J[:, 13]
-        roots[index] = root
-        residuals[index] = unweighted(r, root)
-    return block, roots, residuals
+            biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
+    r, J, _ = weighted_residuals(alignment, state.cTl, state.offset_s(pair.drive), c_twist, biases_px)
+    roots = np.abs(J[:, 13]) * alignment.sigmas_px
+    block = J[:, 7:13] @ response
+    block[:, :6] += J[:, :6]
+    block[:, unknowns.column(delay_key(state.clock(pair.drive)))] += J[:, 6]
+    block[np.arange(len(alignment)), columns] += J[:, 13]
+    for name, column in pair.terms.get(c, {}).items():
+        block[:, unknowns.column(nuisance_key(name))] += column * J[:, 13]
+    return block, roots, unweighted(r, roots)
 
 
 def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
