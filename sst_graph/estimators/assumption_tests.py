@@ -21,6 +21,7 @@ from scipy.stats import t as student_t
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.errors import EstimationError
+from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks, state_from
@@ -169,7 +170,7 @@ class LinearProblem:
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
         table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
-        information = _inverse(marginal_covariance(graph, at, unknowns))
+        information = scaled_inverse(marginal_covariance(graph, at, unknowns))
         found = state_from(at, solution.state, pairs).nuisances
         return cls(table, unknowns, information, {name: found[name] for name in names})
 
@@ -183,12 +184,10 @@ class LinearProblem:
         kept = np.setdiff1d(np.arange(self.unknowns.size), fixed)
         step = np.zeros(self.unknowns.size)
         step[fixed] = [-value for each, value in self.values.items() if each != name]
-        bread = _inverse(self.information[np.ix_(kept, kept)])
+        bread = scaled_inverse(self.information[np.ix_(kept, kept)])
         step[kept] = -bread @ (self.information[np.ix_(kept, fixed)] @ step[fixed])
-        # Of matches that the kernel has put aside the rows are zero: they stay where they are.
-        moved = self.table.J @ step / np.maximum(self.table.root_weights, 1e-6)
-        table = replace(self.table, J=self.table.J[:, kept], r=self.table.r + moved)
-        table = _centred(table, bread)
+        moved = self.table.moved(step)
+        table = _centred(replace(moved, J=moved.J[:, kept]), bread)
         covariance = covariance_of(bread, table, fit_error_model(table))
         place = int(np.searchsorted(kept, columns[name]))
         sigma = float(np.sqrt(covariance[place, place]))
@@ -200,14 +199,7 @@ class LinearProblem:
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
     """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
     zero, and the jackknife over objects would take that for a disagreement among them."""
-    step = -bread @ (table.J.T @ (table.root_weights * table.r))
-    return replace(table, r=table.r + table.J @ step / np.maximum(table.root_weights, 1e-6))
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    """Of a positive definite matrix whose diagonal spans many orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
+    return table.moved(-bread @ (table.J.T @ (table.root_weights * table.r)))
 
 
 def _solved_alone(problem: SolvedProblem, finding: Finding, config: AssumptionConfig) -> Finding:
@@ -253,6 +245,19 @@ def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
         if f.assumption.name in considered.sigmas
     }
     return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
+
+
+def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The reason that the data contradict assumptions: the most likely one, and which others would do.
+
+    Args:
+        findings: the most contradicted first.
+    """
+    against = [finding for finding in findings if finding.contradicted]
+    if not against:
+        return ()
+    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
+    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
 
 
 def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
