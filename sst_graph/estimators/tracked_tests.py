@@ -62,20 +62,20 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
         value = float(score[place] / curvature[place])
         sigma = float(np.sqrt(variance) * frozen[place] / curvature[place]) * wider
         contradicted = abs(value) > config.threshold * sigma
-        found.append(Finding(assumption, value, sigma, value * follows[:7, place], contradicted))
-    return tuple(sorted(found, key=lambda finding: -abs(finding.value) / finding.sigma))
+        found.append(Finding(assumption, value, sigma, contradicted))
+    return tuple(sorted(found, key=lambda finding: -finding.score))
 
 
 class AssumptionTests:
     """When a running tracker tests what it takes for granted, and what it has found.
 
     Attributes:
-        found: findings of the last test, by name of the assumption: (value, sigma, step (7,), contradicted).
+        found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
     """
 
     def __init__(self, config: AssumptionConfig) -> None:
         self.config = config
-        self.found: dict[str, tuple[float, float, FloatArray, bool]] = {}
+        self.found: dict[str, tuple[float, float, bool]] = {}
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -99,6 +99,6 @@ class AssumptionTests:
         """
         if self.config.test:
             self.found = {
-                finding.assumption.name: (finding.value, finding.sigma, finding.step, finding.contradicted)
+                finding.assumption.name: (finding.value, finding.sigma, finding.contradicted)
                 for finding in score_findings(smoother, self.config)
             }
