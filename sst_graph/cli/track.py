@@ -116,7 +116,10 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     Raises:
         DataError: the checkpoint is of another drive, other sensors, settings or another guess.
     """
-    flags = {"calibration.classes": chosen_classes(args.classes)}
+    flags = {
+        "calibration.classes": chosen_classes(args.classes),
+        "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
+    }
     config = settings(TrackerConfig(), args, flags)
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))

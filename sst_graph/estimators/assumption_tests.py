@@ -163,6 +163,19 @@ def few_objects(objects: int, threshold: float) -> float:
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
 
 
+def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The reason that the data contradict assumptions: the most likely one, and which others would do.
+
+    Args:
+        findings: the most contradicted first.
+    """
+    against = [finding for finding in findings if finding.contradicted]
+    if not against:
+        return ()
+    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
+    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
+
+
 def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
     """JSON-able: what each assumption adds to the covariance, and what the data say of it.
 

@@ -52,8 +52,9 @@ class Tracker(Tracking):
         initial_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        super().__init__(camera, config or TrackerConfig(), Guess(initial, initial_offset_s))
-        self.setup = Setup(camera, self.config, initial, initial_offset_s)
+        config = config or TrackerConfig()
+        super().__init__(camera, config, Guess(initial, initial_offset_s))
+        self.setup = Setup(camera, config, initial, initial_offset_s)
         self.first_frames = FirstFrames()
         self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
         self.settled = False
@@ -157,7 +158,8 @@ class Tracker(Tracking):
     def marginal(self) -> TrackedMarginal:
         """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
 
-        Linearized at the estimate, as sure as the reported covariance.
+        Linearized at the estimate, as sure as the reported covariance: parameters of assumptions that are
+        estimated are marginalized out, those that are not are considered.
 
         Raises:
             EstimationError: there is no estimate yet.
@@ -194,7 +196,8 @@ class Tracker(Tracking):
         if self.smoother is None:
             return []
         entries = self.history_store.smoothed(self.smoother)
-        return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
+        beside = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
 
     def consolidate(self, laid_out: Container[int] = ()) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
@@ -231,6 +234,7 @@ class Tracker(Tracking):
                 smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
+            self.tests.look(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False

@@ -11,6 +11,7 @@ import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
+from sst_graph.assumptions import named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
 from sst_graph.estimators.contest import choosing_start, narrowed
@@ -41,9 +42,9 @@ class Guess:
     offset_s: float
     search: bool = True
 
-    def point(self, classes: tuple[SemanticClass, ...]) -> Point | None:
-        """As an estimate without mask biases; None where nothing is known."""
-        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes)
+    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point | None:
+        """As an estimate without mask biases, its parameters (``names``) 0; None where nothing is known."""
+        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes, names)
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,10 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_So
     solution = yield from solving_joint([drive], start, _damped(config))
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
+    names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
+    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
+    cTl, offset_s = state.cTl, state.offset_s(0)
+    point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
@@ -239,12 +243,15 @@ def prior_belief(
 ) -> Gaussian:
     """The batch's own weak priors around the guess, linearized at a point.
 
-    A class's mask bias is around 0, that of its undersides around the class's.
+    A class's mask bias is around 0, that of its undersides around the class's; an estimated parameter of an
+    assumption is around 0.
     """
+    estimated = dict(named_sigmas(config.estimate))
     sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
     k = len(classes)
-    information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * k, *[np.inf] * k]))
-    tie = config.underside_bias_sigma_px**-2.0 * np.eye(k)
-    information[7:, 7:] += np.block([[tie, -tie], [-tie, tie]])
-    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes)
+    sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
+    information = np.diag(1.0 / np.square(sigmas))
+    tie, biases = config.underside_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
+    information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
+    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
     return Gaussian(point, information, information @ point.local(centre))

@@ -74,6 +74,7 @@ class Window:
         velocities: of those that do not.
         judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
+        origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
 
     def __init__(self, camera: PinholeCamera, scans: int, sampled: int | None = None) -> None:
@@ -88,6 +89,7 @@ class Window:
     def restart(self) -> None:
         """Forget all scans, images and motions; numbers go on."""
         self.held = False
+        self.origin_ns: int | None = None
         self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
@@ -280,6 +282,8 @@ class Window:
             raise DataError("tracker", f"a second image of stamp {features.stamp_ns} ns", "one image a stamp")
         self.images.insert(place, dataclasses.replace(features, index=self.next_image))
         self.next_image += 1
+        if self.origin_ns is None:
+            self.origin_ns = features.stamp_ns
 
     def forget_images(self, margin_ns: int, most: int) -> None:
         """Drop images that no scan can meet: those near the window's scans stay, and the newest ones.
@@ -324,5 +328,6 @@ class Window:
         if chosen is None and scans:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
             motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
-        drive = Drive("window", self.camera, tuple(scans), tuple(self.images), motions, ())
+        images = tuple(self.images)
+        drive = Drive("window", self.camera, tuple(scans), images, motions, (), origin_ns=self.origin_ns)
         return drive, numbers

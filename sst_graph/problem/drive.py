@@ -166,6 +166,7 @@ class Drive:
         left_out: what the data lacked.
         survey: what the raw frames show, for the search for causes; None where nobody looked.
         sweep: what was decided of the times of the points, or None where nobody asked.
+        origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
     """
 
     name: str
@@ -177,6 +178,7 @@ class Drive:
     left_out: LeftOut = field(default_factory=LeftOut)
     survey: Survey | None = None
     sweep: SweepDecision | None = None
+    origin_ns: int | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:

@@ -255,7 +255,8 @@ def associate(
 
 def scene_of(drive: Drive, image: int, l_twist: TwistSample | None) -> Scene:
     """What assumptions about an image of a drive may depend on, beside the points."""
-    since_s = (drive.images[image].stamp_ns - drive.images[0].stamp_ns) * 1e-9
+    origin_ns = drive.images[0].stamp_ns if drive.origin_ns is None else drive.origin_ns
+    since_s = (drive.images[image].stamp_ns - origin_ns) * 1e-9
     twist = np.zeros(6) if l_twist is None else l_twist.twist
     return Scene(drive.camera, twist, since_s, drive.scan_period_s)
 
