@@ -9,7 +9,7 @@ far away to near ones, and the estimate over its cluster-robust deviation decide
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -61,6 +61,14 @@ class Finding:
     sigma: float
     step: FloatArray
     contradicted: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        return {**vars(self), "assumption": self.assumption.name}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        for name, value in {**state, "assumption": ASSUMPTIONS[state["assumption"]]}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def sentence(self) -> str:

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from factors.robust import RobustKernel
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.estimators.assumption_tests import Finding
 from sst_graph.estimators.checkpoint import checkpoint_classes
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_config import TrackerConfig
@@ -159,6 +161,17 @@ def test_objects_of_the_package() -> None:
     assert found["config"] == TrackerConfig(window=17) and found["kernel"] == RobustKernel("huber", 2.0)
     assert isinstance(found["a"], Point) and found["a"].offset_s == 0.1
     assert isinstance(_again(MotionSmoother(3)), MotionSmoother)
+
+
+def test_a_finding_holds_its_assumption_by_name() -> None:
+    finding = Finding(ASSUMPTIONS["k1"], 0.1, 0.02, np.arange(7.0), True)
+    found = _again(finding)
+    assert found.assumption is ASSUMPTIONS["k1"] and found.sentence == finding.sentence
+    assert np.array_equal(found.step, finding.step)
+    node, data = stored(finding)
+    text = json.dumps(node).replace('"k1"', '"k9"')
+    with pytest.raises(ValueError, match="k9"):
+        restored(json.loads(text), data, CLASSES)
 
 
 def test_trees_and_images_are_made_anew() -> None:
