@@ -311,13 +311,14 @@ def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatAr
 
 def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Signed distances (k,) and normals (2, k) at pixels (2, k) on the image; infinite at ridges."""
-    rows, columns = contour.distance.shape
+    distances = contour.distance
+    rows, columns = distances.shape
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
     x0, y0 = column - contour.left, row - contour.top
     valid = contour.well_inside(u, v) & (x0 >= 0) & (y0 >= 0) & (x0 < columns - 1) & (y0 < rows - 1)
     at = np.where(valid, y0 * columns + x0, 0)
-    field = contour.distance.reshape(-1)
+    field = distances.reshape(-1)
     a, b, c, d = (field[at + step].astype(np.float64) for step in (0, 1, columns, columns + 1))
     x, y = u - column, v - row
     top, bottom = a + x * (b - a), c + x * (d - c)

@@ -209,7 +209,7 @@ def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> tuple[Int
 def _part(
     table: MatchTable, rows: IntArray, columns: IntArray, information: FloatArray, model: ErrorModel
 ) -> FramePart:
-    J, z = table.J[np.ix_(rows, columns)], table.root_weights[rows]
+    J, z = table.J[rows][:, columns].toarray(), table.root_weights[rows]
     sides, of_side = np.unique(table.sides[rows], return_inverse=True)
     scores = np.stack([np.bincount(of_side, z * column, len(sides)) for column in J.T], axis=1)
     in_frame = np.unique(table.side_frames[rows], return_inverse=True)[1]

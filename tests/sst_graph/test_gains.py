@@ -16,6 +16,7 @@ from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
     ErrorModel,
+    gram,
     match_table,
     robust_covariance,
     score_variance,
@@ -58,7 +59,7 @@ def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
     unknowns = Unknowns.of(state, some)
     bread = marginal_covariance(graph, values, unknowns)
     table = match_table(graph, values, some, state, objects, unknowns)
-    surplus = score_variance(table, gains(motion)[0]) - table.J.T @ table.J
+    surplus = score_variance(table, gains(motion)[0]) - gram(table.J)
     return (bread + bread @ surplus @ bread)[:7, :7]
 
 
@@ -104,7 +105,7 @@ def test_the_offset_follows_from_the_twist() -> None:
     table = match_table(*joint_graph(pairs, state, CONFIG), pairs, state, objects, unknowns)
     start = 0
     for pair, frame in zip(pairs, gains("constant")[1], strict=True):
-        J = table.J[start : start + len(pair)]
+        J = table.J[start : start + len(pair)].toarray()
         start += len(pair)
         # Up to the acceleration that odometry sees in a constant motion.
         assert np.abs(J[:, 6] + J[:, :6] @ frame.l_twist).max() < 0.05 * np.abs(J[:, 6]).max()
