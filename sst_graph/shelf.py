@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import tempfile
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import FileIO
@@ -36,7 +36,6 @@ class Shelf:
         self._file: FileIO | None = None
         self._end = 0
         self._writable = True
-        self._lock = threading.Lock()
 
     def __del__(self) -> None:
         if (file := getattr(self, "_file", None)) is not None:
@@ -68,11 +67,9 @@ class Shelf:
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="sst-graph-", buffering=0)  # noqa: SIM115
-            with self._lock:
-                self._file.seek(self._end)
-                written = 0
-                while written < len(data):
-                    written += self._file.write(data[written:])
+            written = 0
+            while written < len(data):
+                written += os.pwrite(self._file.fileno(), data[written:], self._end + written)
         except OSError as error:
             self._writable = False
             _LOG.warning(
@@ -91,13 +88,20 @@ class Shelf:
         assert self._file is not None
         flat = np.empty(math.prod(shape), dtype)
         view, got = flat.view(np.uint8).data, 0
-        with self._lock:
-            self._file.seek(start)
-            while got < len(view):
-                if not (count := self._file.readinto(view[got:])):
-                    raise OSError(f"the temporary file of a drive ends {len(view) - got} bytes early")
-                got += count
+        while got < len(view):
+            if not (count := _read_at(self._file.fileno(), view[got:], start + got)):
+                raise OSError(f"the temporary file of a drive ends {len(view) - got} bytes early")
+            got += count
         return flat.reshape(shape)
+
+
+def _read_at(descriptor: int, view: memoryview, start: int) -> int:
+    """Read into a view; number of bytes. The file's own position stays, for forked processes share it."""
+    if hasattr(os, "preadv"):
+        return os.preadv(descriptor, [view], start)
+    data = os.pread(descriptor, len(view), start)  # macOS
+    view[: len(data)] = data
+    return len(data)
 
 
 class Shelved:
