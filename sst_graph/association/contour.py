@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.association.sampling import sampled
+from sst_graph.shelf import Shelf, shelvable
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -45,9 +46,10 @@ class ContourFeet:
     valid: NDArray[np.bool_]
 
 
+@shelvable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
-    """Signed distance field of one class in one mask.
+    """Signed distance field of one class in one mask; on a shelf, it is read whenever it is asked for.
 
     Attributes:
         distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
@@ -103,6 +105,10 @@ class ContourMap:
             distance -= shifts
             unknown |= unseen
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
+
+    def on(self, shelf: Shelf) -> ContourMap:
+        """The same with its fields on a shelf."""
+        return replace(self, distance=shelf.put(self.distance), unknown=shelf.put(self.unknown))
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
