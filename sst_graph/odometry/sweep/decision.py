@@ -260,20 +260,25 @@ def _judged(
     evidence = {name: _log_mean(ratio) for name, ratio in ratios.items()}
     best = max(evidence, key=lambda name: evidence[name])
     behind = {name: evidence[best] - evidence[name] for name in evidence}
-    excluded = {name for name in behind if behind[name] > -np.log(config.error_rate)}
+    needed = -np.log(config.error_rate)
+    excluded = {name for name in behind if behind[name] > needed}
     starts = {name: _start(-ratio) for name, ratio in ratios.items()}
     # Against compensated points stands the turn that comes nearest to them.
     raw = best if best != "compensated" else min(_RAW, key=lambda name: behind[name])
     sector, start_told = starts[raw]
     share, sigma = float(found.quadratic.free()[sector]), float(told.sigma[sector])
     agrees = abs(share - FRACTIONS[best]) < config.tolerance + 3.0 * sigma
-    decided = len(excluded) == 2 and agrees
+    # Where only a step at the start of the turn shows, one side of the scene against the other, whatever else
+    # sets the sides apart looks like it: every start must be told, also one where no points are.
+    informed = 0.5 / float(told.sigma.max()) ** 2 > needed
+    decided = len(excluded) == 2 and agrees and informed
     timings = {
         name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0]))
         for name in evidence
     }
     kind = cast(SweepKind, best if decided else "undecided")
-    others = [timings[name] for name in evidence if name not in excluded or not agrees]
+    settled = agrees and informed
+    others = [timings[name] for name in evidence if name not in excluded or not settled]
     return SweepDecision(
         kind,
         timings[best] if decided and best != "compensated" else timing,
