@@ -162,11 +162,6 @@ class AlignmentKeys:
         sizes = [6 if key == self.cTl else 1 for key in self.lasting]
         return [sum(sizes[:k]) for k in range(len(sizes))]
 
-    @property
-    def size(self) -> int:
-        """Dimension of :attr:`lasting`."""
-        return sum(6 if key == self.cTl else 1 for key in self.lasting)
-
     def keeps_double(self, values: gtsam.Values) -> bool:
         """Whether the time offset is kept as a ``double``."""
         try:

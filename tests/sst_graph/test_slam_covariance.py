@@ -145,6 +145,19 @@ def test_a_marginal_that_is_too_sure_is_told() -> None:
     assert WarningKind.OVERCONFIDENT_MARGINAL not in [w.kind for w in honest]
 
 
+def test_classes_may_share_a_mask_bias() -> None:
+    person, B = SemanticClass.PERSON, gtsam.symbol("B", 0)
+    keys = AlignmentKeys(Trajectory(), E, 0.1, {VEHICLE: B, person: B, SemanticClass.POLE: 0.5})
+    assert keys.lasting == (E, B)
+    covariance = np.diag(np.arange(1.0, 8.0))
+    covariance[0, 6] = covariance[6, 0] = 0.5
+    P = keys.placed(covariance)
+    columns = [*range(6), bias_column(VEHICLE), bias_column(person)]
+    assert np.count_nonzero(np.diag(P)) == len(columns)
+    np.testing.assert_array_equal(np.diag(P)[columns], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 7.0])
+    assert P[0, bias_column(person)] == 0.5 and P[bias_column(VEHICLE), bias_column(person)] == 7.0
+
+
 def test_ratios_of_covariances() -> None:
     P, C = np.diag([1.0, 4.0, 0.0]), np.diag([4.0, 64.0, 0.0])
     assert inflation(P, C) == pytest.approx((4.0 + 16.0) / 2.0) and times_too_sure(P, C) == pytest.approx(4.0)
