@@ -59,9 +59,11 @@ def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
 
 def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive, KeptDrive | None]]:
     """Name, drive, another drive of the same size, and the drive by the right camera where it can be had."""
-    other = KeptDrive.of(open_source(args.other, frames=f":{args.frames}"), sweep="auto") if args.other else None
+    some = f":{args.frames}"
+    other = KeptDrive.of(open_source(args.other, frames=some), sweep="auto") if args.other else None
     for path in args.drive:
-        drive = KeptDrive.of(open_source(path, image_shift=args.image_shift, frames=f":{args.frames}"), sweep="auto")
+        source = open_source(path, image_shift=args.image_shift, frames=some)
+        drive = KeptDrive.of(source, sweep="auto")
         yield path.name, drive, other or drive, None
     for seed in args.seeds:
         beside = street(seed, args.frames, right=True) if RIGHT in args.lies else None
