@@ -21,7 +21,7 @@ ASSUMPTIONS: dict[str, Assumption] = {
 }
 """All assumptions by name, in the order in which they are shown."""
 
-__all__ = ["ASSUMPTIONS", "Assumption", "Effect", "View", "combined", "named_sigmas"]
+__all__ = ["ASSUMPTIONS", "Assumption", "Effect", "View", "combined", "held_at_zero", "named_sigmas"]
 
 
 def named_sigmas(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
@@ -35,6 +35,16 @@ def named_sigmas(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
     if len(set(names)) < len(names):
         raise ConfigError(f"estimate: found {', '.join(names)}, expected each name once")
     return found
+
+
+def held_at_zero(estimate: Sequence[str]) -> tuple[str, ...]:
+    """Names of the assumptions whose parameters are not among those that are estimated.
+
+    Args:
+        estimate: as :func:`named_sigmas` takes it.
+    """
+    estimated = dict(named_sigmas(estimate))
+    return tuple(name for name in ASSUMPTIONS if name not in estimated)
 
 
 def _named_sigma(text: str) -> tuple[str, float]:

@@ -129,12 +129,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     calibrate.add_argument(
         "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
-    calibrate.add_argument(
-        "--estimate",
-        metavar="NAMES",
-        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
-        "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
-    )
+    _add_estimate(calibrate)
     _add_settings(calibrate)
     calibrate.add_argument(
         "--out",
@@ -145,6 +140,15 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
+
+
+def _add_estimate(command: _Parser) -> None:
+    command.add_argument(
+        "--estimate",
+        metavar="NAMES",
+        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
+        "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
+    )
 
 
 def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
@@ -158,6 +162,7 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
         help="start: the data's nominal calibration (default), no guess at all, or a file",
     )
     track.add_argument("--classes", metavar="vehicle|all|A,B", help="classes to align")
+    _add_estimate(track)
     _add_settings(track)
     track.add_argument("--checkpoint", type=Path, metavar="FILE", help="save the tracker here as it goes")
     track.add_argument(

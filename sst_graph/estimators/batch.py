@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
 from sst_graph.estimators.assumption_tests import (
-    Finding,
-    TestedProblem,
+    SolvedProblem,
     assumption_report,
     check_assumptions,
+    contradiction_of,
     estimated_report,
+    told_by,
 )
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.causes import with_causes
@@ -34,7 +35,7 @@ from sst_graph.estimators.contest import (
 )
 from sst_graph.estimators.contradictions import find_contradictions
 from sst_graph.estimators.frames import as_sources
-from sst_graph.estimators.joint import JointConfig, JointSolution, agreement, concentration, explained
+from sst_graph.estimators.joint import JointSolution, agreement, concentration, explained
 from sst_graph.estimators.motion import difference
 from sst_graph.estimators.motion_answer import answer_motion
 from sst_graph.estimators.motion_joint import Labels, WithMotion, with_motion
@@ -161,7 +162,7 @@ def answer_joint(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """The default: a global start, then silhouettes over the whole drive."""
-    config = replace(config, joint=_estimating(config))
+    config = config.estimating
     # 1. A start that needs no luck.
     tracks = Tracks(drives)
     contest = choose_start(
@@ -195,10 +196,10 @@ def answer_joint(
             by_standing = standing_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
-    considered = consider(robust, *frozen, config.assumptions)
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
-    problem = TestedProblem(drives, tracks, objects, solution, config.joint, centre)
+    problem = SolvedProblem(drives, tracks, objects, solution, config.joint, centre)
     findings = check_assumptions(problem, config.assumptions)
+    considered = told_by(consider(robust, *frozen, config.assumptions), findings)
     size = 6 + len(solution.state.offsets_s)
     motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
     parts_of_sigma = budget(covariance, motion, considered)
@@ -213,7 +214,7 @@ def answer_joint(
         remarks=(*_remarks(drives), *heard.remarks),
         by_standing=by_standing[:7, :7],
         doubts=(
-            *_contradicted(findings),
+            *contradiction_of(findings),
             *_doubts(solution, finals, covariance, evidence, guess, config),
             *contradictions.sentences,
             *heard.doubts,
@@ -232,21 +233,6 @@ def answer_joint(
             **_numbers(drives, solution, below, robust),
         },
     )
-
-
-def _estimating(config: CalibrationConfig) -> JointConfig:
-    """The joint method's settings with the parameters that are to be estimated."""
-    joint = config.joint
-    return replace(joint, graph=replace(joint.graph, estimate=config.assumptions.estimate))
-
-
-def _contradicted(findings: Sequence[Finding]) -> tuple[str, ...]:
-    """The reason that the data contradict assumptions: the most likely one, and which others would do."""
-    against = [finding for finding in findings if finding.contradicted]
-    if not against:
-        return ()
-    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
-    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
 
 
 def _numbers(

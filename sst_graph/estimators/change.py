@@ -10,15 +10,21 @@ import gtsam
 import numpy as np
 
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Point, scaled_inverse
+from sst_graph.estimators.gaussian import Point, scaled_inverse, with_room
 from sst_graph.problem.state import object_bias_key, twist_key
 
 if TYPE_CHECKING:
     from sst_graph.estimators.smoother import WindowSmoother
 
 
-def read_point(isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] = ()) -> Point:
-    """The estimate under [E, D, biases..., biases of the objects...].
+def read_point(
+    isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] = (), names: tuple[str, ...] = ()
+) -> Point:
+    """The estimate under [E, D, biases..., parameters..., biases of the objects...].
+
+    Args:
+        tracks: of the objects.
+        names: of the parameters.
 
     Raises:
         ValueError: it is not finite.
@@ -28,7 +34,9 @@ def read_point(isam: gtsam.ISAM2, keys: Sequence[int], tracks: tuple[int, ...] =
     if not (np.isfinite(scalars).all() and np.isfinite(cTl.matrix()).all()):
         raise ValueError("an estimate that is not finite")
     objects = len(scalars) - len(tracks)
-    return Point(cTl, float(scalars[0]), scalars[1:objects], tracks, scalars[objects:])
+    parameters = objects - len(names)
+    biases, own = scalars[1:parameters], scalars[objects:]
+    return Point(cTl, float(scalars[0]), biases, tracks, own, names, scalars[parameters:objects])
 
 
 @dataclass(frozen=True)
@@ -90,19 +98,20 @@ class Change:
         # 3. The estimate, if it is one.
         tracks = self.past.point.tracks
         keys = self._smoother.keys(self.epochs[-1].number, tracks)
-        self.point = read_point(self.isam, keys, tracks)
+        self.point = read_point(self.isam, keys, tracks, self.past.point.names)
 
     def _retire(self) -> None:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
             entry = self.entries.pop(scan)
             self._remove.append(self.ids.pop(scan))
+            belief, drift = entry.score.belief, self._smoother.drift
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
-            self.past, self.bent = self.past.plus(entry.score.belief), self.bent.plus(entry.score.bent)
+            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.score.bent)
             self.alone = self.alone.plus(entry.score.by_standing)
             if entry.other is not None:
                 self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
-            columns, drift = self.past.point.columns(entry.score.belief.point.tracks), self._smoother.drift
+            columns = self.past.point.columns(belief.point.tracks, belief.held)
             self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
                 self.epoch_sums.add(entry.score, scan, self._smoother.graph.object_bias_sigma_px)
@@ -121,9 +130,8 @@ class Change:
         beliefs = (self.past, self.bent, self.alone)
         self.past, self.bent, self.alone = (b.with_objects(new, sigma_px) for b in beliefs)
         self.sums.grow(self.past.point.size)
-        self.undecided = self.undecided.through(
-            np.eye(self.past.point.size, len(self.bent.vector) - len(new))
-        )
+        size = self.past.point.size
+        self.undecided = self.undecided.through(with_room(size - len(new), size, self.bent.held))
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
             self._values.insert(object_bias_key(0, track), np.array([bias]))
@@ -160,7 +168,8 @@ class Change:
         if all(track in kept for track in self.sums.objects.live):
             return
         seen = [entry.score.belief for entry in self.entries.values()]
-        information = self.past.information_with(seen)
+        n = self.past.point.size
+        information = self.past.information_with(seen)[:n, :n]
         point = self.past.at(self.point).point
         self.sums.objects.close(kept, information, scaled_inverse(information), point)
 
@@ -238,7 +247,7 @@ class Change:
         self.past, self.bent, self.alone = (b.at(self.point) for b in beliefs)
         self.undecided = self.undecided.moved(before.local(self.bent.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
-        self._add(self.bent.factor(keys), "past", 0)
+        self._add(self.bent.without_held().factor(keys), "past", 0)
 
     def _add(self, factor: gtsam.NonlinearFactor, kind: str, number: int) -> None:
         self._graph.add(factor)

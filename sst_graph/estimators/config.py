@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from sst_graph.config import Settings
@@ -78,3 +78,9 @@ class CalibrationConfig(Settings):
     contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
     check_stamps: bool = True
     find_causes: bool = True
+
+    @property
+    def estimating(self) -> CalibrationConfig:
+        """The same with a variable in method joint's graph for each assumption that is to be estimated."""
+        graph = replace(self.joint.graph, estimate=self.assumptions.estimate)
+        return replace(self, joint=replace(self.joint, graph=graph))

@@ -8,8 +8,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.uncertainty.common_error import camera_turns
-
 FloatArray = NDArray[np.float64]
 
 
@@ -53,3 +51,11 @@ def steps(cTl: gtsam.Pose3, turn_rad: float, offset_s: float) -> FloatArray:
     found[:6, :2] = camera_turns(cTl) * turn_rad
     found[6, 2] = offset_s
     return found
+
+
+def camera_turns(cTl: gtsam.Pose3) -> FloatArray:
+    """(6, 2) tangents of the extrinsic for turns of the camera by 1 rad about its own x and y axis.
+
+    Exp(d_c) cTl = cTl Exp(Ad(cTl^-1) d_c).
+    """
+    return np.asarray(cTl.inverse().AdjointMap()[:, :2])

@@ -1,4 +1,5 @@
-"""A Gaussian belief on extrinsic, time offset and mask biases, in information form at a point."""
+"""A Gaussian belief on extrinsic, time offset, mask biases and estimated parameters of assumptions, in
+information form at a point."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Point:
-    """A value of the unknowns; tangent order [extrinsic 6, offset 1, biases, object biases].
+    """A value of the unknowns; tangent order [extrinsic 6, offset 1, biases, parameters, object biases].
 
     Attributes:
         cTl: extrinsic.
@@ -29,6 +30,8 @@ class Point:
         biases_px: (2 c,) mask bias of each class, then that of each class's undersides [px].
         tracks: objects with a mask bias of their own, by the number of their track.
         object_biases_px: (k,) those biases [px].
+        names: assumptions whose parameters are estimated.
+        parameters: (p,) the values of these parameters, in their units.
     """
 
     cTl: gtsam.Pose3
@@ -36,11 +39,20 @@ class Point:
     biases_px: FloatArray
     tracks: tuple[int, ...] = ()
     object_biases_px: FloatArray = field(default_factory=lambda: np.zeros(0))
+    names: tuple[str, ...] = ()
+    parameters: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
-    def unbiased(cls, cTl: gtsam.Pose3, offset_s: float, classes: Sequence[SemanticClass]) -> Point:
-        """With mask biases of 0."""
-        return cls(cTl, offset_s, np.zeros(2 * len(classes)))
+    def unbiased(
+        cls,
+        cTl: gtsam.Pose3,
+        offset_s: float,
+        classes: Sequence[SemanticClass],
+        names: Sequence[str] = (),
+    ) -> Point:
+        """With mask biases of 0, and parameters of 0 by these names."""
+        nothing = np.zeros(len(names))
+        return cls(cTl, offset_s, np.zeros(2 * len(classes)), names=tuple(names), parameters=nothing)
 
     @property
     def size(self) -> int:
@@ -49,11 +61,17 @@ class Point:
     @property
     def core_size(self) -> int:
         """Unknowns before the objects' biases."""
-        return 7 + len(self.biases_px)
+        return 7 + len(self.biases_px) + len(self.parameters)
 
-    def columns(self, tracks: Sequence[int]) -> IntArray:
-        """Columns of [extrinsic, offset, biases, and these objects' biases]; not to be written to."""
-        return _columns(self.core_size, self.tracks, tuple(tracks))
+    @property
+    def parameter_columns(self) -> range:
+        """Columns of the estimated parameters."""
+        return range(7 + len(self.biases_px), self.core_size)
+
+    def columns(self, tracks: Sequence[int], held: int = 0) -> IntArray:
+        """Columns of [extrinsic, offset, biases, parameters, these objects' biases, and ``held`` further ones
+        that are behind all]; not to be written to."""
+        return _columns(self.core_size, self.tracks, tuple(tracks), held)
 
     def seen(self, places: Mapping[int, int]) -> Point:
         """The point with just these objects; one that has no bias yet takes its class's.
@@ -85,6 +103,7 @@ class Point:
                 turn,
                 [other.offset_s - self.offset_s],
                 np.subtract(other.biases_px, self.biases_px),
+                np.subtract(other.parameters, self.parameters),
                 theirs - self.object_biases_px,
             ]
         )
@@ -95,7 +114,8 @@ class Point:
             self,
             cTl=self.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
             offset_s=self.offset_s + float(step[6]),
-            biases_px=self.biases_px + step[7 : self.core_size],
+            biases_px=self.biases_px + step[7 : 7 + len(self.biases_px)],
+            parameters=self.parameters + step[7 + len(self.biases_px) : self.core_size],
             object_biases_px=self.object_biases_px + step[self.core_size :],
         )
 
@@ -104,16 +124,24 @@ class Point:
         of_class, below = np.split(self.biases_px, 2)
         biases = {(0, c): float(bias) for c, bias in zip(classes, of_class, strict=True)}
         shared = {(0, underside_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
-        return State(self.cTl, (self.offset_s,), biases, shared)
+        return State(self.cTl, (self.offset_s,), biases, shared, self.nuisances)
+
+    @property
+    def nuisances(self) -> dict[str, float]:
+        """The estimated parameters by name."""
+        return dict(zip(self.names, self.parameters.tolist(), strict=True))
 
 
 @dataclass(frozen=True)
 class Gaussian:
     """exp(-1/2 d' information d + vector' d) of the step d from a point.
 
+    Behind the unknowns there may be parameters that are held at 0, those of assumptions that are not
+    estimated: what the data say of them is carried along, and taken for what it is where all else is known.
+
     Attributes:
         point: where it was linearized.
-        information: (n, n).
+        information: (n, n) of the unknowns, then of what is held.
         vector: (n,).
     """
 
@@ -121,15 +149,36 @@ class Gaussian:
     information: FloatArray
     vector: FloatArray
 
+    @property
+    def held(self) -> int:
+        """How many parameters are held."""
+        return len(self.vector) - self.point.size
+
+    def without_held(self) -> Gaussian:
+        """The belief on the unknowns alone."""
+        n = self.point.size
+        return self if self.held == 0 else Gaussian(self.point, self.information[:n, :n], self.vector[:n])
+
+    def holding(self, count: int) -> Gaussian:
+        """The belief with so many parameters held of which nothing is known yet."""
+        n = len(self.vector)
+        information = np.zeros((n + count, n + count))
+        information[:n, :n] = self.information
+        return Gaussian(self.point, information, np.append(self.vector, np.zeros(count)))
+
     def at(self, point: Point) -> Gaussian:
         """The same belief about another, near point; objects that are new there are left out."""
         point = point if point.tracks == self.point.tracks else _like(self.point, point)
-        return Gaussian(point, self.information, self.vector - self.information @ self.point.local(point))
+        moved = self.information[:, : self.point.size] @ self.point.local(point)
+        return Gaussian(point, self.information, self.vector - moved)
 
     def plus(self, other: Gaussian) -> Gaussian:
-        """Both beliefs together, at this one's point; the objects of the other are all known here."""
-        other = other.at(self.point)
-        columns = self.point.columns(other.point.tracks)
+        """Both beliefs together, at this one's point; the objects of the other are all known here.
+
+        What is held is what this belief holds, or nothing.
+        """
+        other = other.at(self.point) if self.held else other.without_held().at(self.point)
+        columns = self.point.columns(other.point.tracks, other.held)
         information, vector = self.information.copy(), self.vector.copy()
         information[np.ix_(columns, columns)] += other.information
         vector[columns] += other.vector
@@ -137,8 +186,16 @@ class Gaussian:
 
     def information_with(self, others: Sequence[Gaussian]) -> FloatArray:
         """(n, n) information of this belief and others, whose objects are all known here."""
-        columns = [self.point.columns(other.point.tracks) for other in others]
-        return self.information + scattered(self.point.size, columns, [o.information for o in others])[0]
+        others = others if self.held else [other.without_held() for other in others]
+        columns = [self.point.columns(other.point.tracks, other.held) for other in others]
+        return self.information + scattered(len(self.vector), columns, [o.information for o in others])[0]
+
+    def vector_with(self, others: Sequence[Gaussian]) -> FloatArray:
+        """(n,) vector of the same, about this belief's point."""
+        vector = self.vector.copy()
+        for other in others:
+            vector[self.point.columns(other.point.tracks, other.held)] += other.at(self.point).vector
+        return vector
 
     def with_objects(self, places: Mapping[int, int], sigma_px: float) -> Gaussian:
         """The belief with biases of further objects, each within ``sigma_px`` of its class's.
@@ -154,9 +211,10 @@ class Gaussian:
             tracks=(*self.point.tracks, *places),
             object_biases_px=np.append(self.point.object_biases_px, of_class),
         )
-        n = self.point.size
-        information, vector = np.zeros((point.size, point.size)), np.zeros(point.size)
-        information[:n, :n], vector[:n] = self.information, self.vector
+        n, size = self.point.size, len(self.vector) + len(places)
+        information, vector = np.zeros((size, size)), np.zeros(size)
+        before = np.array([*range(n), *range(point.size, size)])
+        information[np.ix_(before, before)], vector[before] = self.information, self.vector
         weight = sigma_px**-2.0
         for i, place in enumerate(places.values()):
             a, b = 7 + place, n + i
@@ -173,9 +231,9 @@ class Gaussian:
             one as T times it.
         """
         kept = [track for track in self.point.tracks if track not in set(tracks)]
-        x = self.point.columns(kept)
-        o = np.setdiff1d(np.arange(self.point.size), x)
-        T = np.zeros((len(x), self.point.size))
+        x = self.point.columns(kept, self.held)
+        o = np.setdiff1d(np.arange(len(self.vector)), x)
+        T = np.zeros((len(x), len(self.vector)))
         T[np.arange(len(x)), x] = 1.0
         H = self.information
         T[:, o] = -np.linalg.solve(H[np.ix_(o, o)], H[np.ix_(o, x)]).T
@@ -189,9 +247,9 @@ class Gaussian:
 
     def transition(self, variances: FloatArray) -> FloatArray:
         """A (n, n) = (I + information Q)^-1 of a random walk, Q = diag(variances (m,), 0): the rest stays."""
-        Q = np.zeros(self.point.size)
+        Q = np.zeros(len(self.vector))
         Q[: len(variances)] = variances
-        return np.asarray(np.linalg.inv(np.eye(self.point.size) + self.information * Q[None, :]))
+        return np.asarray(np.linalg.inv(np.eye(len(Q)) + self.information * Q[None, :]))
 
     def drifted(self, variances: FloatArray) -> Gaussian:
         """The belief after a random walk."""
@@ -200,11 +258,14 @@ class Gaussian:
         return Gaussian(self.point, 0.5 * (information + information.T), A @ self.vector)
 
     def mean(self) -> Point:
-        """The most likely value."""
+        """The most likely value, of beliefs that hold nothing."""
         return self.point.moved(scaled_inverse(self.information) @ self.vector)
 
     def factor(self, keys: Sequence[int]) -> gtsam.LinearContainerFactor:
-        """As a factor on [extrinsic, offset, biases..., object biases...]; it can be pickled."""
+        """As a factor on [extrinsic, offset, biases..., parameters..., object biases...]; it can be pickled.
+
+        Of beliefs that hold nothing.
+        """
         n, starts = self.point.size, [0, 6, *range(7, self.point.size + 1)]
         scale = np.sqrt(np.maximum(np.diag(self.information), 1e-30))
         R = np.linalg.cholesky(self.information / np.outer(scale, scale) + 1e-14 * np.eye(n)).T
@@ -224,17 +285,27 @@ class Gaussian:
 
 
 @lru_cache(maxsize=4096)
-def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...]) -> IntArray:
+def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...], held: int) -> IntArray:
     """Kept, for each frame asks for those of the whole window, and few of them are new."""
-    return np.array([*range(core), *(core + known.index(track) for track in chosen)], dtype=np.intp)
+    objects, size = [core + known.index(track) for track in chosen], core + len(known)
+    return np.array([*range(core), *objects, *range(size, size + held)], dtype=np.intp)
+
+
+def with_room(before: int, after: int, held: int) -> FloatArray:
+    """T (after + held, before + held) from some unknowns to more of them, before what is held."""
+    T = np.zeros((after + held, before + held))
+    T[:before, :before] = np.eye(before)
+    T[after:, before:] = np.eye(held)
+    return T
 
 
 def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
-    """(k, m) steps from each point to another, over [extrinsic, offset, biases]."""
+    """(k, m) steps from each point to another, over [extrinsic, offset, biases, parameters]."""
     turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)
     offsets = np.array([to.offset_s - point.offset_s for point in points])
     biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
-    return np.column_stack([turns, offsets, to.biases_px - biases])
+    parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
+    return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
 
 
 def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
@@ -268,8 +339,9 @@ def _picked(point: Point, tracks: Sequence[int]) -> FloatArray:
 
 
 def insert_point(values: gtsam.Values, keys: Sequence[int], point: Point) -> None:
-    """Put a point into values under [extrinsic, offset, biases...], where a key is not there yet."""
-    scalars = [point.offset_s, *point.biases_px, *point.object_biases_px]
+    """Put a point into values under [extrinsic, offset, biases, parameters, object biases], where a key is
+    not there yet."""
+    scalars = [point.offset_s, *point.biases_px, *point.parameters, *point.object_biases_px]
     if not values.exists(keys[0]):
         values.insert(keys[0], point.cTl)
     for key, scalar in zip(keys[1:], scalars, strict=True):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
@@ -52,8 +52,9 @@ class Tracker(Tracking):
         initial_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        super().__init__(camera, config or TrackerConfig(), Guess(initial, initial_offset_s))
-        self.setup = Setup(camera, self.config, initial, initial_offset_s)
+        config = config or TrackerConfig()
+        super().__init__(camera, config, Guess(initial, initial_offset_s))
+        self.setup = Setup(camera, config, initial, initial_offset_s)
         self.first_frames = FirstFrames()
         self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
         self.settled = False
@@ -157,7 +158,8 @@ class Tracker(Tracking):
     def marginal(self) -> TrackedMarginal:
         """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
 
-        Linearized at the estimate, as sure as the reported covariance.
+        Linearized at the estimate, as sure as the reported covariance: parameters of assumptions that are
+        estimated are marginalized out, those that are not are considered.
 
         Raises:
             EstimationError: there is no estimate yet.
@@ -194,22 +196,21 @@ class Tracker(Tracking):
         if self.smoother is None:
             return []
         entries = self.history_store.smoothed(self.smoother)
-        return [dataclasses.replace(e, covariance=e.covariance + self._common(e.cTl)) for e in entries]
+        beside = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
 
-    def consolidate(self) -> None:
+    def consolidate(self, laid_out: Container[int] = ()) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
 
         The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
+
+        Args:
+            laid_out: ids of values that have their memory layout already.
         """
-        lay_out(self)
+        lay_out(self, laid_out)
         self.odometry.rebuild_map()
         if self.smoother is not None:
             self.smoother.relinearize()
-
-    def make_ready(self) -> None:
-        """Pack what the newest frame brought, so that saving a checkpoint takes no longer than a frame."""
-        if self.window.images:
-            _ = self.window.images[-1].packed
 
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.
@@ -233,6 +234,7 @@ class Tracker(Tracking):
                 smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
+            self.tests.look(smoother)
         except EstimationError as error:
             _LOG.warning("tracker: not settled: %s", error)
             return False

@@ -74,6 +74,7 @@ class JointSolution:
         graph, values: the last frozen graph and its optimum.
         outer_iterations: outer iterations done.
         converged: the last step was short beside the frozen problem's own uncertainty.
+        matched_at: the state that the matches were made at.
     """
 
     state: State
@@ -83,6 +84,7 @@ class JointSolution:
     values: gtsam.Values
     outer_iterations: int
     converged: bool
+    matched_at: State
 
 
 def solve_joint(
@@ -151,7 +153,8 @@ def solving_joint(
     if belief is not None:
         graph.add(belief)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
-    return JointSolution(state, matches, found, graph, problem.values_at(optimum), outer + 1, converged)
+    values = problem.values_at(optimum)
+    return JointSolution(state, matches, found, graph, values, outer + 1, converged, problem.state)
 
 
 def support(solution: JointSolution) -> float:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from sst_graph.estimators.alarm import Joint
 from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import UNKNOWN_SIGMAS
+from sst_graph.uncertainty.assumptions import steps_by
 
 FloatArray = NDArray[np.float64]
 
@@ -25,11 +27,13 @@ class Known:
         inflation: how much larger it is than that of independent matches.
         by_standing: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
             object moves.
+        steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
     """
 
     joint: Joint
     inflation: float = 1.0
     by_standing: FloatArray | None = None
+    steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def nothing(cls) -> Known:
@@ -43,7 +47,8 @@ class Known:
         Raises:
             EstimationError: it has no covariance.
         """
-        matrix, naive = smoother.covariance()
+        information = smoother.information()
+        matrix, naive = smoother.covariance(information)
         if not (np.isfinite(matrix).all() and (np.diag(matrix) > 0.0).all()):
             raise EstimationError("a covariance that is not finite")
         m = smoother.past.point.core_size
@@ -54,10 +59,11 @@ class Known:
         if alone is not None:
             wider = scaled_inverse(alone)[:7, :7] - naive[:7, :7]
             by_standing = matrix[:7, :7] + inflation * wider
-        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_standing)
+        steps = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
+        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_standing, steps)
 
     @property
     def covariance(self) -> FloatArray:
-        """(m, m) covariance of extrinsic, offset and mask biases."""
+        """(m, m) covariance of extrinsic, offset, mask biases and estimated parameters."""
         m = self.joint.core_size
         return self.joint.matrix[:m, :m]

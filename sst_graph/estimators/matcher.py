@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
+from sst_graph.assumptions import held_at_zero
 from sst_graph.estimators.adoption import mean_cost
 from sst_graph.estimators.epochs import Found
 from sst_graph.estimators.gaussian import Point
@@ -35,6 +36,7 @@ class WindowMatcher:
         self.config = config
         self.classes = config.calibration.classes
         self.graph = config.calibration.joint.graph
+        self.held_names = held_at_zero(self.graph.estimate)
         self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
         self._twists: tuple[int, Tracks] | None = None
         self._growing = GrowingTrack(_SMOOTHED)
@@ -83,7 +85,8 @@ class WindowMatcher:
         for number, pair in pairs.items():
             if len(pair) >= self.config.min_frame_matches:
                 pair = pair if share == 1.0 else with_share(pair, share)
-                score = self._score(pair, number, point, share, by_object=not self.config.drift.enabled)
+                by_object = not self.config.drift.enabled
+                score = self._score(pair, number, point, share, by_object, self.held_names)
                 image = self.window.images[pair.pair.image]
                 out = self.left_out(pair, number, point.offset_s)
                 found[number] = Found(pair, score, stamps[number], image.index, left_out=out)
@@ -113,7 +116,7 @@ class WindowMatcher:
         pairs = associate([part], tracks, state, kernel, self.graph)
         if not pairs or len(pairs[0]) < self.config.min_frame_matches:
             return None
-        score = self._score(pairs[0], number, point, 1.0, by_object=False)
+        score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
         return Other(score.bent, middle_s, early)
 
     def scores(
@@ -176,7 +179,7 @@ class WindowMatcher:
         return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
 
     def _leaving_out(self, pair: PairMatches, number: int, out: Collection[int]) -> PairMatches:
-        tracks, matches, own = self.window.tracks[number], {}, {}
+        tracks, matches, own, terms = self.window.tracks[number], {}, {}, {}
         for c, m in pair.matches.items():
             kept = np.flatnonzero([tracks[c, int(name)] not in out for name in m.objects])
             if len(kept):
@@ -184,7 +187,9 @@ class WindowMatcher:
                 matches[c] = replace(m, alignment=m.alignment.take(kept), **part)
                 if c in pair.tracks:
                     own[c] = pair.tracks[c][kept]
-        return replace(pair, matches=matches, tracks=own)
+                if c in pair.terms:
+                    terms[c] = {name: column[kept] for name, column in pair.terms[c].items()}
+        return replace(pair, matches=matches, tracks=own, terms=terms)
 
     def cost(self, point: Point, chosen: Collection[int]) -> float | None:
         """Mean cost of the boundary points of some scans at a point; None where none can be seen."""
@@ -205,10 +210,16 @@ class WindowMatcher:
         return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
 
     def _score(
-        self, pair: PairMatches, number: int, point: Point, share: float, by_object: bool
+        self,
+        pair: PairMatches,
+        number: int,
+        point: Point,
+        share: float,
+        by_object: bool,
+        held: Sequence[str] = (),
     ) -> PairScore:
         tracks = self.window.tracks[number]
-        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object)
+        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""

@@ -17,8 +17,7 @@ from sst_graph.problem.graph import Tracks
 from sst_graph.problem.matching import match_all, outlines_of
 from sst_graph.problem.objects import ObjectId, tracks_of_scans
 from sst_graph.problem.state import State
-from sst_graph.uncertainty.assumptions import AssumptionConfig
-from sst_graph.uncertainty.common_error import common_covariance
+from sst_graph.uncertainty.assumptions import AssumptionConfig, consider
 from sst_graph.uncertainty.contradiction import PartAnswer
 from sst_graph.uncertainty.covariance import robust_covariance
 from sst_graph.uncertainty.standing import standing_covariance
@@ -64,7 +63,7 @@ class Parts:
         reference: the answer of all drives together, where the parts start and what their weak priors are
             centred on.
         joint: settings of the joint method.
-        assumptions: whose principal point each part's covariance has beside its matches.
+        assumptions: what each part's covariance has beside its matches.
         kernel_px: scales of the robust kernel of a part's solution, as in :class:`JointConfig` [px].
     """
 
@@ -106,9 +105,9 @@ class Parts:
         state = solution.state
         objects = [tracks_of_scans(self.objects[part.drive], part.scans)]
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
-        common = common_covariance(state.cTl, self.drives[part.drive].camera, self.assumptions)
+        beside = consider(robust, solution.pairs, solution.values, state, self.assumptions).covariance(7)
         # What moving objects alone tell is not called known: a vehicle that brakes looks like another offset.
-        covariance = standing_covariance(robust, solution.pairs)[:7, :7] + common
+        covariance = standing_covariance(robust, solution.pairs)[:7, :7] + beside
         weights = np.bincount(robust.table.sides, robust.table.root_weights**2)
         clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
         return PartAnswer(difference(self.reference_of(part), state), covariance, clusters)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.silhouettes import SIDES
-from sst_graph.estimators.gaussian import scattered
+from sst_graph.estimators.gaussian import scattered, with_room
 from sst_graph.estimators.object_sums import ObjectSums
 from sst_graph.estimators.scores import PairScore, summed_rows
 from sst_graph.uncertainty.covariance import (
@@ -36,11 +36,13 @@ class ScoreSums:
     """The sums over all frames that have left the window, in the columns of the belief that took them in.
 
     Attributes:
-        JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side.
+        JJ, frames, closed: (n, n) sums of J'J, of squared scores by side and frame, by closed side; in the
+            columns of the belief, those of what it holds included.
         live: running score of each side seen lately, and the scan that saw it last.
         recent: (k, 6) [side, mean, weights, weights2, within, moved] of the latest sides.
         objects: what each object says.
         weight, curvature: sums over all matches, see :class:`PairScore`.
+        held: how many parameters the belief holds.
     """
 
     JJ: FloatArray
@@ -48,14 +50,16 @@ class ScoreSums:
     closed: FloatArray
     live: dict[int, tuple[FloatArray, int]] = field(default_factory=dict)
     recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=150))
-    objects: ObjectSums = field(default_factory=lambda: ObjectSums(np.zeros((0, 0))))
+    objects: ObjectSums = field(default_factory=lambda: ObjectSums.empty(0))
     weight: float = 0.0
     curvature: float = 0.0
+    held: int = 0
 
     @classmethod
-    def empty(cls, n: int) -> ScoreSums:
-        nothing = np.zeros((n, n))
-        return cls(nothing, nothing, nothing, objects=ObjectSums(nothing))
+    def empty(cls, n: int, held: int = 0) -> ScoreSums:
+        """n: unknowns; held: further parameters."""
+        nothing = np.zeros((n + held, n + held))
+        return cls(nothing, nothing, nothing, objects=ObjectSums.empty(n, held), held=held)
 
     def add(
         self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
@@ -63,14 +67,14 @@ class ScoreSums:
         """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed.
 
         Args:
-            columns: where the pair's unknowns stand among those of the sums.
+            columns: where the pair's unknowns, and what it holds if the sums do, stand among those of these.
             by_object: keep what each object says, too.
         """
-        self.JJ, self.frames = self.JJ.copy(), self.frames.copy()
-        self.JJ[np.ix_(columns, columns)] += score.JJ
-        self.frames[np.ix_(columns, columns)] += score.sums
+        self.JJ, self.frames, n = self.JJ.copy(), self.frames.copy(), len(columns)
+        self.JJ[np.ix_(columns, columns)] += score.JJ[:n, :n]
+        self.frames[np.ix_(columns, columns)] += score.sums[:n, :n]
         rows = np.zeros((len(score.sides.sides), len(self.JJ)))
-        rows[:, columns] = score.sides.scores
+        rows[:, columns] = score.sides.scores[:, :n]
         for side, row in zip(score.sides.sides.tolist(), rows, strict=True):
             before = self.live.get(side)
             self.live[side] = (row if before is None else before[0] + row, scan)
@@ -90,7 +94,7 @@ class ScoreSums:
 
     def grow(self, n: int) -> None:
         """Make room for further unknowns, n in all."""
-        self.transform(np.eye(n, len(self.JJ)))
+        self.transform(with_room(len(self.JJ) - self.held, n, self.held))
 
     def transform(self, T: FloatArray) -> None:
         """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
@@ -108,27 +112,36 @@ class ScoreSums:
         return fit_sides(np.concatenate(rows))
 
     def surplus(
-        self, window: Sequence[PairScore], columns: Sequence[IntArray], model: ErrorModel
+        self,
+        window: Sequence[PairScore],
+        columns: Sequence[IntArray],
+        model: ErrorModel,
+        with_held: bool = False,
     ) -> FloatArray:
         """(n, n) variance of the score beyond that of independent matches.
 
         Args:
             window: pairs beside those taken in.
-            columns: where their unknowns stand.
+            columns: where their unknowns stand, and what they hold where that is asked for.
+            with_held: over what is held, too.
         """
-        n = len(self.JJ)
-        JJ, frames = scattered(n, columns, [score.JJ for score in window], [score.sums for score in window])
-        total = (model.match - 1.0) * (self.JJ + JJ) + model.side_frame * (self.frames + frames)
+        n = len(self.JJ) if with_held else len(self.JJ) - self.held
+        parts = [(score, slice(len(own))) for score, own in zip(window, columns, strict=True)]
+        of_matches = [score.JJ[own, own] for score, own in parts]
+        of_sides = [score.sums[own, own] for score, own in parts]
+        JJ, frames = scattered(n, columns, of_matches, of_sides)
+        JJ, frames = self.JJ[:n, :n] + JJ, self.frames[:n, :n] + frames
+        total = (model.match - 1.0) * JJ + model.side_frame * frames
         sides = [np.array(list(self.live), dtype=np.intp), *(score.sides.sides for score in window)]
         rows = np.zeros((sum(len(part) for part in sides), n))
         for i, (row, _) in enumerate(self.live.values()):
-            rows[i] = row
+            rows[i] = row[:n]
         start = len(self.live)
         for score, own in zip(window, columns, strict=True):
-            rows[start : start + len(score.sides.sides), own] = score.sides.scores
+            rows[start : start + len(score.sides.sides), own] = score.sides.scores[:, : len(own)]
             start += len(score.sides.sides)
         by_side = summed_rows(rows, np.concatenate(sides))
-        return np.asarray(total + model.side * (self.closed + by_side.T @ by_side))
+        return np.asarray(total + model.side * (self.closed[:n, :n] + by_side.T @ by_side))
 
 
 def fit_sides(rows: FloatArray) -> ErrorModel:

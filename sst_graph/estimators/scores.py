@@ -15,6 +15,7 @@ from sst_graph.association.silhouettes import SIDES
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.problem.graph import GraphConfig, PairMatches
+from sst_graph.problem.nuisances import columns_beside
 from sst_graph.problem.objects import numbers_in, of_each
 from sst_graph.problem.state import underside_track
 from sst_graph.problem.trajectory import camera_twist
@@ -35,7 +36,7 @@ class SideSums:
 
     Attributes:
         sides: (k,) number of the side, the same in all frames.
-        scores: (k, n) sum of root weight times row of J.
+        scores: (k, n) sum of root weight times row of J, in the columns of the belief.
         means: (k,) weighted mean of the whitened residuals.
         weights, weights2: (k,) sums of the weights and of their squares.
         within: (k,) weighted sum of squares around the mean.
@@ -62,10 +63,12 @@ class PairScore:
     """What one pair says: its belief, motion marginalised out, and the sums of its matches.
 
     Attributes:
-        belief: on [extrinsic, offset, biases, and the biases of the objects it sees].
+        belief: on [extrinsic, offset, biases, parameters, and the biases of the objects it sees]; it may hold
+            parameters of assumptions.
         bent: the same with the robust loss's second derivatives in place of the weights: how the gradient of
             matches that cannot be made anew follows an estimate that moves on.
-        JJ: (n, n) sum of J'J of its matches, motion marginalised out, times their common share.
+        JJ: (n, n) sum of J'J of its matches, motion marginalised out, times their common share; in the
+            columns of the belief, what it holds included, as are ``sides`` and ``sums``.
         sides: by side.
         sums: (n, n) sum of squared scores by side.
         matches: number of matches.
@@ -121,6 +124,7 @@ def score_pair(
     config: GraphConfig,
     share: float = 1.0,
     by_object: bool = True,
+    held: Sequence[str] = (),
 ) -> PairScore:
     """Linearize a pair at the point its matches were made at: its silhouettes and its motion.
 
@@ -128,20 +132,22 @@ def score_pair(
         tracks: number of the track of each (class, object) of the scan.
         share: factor that the weights of all matches carry beside their own.
         by_object: tell what each object alone says, too.
+        held: assumptions whose parameters the belief holds.
     """
     places = object_places(pair, classes, tracks)
     point = point.seen(places)
-    J, JV, r, roots = _rows(pair, point, classes)
-    # [unknowns, twist]: silhouettes, then the twist that odometry tells.
-    A, n = np.concatenate([J, JV], axis=1), point.size
+    J, JV, r, roots = _rows(pair, point, classes, held)
+    # [unknowns, held parameters, twist]: silhouettes, then the twist that odometry tells.
+    A, n, m = np.concatenate([J, JV], axis=1), point.size, J.shape[1]
     H, g = A.T @ A, -A.T @ r
     curvature = _curvatures(pair, r, roots)
     weight, bend = float(roots @ roots), float(curvature.sum())
     motion = np.zeros_like(H)
-    columns = [*range(7), *range(n, n + 6)]
+    columns = [*range(7), *range(m, m + 6)]
     motion[np.ix_(columns, columns)] = _motion_information(pair, point, config)
     belief, gain = _without_twist(point, H + motion, g)
     bent, _ = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
+    known = np.array([*range(n), *range(m, m + 6)])
     J = J - JV @ gain  # as the answer follows a residual, the twist following the answer
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
@@ -157,7 +163,7 @@ def score_pair(
         ObjectBeliefs.of(J, r, roots, track, point) if by_object else None,
         weight,
         bend,
-        _by_standing(pair, point, A, motion),
+        _by_standing(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
 
 
@@ -171,9 +177,9 @@ def _by_standing(pair: PairMatches, point: Point, A: FloatArray, motion: FloatAr
 
 
 def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian, FloatArray]:
-    """The belief on the unknowns, from information and vector over [unknowns, twist]; (6, n) what an unknown
-    takes off the twist."""
-    n = point.size
+    """The belief on the unknowns and what is held, from information and vector over these and the twist;
+    (6, n) what each of them takes off the twist."""
+    n = len(H) - 6
     gain = np.asarray(np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]])), np.float64)
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
     belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
@@ -199,9 +205,10 @@ def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> Fl
 
 
 def _rows(
-    pair: PairMatches, point: Point, classes: Sequence[SemanticClass]
+    pair: PairMatches, point: Point, classes: Sequence[SemanticClass], held: Sequence[str]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Weighted rows of all matches by unknowns (m, n) and twist (m, 6), residuals and root weights (m,)."""
+    """Weighted rows of all matches by unknowns and held parameters (m, n) and twist (m, 6), residuals and
+    root weights (m,)."""
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
         alignment, place = matches.alignment, classes.index(c)
@@ -211,13 +218,20 @@ def _rows(
             names, groups = pair.biased[c]
             below = 7 + len(classes) + place
             known = {track: point.core_size + k for k, track in enumerate(point.tracks)}
-            own = [below if t == underside_track(c) else known[t] for t in names]
-            columns = np.array(own)[groups]
-            biases = np.concatenate([point.biases_px, point.object_biases_px])[columns - 7]
-        r, J, _ = weighted_residuals(alignment, point.cTl, point.offset_s, pair.motion.c_twist, biases)
-        block = np.zeros((len(r), point.size))
+            columns = np.array([below if t == underside_track(c) else known[t] for t in names])[groups]
+            values = np.concatenate([point.biases_px, point.parameters, point.object_biases_px])
+            biases = values[columns - 7]
+        at = point.cTl, point.offset_s, pair.motion.c_twist
+        r, J, _ = weighted_residuals(alignment, *at, biases)
+        block = np.zeros((len(r), point.size + len(held)))
         block[:, :7] = J[:, :7]
         block[np.arange(len(r)), columns] = J[:, 13]
+        for place, name in zip(point.parameter_columns, point.names, strict=True):
+            block[:, place] = pair.terms[c][name] * J[:, 13]
+        if held:
+            assert pair.scene is not None
+            own = columns_beside(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
+            block[:, point.size :] = own
         blocks.append(block)
         twists.append(J[:, 7:13])
         residuals.append(r)

@@ -13,18 +13,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from factors import delay_drift, extrinsic_drift
+from sst_graph.association.silhouettes import SIDES
+from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
+from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
 from sst_graph.problem.graph import GraphConfig, motion_factor, silhouettes_factor
-from sst_graph.problem.state import bias_key, delay_key, object_bias_key, twist_key, underside_track
+from sst_graph.problem.state import (
+    bias_key,
+    delay_key,
+    nuisance_key,
+    object_bias_key,
+    twist_key,
+    underside_track,
+)
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
-from sst_graph.uncertainty.object_spread import composed
+from sst_graph.uncertainty.object_spread import ObjectSpread, composed
 
 FloatArray = NDArray[np.float64]
 
@@ -38,11 +48,20 @@ _RELINEARIZE = {
 """Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below what a frame tells."""
 
 
-def _parameters() -> gtsam.ISAM2Params:
+_RELINEARIZE_SPANS = 1e-3
+"""The same of an assumption's parameter, in units of what it may be: a few hundredths of a pixel."""
+
+
+def _parameters(estimate: Sequence[str]) -> gtsam.ISAM2Params:
+    """estimate: names and deviations of the parameters that are variables."""
     params = gtsam.ISAM2Params()
     thresholds = gtsam.ISAM2ThresholdMap()
     for name, steps in _RELINEARIZE.items():
         thresholds.insert((name, steps))
+    # One threshold for all keys of a letter: the least of them.
+    spans = [ASSUMPTIONS[name].span for name, _ in named_sigmas(estimate)]
+    if spans:
+        thresholds.insert(("N", np.array([_RELINEARIZE_SPANS * min(spans)])))
     params.setRelinearizeThreshold(thresholds)
     params.relinearizeSkip = 1
     params.findUnusedFactorSlots = True
@@ -62,9 +81,11 @@ class WindowSmoother:
     ) -> None:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
-        self.prior = self.past = self.bent = self.alone = prior
-        self.undecided = Undecided.none(prior.point.size)
-        self.sums = ScoreSums.empty(prior.point.size)
+        self.held_names = held_at_zero(graph.estimate)
+        self.prior = self.alone = prior
+        self.past = self.bent = prior.holding(len(self.held_names))
+        self.undecided = Undecided.none(len(self.bent.vector))
+        self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, Entry] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
@@ -93,11 +114,12 @@ class WindowSmoother:
         return sum(entry.score.matches for entry in self.entries.values())
 
     def keys(self, epoch: int, tracks: Sequence[int] = ()) -> list[int]:
-        """Keys of [E, D, biases..., biases of some objects...] of an epoch."""
+        """Keys of [E, D, biases..., parameters..., biases of some objects...] of an epoch."""
         biases = [bias_key(0, c) for c in self.classes]
         biases += [object_bias_key(0, underside_track(c)) for c in self.classes]
+        parameters = [nuisance_key(name) for name in self.prior.point.names]
         objects = [object_bias_key(0, track) for track in tracks]
-        return [int(gtsam.symbol("E", epoch)), delay_key(epoch), *biases, *objects]
+        return [int(gtsam.symbol("E", epoch)), delay_key(epoch), *biases, *parameters, *objects]
 
     def update(
         self,
@@ -142,7 +164,8 @@ class WindowSmoother:
     def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What the matches of a pair say."""
         (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
-        return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0))
+        at = entry.score.belief.point.nuisances
+        return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0), at)
 
     def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What odometry says of the twist of a pair's image."""
@@ -171,8 +194,8 @@ class WindowSmoother:
                 self._whole(), self.isam.calculateEstimate(), params
             )
             isam, indices = self._linearized(optimizer.optimize())
-            tracks = self.past.point.tracks
-            point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks)
+            tracks, names = self.past.point.tracks, self.past.point.names
+            point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks, names)
         except (RuntimeError, ValueError) as error:
             raise EstimationError(f"the window's optimisation failed: {error}") from error
         self._go_on_with(isam, indices)
@@ -180,12 +203,22 @@ class WindowSmoother:
 
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
-        self._go_on_with(*self._linearized(self.isam.calculateEstimate()))
+        self._go_on_with(*self._linearized(self.isam.calculateEstimate(), self._held()))
+
+    def _held(self) -> gtsam.NonlinearFactorGraph:
+        """As :meth:`_whole`, the very factors that iSAM2 holds."""
+        links = [link for epoch in self._epochs for link in epoch.links or ()]
+        twists = [twist.index for twist in self.twists.values()]
+        held, graph = self.isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for index in [self.past_id, *links, *self.ids.values(), *twists]:
+            graph.add(held.at(index))
+        return graph
 
     def _whole(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the window: the past, the walks, the pairs, the twists."""
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(self.bent.factor(self.keys(self._epochs[0].number, self.past.point.tracks)))
+        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
+        graph.add(self.bent.without_held().factor(keys))
         for old, new in pairwise(self._epochs):
             for factor in self.drift_factors(old, new):
                 graph.add(factor)
@@ -195,10 +228,13 @@ class WindowSmoother:
             graph.add(self.twist_factor(self.entries[twist.scan]))
         return graph
 
-    def _linearized(self, values: gtsam.Values) -> tuple[gtsam.ISAM2, list[int]]:
-        """A fresh iSAM2 of all factors at some values, and the factors' indices."""
-        isam = gtsam.ISAM2(_parameters())
-        return isam, list(isam.update(self._whole(), values).getNewFactorsIndices())
+    def _linearized(
+        self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
+    ) -> tuple[gtsam.ISAM2, list[int]]:
+        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
+        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
+        whole = self._whole() if graph is None else graph
+        return isam, list(isam.update(whole, values).getNewFactorsIndices())
 
     def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
         """Go on with an iSAM2 of :meth:`_whole`."""
@@ -227,20 +263,32 @@ class WindowSmoother:
         self._go_on_with(*self._linearized(values))
 
     def walk(self, seconds: float) -> FloatArray:
-        """(m,) variances of the random walk of [extrinsic, offset, biases] over some seconds."""
+        """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] over some seconds."""
         drift = self.drift
         rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.offset_s]
-        return np.asarray(seconds * np.square([*rates, *[0.0] * len(self.prior.point.biases_px)]))
+        return np.asarray(seconds * np.square([*rates, *[0.0] * (self.prior.point.core_size - 7)]))
 
-    def _information(self) -> FloatArray:
-        """(n, n) of past and window together on the last epoch, matches taken as independent."""
+    def information(self) -> FloatArray:
+        """(n, n) of past and window together on the last epoch, matches taken as independent, over the
+        unknowns of ``past`` and what it holds."""
         return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
+
+    def vector(self) -> FloatArray:
+        """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
+        unknowns of ``past`` and what it holds."""
+        belief = self.bent.at(self._point)
+        for i, epoch in enumerate(self._epochs):
+            if i > 0:
+                belief = belief.drifted(self.walk(self._seconds(i)))
+            seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
+            belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
+        return belief.vector
 
     def information_of_standing(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
         alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
         moves = any(entry.score.standing is not None for entry in self.entries.values())
-        if not moves and np.array_equal(alone.information, self.past.information):
+        if not moves and np.array_equal(alone.information, self.past.without_held().information):
             return None
         return self._onwards(alone, beliefs)
 
@@ -259,27 +307,70 @@ class WindowSmoother:
         """From the start of epoch i - 1 to that of epoch i [s]."""
         return max(1e-3, (self._epochs[i].start_ns - self._epochs[i - 1].start_ns) * 1e-9)
 
-    def covariance(self) -> tuple[FloatArray, FloatArray]:
+    def covariance(self, information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
+
+        Args:
+            information: as :meth:`information` tells it; None to ask for it here.
 
         Raises:
             EstimationError: a direction without any information.
         """
-        information = self._information()
+        n = self.past.point.size
+        information = (self.information() if information is None else information)[:n, :n]
         try:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        point, scores = self.past.point, [entry.score for entry in self.entries.values()]
-        columns = [point.columns(score.belief.point.tracks) for score in scores]
-        robust = naive + naive @ self.sums.surplus(scores, columns, self.model) @ naive
+        robust = naive + naive @ self.surplus() @ naive
         spread = None
         if not self.drift.enabled:
-            found = [score.objects for score in scores if score.objects is not None]
             point_now = self.past.at(self._point).point
-            spread = self.sums.objects.spread(found, naive, point_now)
-        robust = composed(robust, spread, self.sums.flatness(scores))
+            spread = self.sums.objects.spread(self._objects(), naive, point_now)
+        robust = composed(robust, spread, self.flatness)
         return 0.5 * (robust + robust.T), naive
+
+    def _objects(self) -> list[ObjectBeliefs]:
+        """What each object says in each scan of the window."""
+        scores = [entry.score for entry in self.entries.values()]
+        return [score.objects for score in scores if score.objects is not None]
+
+    def score_spread(
+        self, directions: FloatArray, information: FloatArray, values: FloatArray
+    ) -> tuple[ObjectSpread | None, ...]:
+        """How estimates of held parameters vary with the objects; None where objects are not kept (drift).
+
+        Args:
+            directions, information, values: as of :meth:`ObjectSums.score_spread`.
+        """
+        if self.drift.enabled:
+            return (None,) * len(information)
+        point = self.past.at(self._point).point
+        return self.sums.objects.score_spread(self._objects(), point, directions, information, values)
+
+    def surplus(self, with_held: bool = False) -> FloatArray:
+        """(n, n) variance of the score of past and window beyond that of independent matches.
+
+        Args:
+            with_held: over what ``past`` holds, too.
+        """
+        scores, point = [entry.score for entry in self.entries.values()], self.past.point
+        held = self.past.held if with_held else 0
+        columns = [point.columns(score.belief.point.tracks, held) for score in scores]
+        return self.sums.surplus(scores, columns, self.model, with_held)
+
+    @property
+    def flatness(self) -> float:
+        """Mean robust weight over mean curvature, of all matches of past and window."""
+        return self.sums.flatness([entry.score for entry in self.entries.values()])
+
+    @property
+    def objects(self) -> int:
+        """How many objects past and window have seen."""
+        sides = [np.array(list(self.sums.live), np.intp)]
+        sides += [entry.score.sides.sides for entry in self.entries.values()]
+        live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
+        return self.sums.objects.count + len(live)
 
     def live_epochs(self) -> list[RetiredEpoch]:
         """Epochs of the window, as if they retired now."""

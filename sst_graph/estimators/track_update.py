@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import gtsam
@@ -16,7 +17,7 @@ FloatArray = NDArray[np.float64]
 Sensor = Literal["image", "scan"]
 UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
 """Of an estimate that does not exist yet [rad, m, s]."""
-TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "alarm"]
+TrackStatus = Literal["starting", "ok", "unobservable", "unconfirmed", "contradicted", "alarm"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +30,9 @@ class TrackUpdate(ByValue):
         time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
         covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
-            converged again; ``unconfirmed`` where no frames have lately confirmed it; else whether the limits
-            of observability are met.
+            converged again; ``contradicted`` where the data contradict something that is taken for granted;
+            ``unconfirmed`` where no frames have lately confirmed it; else whether the limits of observability
+            are met.
         accepted: all of the frame was taken into the estimate; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
         refused: the sensors of it whose data were not taken in: they have changed nothing.
@@ -47,6 +49,10 @@ class TrackUpdate(ByValue):
         weak_directions: what is known worse than the limits.
         covariance_reason: why there is no covariance; empty where there is.
         settled: the window was solved as a whole after this frame (:meth:`Tracker.settle`).
+        contradictions: what the data contradict of all that is taken for granted, with estimate, deviation
+            and remedy.
+        estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
+            its assumption's name, in its unit; empty while there is no estimate.
     """
 
     stamp_ns: int
@@ -67,6 +73,8 @@ class TrackUpdate(ByValue):
     weak_directions: tuple[WeakDirection, ...] = ()
     covariance_reason: str = ""
     settled: bool = False
+    contradictions: tuple[str, ...] = ()
+    estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -99,5 +107,9 @@ class TrackUpdate(ByValue):
             "offset_unconfirmed_s": self.offset_unconfirmed_s,
             "adopted": self.adopted,
             "settled": self.settled,
+            "contradictions": list(self.contradictions),
+            "estimated": {
+                name: {"value": value, "sigma": sigma} for name, (value, sigma) in self.estimated.items()
+            },
             "weak": [weak.sentence for weak in self.weak_directions],
         }

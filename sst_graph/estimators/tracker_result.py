@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sst_graph.config import to_dict
+from sst_graph.estimators.assumption_tests import assumption_report
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
@@ -20,6 +21,8 @@ def tracker_result(
     reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
     if last.status == "unobservable":
         status = "unobservable"
+    elif last.status == "contradicted":
+        reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
         reasons = _unconfirmed(last, tracker.trial.on)
     elif last.status != "ok":
@@ -48,6 +51,8 @@ def tracker_result(
                 c.name.lower(): bias
                 for (_, c), bias in tracker.point.state(tracker.classes).biases_px.items()
             },
+            "assumptions": assumption_report(tracker.considered(), tracker.tests.findings),
+            "estimated": last.to_dict()["estimated"],
             "error_model": None
             if model is None
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},

@@ -11,9 +11,10 @@ import numpy as np
 
 from factors.robust import RobustKernel
 from sst_graph.association.pairing import pair_by_time
+from sst_graph.assumptions import named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
-from sst_graph.estimators.contest import choosing_start
+from sst_graph.estimators.contest import choosing_start, narrowed
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.joint import JointConfig, explained, solving_joint
 from sst_graph.estimators.tracker_config import TrackerConfig
@@ -41,9 +42,9 @@ class Guess:
     offset_s: float
     search: bool = True
 
-    def point(self, classes: tuple[SemanticClass, ...]) -> Point | None:
-        """As an estimate without mask biases; None where nothing is known."""
-        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes)
+    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point | None:
+        """As an estimate without mask biases, its parameters (``names``) 0; None where nothing is known."""
+        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes, names)
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,7 @@ class _Solved:
 
     def turned_from(self, other: _Solved) -> bool:
         """Whether the two are poses of different basins."""
-        turn = gtsam.Rot3.Logmap(self.point.cTl.between(other.point.cTl).rotation())
-        return float(np.linalg.norm(turn)) > _OTHER_BASIN_RAD
+        return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
 class _Unsettled(EstimationError):
@@ -83,10 +83,18 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
         EstimationError: too little to see, an ambiguous start, or a solution that did not settle, or did
             while one that did not explains the labels better.
     """
-    reach = config.calibration.start.search.delay_s
-    free = guess.search and reach > 0.0
-    delays = (0.0, reach) if free else (0.0,)
-    solved, failed = yield from _tried([_best(drive, guess, config, delay_s) for delay_s in delays])
+    searched = guess.search or guess.cTl is None
+    reach = config.calibration.start.search.delay_s if guess.search else 0.0
+    # 1. Candidates, with time offsets around the guess's.
+    starts = yield from _starts(drive, guess, config, reach)
+    # 2. Their poses with the guess's time offset; then as they are.
+    held = [State(start.cTl, (guess.offset_s,)) for start in _of_other_basins(starts)]
+    if searched:
+        # The contest has led them near.
+        joint = narrowed(config.calibration.joint)
+        config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, joint=joint))
+    ways = [held, starts] if reach > 0.0 else [starts]
+    solved, failed = yield from _tried([_best(drive, way, config) for way in ways])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -95,6 +103,19 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
             best = other
     _refuse_beside(best, failed, config)
     return best.point
+
+
+def _of_other_basins(starts: Sequence[State]) -> list[State]:
+    """The starts that are not in the basin of one before."""
+    chosen: list[State] = []
+    for start in starts:
+        if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
+            chosen.append(start)
+    return chosen
+
+
+def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
 def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
@@ -126,13 +147,12 @@ def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: Tra
             )
 
 
-def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[_Solved]:
-    """The best of the solutions from all candidates with offsets within ``delay_s`` of the guess's.
+def _best(drive: Drive, starts: Sequence[State], config: TrackerConfig) -> Stepwise[_Solved]:
+    """The best of the solutions from some starts.
 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    starts = yield from _starts(drive, guess, config, delay_s)
     solved, failed = yield from _tried([_solution(drive, start, config) for start in starts])
     if not solved:
         if reached := _unsettled(failed):
@@ -149,7 +169,8 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
 
 
 def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
-    """Where the solutions begin: the winners of the batch's contest, or the guess itself.
+    """Where the solutions begin: the winners of the batch's contest, with offsets within ``delay_s`` of the
+    guess's, or the guess itself.
 
     Raises:
         EstimationError: nothing to search for, or no guess and no search.
@@ -178,7 +199,10 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_So
     solution = yield from solving_joint([drive], start, _damped(config))
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    point = Point(state.cTl, state.offset_s(0), np.array(2 * biases))
+    names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
+    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
+    cTl, offset_s = state.cTl, state.offset_s(0)
+    point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
@@ -219,12 +243,15 @@ def prior_belief(
 ) -> Gaussian:
     """The batch's own weak priors around the guess, linearized at a point.
 
-    A class's mask bias is around 0, that of its undersides around the class's.
+    A class's mask bias is around 0, that of its undersides around the class's; an estimated parameter of an
+    assumption is around 0.
     """
+    estimated = dict(named_sigmas(config.estimate))
     sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
     k = len(classes)
-    information = np.diag(1.0 / np.square([*sigmas, *[config.bias_sigma_px] * k, *[np.inf] * k]))
-    tie = config.underside_bias_sigma_px**-2.0 * np.eye(k)
-    information[7:, 7:] += np.block([[tie, -tie], [-tie, tie]])
-    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes)
+    sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
+    information = np.diag(1.0 / np.square(sigmas))
+    tie, biases = config.underside_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
+    information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
+    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
     return Gaussian(point, information, information @ point.local(centre))

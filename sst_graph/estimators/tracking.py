@@ -15,6 +15,7 @@ from factors.camera import PinholeCamera
 from sst_graph.estimators.admission import StampOrder, check_lateness
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.arrivals import Arrivals
+from sst_graph.estimators.assumption_tests import contradiction_of
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History
 from sst_graph.estimators.known import Known
@@ -25,6 +26,7 @@ from sst_graph.estimators.settling import Milestones, Settling
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.starting import EXPECTED, Started, Starting
 from sst_graph.estimators.track_update import TrackStatus, TrackUpdate
+from sst_graph.estimators.tracked_tests import AssumptionTests
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess
 from sst_graph.estimators.trial import Trial
@@ -35,7 +37,7 @@ from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.problem.drive import ScanFeatures, image_features, scan_features
 from sst_graph.result import WeakDirection
 from sst_graph.types import CameraImage, RelativeMotion, Scan
-from sst_graph.uncertainty.common_error import common_covariance
+from sst_graph.uncertainty.assumptions import Considered, considered
 from sst_graph.uncertainty.observability import open_directions
 
 _LOG = logging.getLogger(__name__)
@@ -51,10 +53,10 @@ class Tracking:
 
     def __init__(self, camera: PinholeCamera, config: TrackerConfig, guess: Guess) -> None:
         self.camera = camera
-        self.config = config
+        self.config = config = dataclasses.replace(config, calibration=config.calibration.estimating)
         calibration = self.config.calibration
         self.classes = calibration.classes
-        self.window = Window(camera, self.config.window)
+        self.window = Window(camera, config.window, config.searched_scans)
         self.matcher = WindowMatcher(self.window, self.config)
         self.odometry = LidarOdometry(calibration.prepare.lidar_odometry)
         self.last_scan: Scan | None = None
@@ -71,6 +73,7 @@ class Tracking:
         self.settling: Settling | None = None
         self.arrivals = Arrivals()
         self.trial = Trial(self.config)
+        self.tests = AssumptionTests(calibration.assumptions)
         self.doubt = ""
         self.starts = 0
         self.image_order, self.scan_order = StampOrder("image", True), StampOrder("scan", False)
@@ -90,11 +93,13 @@ class Tracking:
         """The present estimate, or the guess."""
         if self.smoother is not None:
             return self.smoother.point
-        return Point.unbiased(self.guess.cTl or gtsam.Pose3(), self.guess.offset_s, self.classes)
+        guess, names = self.guess, self.estimated_names
+        return Point.unbiased(guess.cTl or gtsam.Pose3(), guess.offset_s, self.classes, names)
 
     @property
     def covariance(self) -> FloatArray:
-        """(m, m) of extrinsic [rad, m], time offset [s] and mask biases [px]; wide before the start."""
+        """(m, m) of extrinsic [rad, m], time offset [s], mask biases [px] and estimated parameters of
+        assumptions; of the first two only, and wide, before the start."""
         return self.known.covariance
 
     @property
@@ -103,11 +108,29 @@ class Tracking:
         return self.adoption.adopted
 
     def reported(self) -> FloatArray:
-        """(7, 7) covariance of the present estimate, with what all contours may err by together."""
-        return self.covariance[:7, :7] + self._common(self.point.cTl)
+        """(7, 7) covariance of the present estimate, with what assumptions that may be wrong add to it."""
+        return self.covariance[:7, :7] + self.considered().covariance(7)
 
-    def _common(self, cTl: gtsam.Pose3) -> FloatArray:
-        return common_covariance(cTl, self.camera, self.config.calibration.assumptions)
+    def considered(self) -> Considered:
+        """How the present estimate follows the assumptions that are not estimated beside it."""
+        return considered(self.known.steps, self.config.calibration.assumptions)
+
+    @property
+    def estimated_names(self) -> tuple[str, ...]:
+        """Assumptions whose parameters are estimated."""
+        return tuple(name for name, _ in self.config.calibration.assumptions.estimated)
+
+    @property
+    def estimated(self) -> dict[str, tuple[float, float]]:
+        """Value and deviation of each parameter that is estimated, by name; none before the start."""
+        if self.smoother is None:
+            return {}
+        point, sigmas = self.point, np.sqrt(np.diag(self.covariance))
+        sigmas = sigmas[point.parameter_columns]
+        return {
+            name: (value, float(sigma))
+            for (name, value), sigma in zip(point.nuisances.items(), sigmas, strict=True)
+        }
 
     def take_image(self, image: CameraImage, moved_ns: int) -> TrackUpdate:
         """A checked image into the window; ``moved_ns``: the stamps have moved by as much for good."""
@@ -168,9 +191,8 @@ class Tracking:
             return self.answer(stamp_ns, f"no start yet: {' '.join(str(error).split())}")
         if started is not None:
             return self.begin(started, stamp_ns)
-        search = self.starting.search
-        looks = "collecting frames for a start" if search is None else "looking for a start"
-        return self.answer(stamp_ns, looks)
+        under_way = self.starting.under_way
+        return self.answer(stamp_ns, "looking for a start" if under_way else "collecting frames for a start")
 
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""
@@ -178,6 +200,7 @@ class Tracking:
         if why := self.trial.check(self.watch, smoother, known, window.restless()):
             return self._refuse_start(stamp_ns, len(window.scans) // 2, why)
         self.known, self.smoother = known, smoother
+        self.tests.look(smoother)
         self.starting.succeeded()
         self.starts += 1
         self.trial.begin(window.next_scan)
@@ -222,7 +245,8 @@ class Tracking:
                 return self._change(changed, stamp_ns, since, chi2, "the calibration has changed")
             return self._refuse_start(stamp_ns, since, "new frames contradict the start: it begins anew")
         if new:
-            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, self.guess.point(self.classes))
+            in_use = self.guess.point(self.classes, self.estimated_names)
+            self.adoption.hear(partial(self.matcher.cost, chosen=new), before, in_use)
         # 3. The graph takes all in, or nothing.
         first = self.window.first_scan
         if new or not missing <= {number}:
@@ -233,8 +257,9 @@ class Tracking:
         self.known = Known.of(smoother)
         if new:
             self.arrivals.take(number, self.reported())
-        # 4. Does a new start hold?
+        # 4. Does a new start hold, and what is taken for granted?
         self.trial.look_again(number, self.watch, smoother, self.known, restless)
+        self.tests.take(number, smoother)
         # 5. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
@@ -300,6 +325,7 @@ class Tracking:
         """Give up the estimate and all scans but the last few."""
         self.stop_settling()
         self.smoother, self.doubt, self.known = None, "", Known.nothing()
+        self.tests.restart()
         self.window.keep_scans(keep)
         self.starting.begin(guess, len(self.window.scans))
         self.entered.clear()
@@ -314,11 +340,12 @@ class Tracking:
         covariance = self.reported()
         status: TrackStatus = "alarm" if self.starting.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
-        since = self.watch.confirmation
+        since, contradictions = self.watch.confirmation, contradiction_of(self.tests.findings)
         if self.smoother is not None:
             weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
             late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
+            status = "contradicted" if contradictions else status
         found = self.smoother is not None
         return TrackUpdate(
             stamp_ns=stamp_ns,
@@ -336,4 +363,6 @@ class Tracking:
             offset_unconfirmed_s=since.offset_s,
             adopted=offer and self.adoption.offer(point, status == "ok"),
             weak_directions=weak,
+            contradictions=contradictions,
+            estimated=self.estimated,
         )

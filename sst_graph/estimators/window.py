@@ -64,6 +64,7 @@ class Window:
 
     Attributes:
         size: most scans, but while nothing may leave.
+        sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
         held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         sightings: the latest ones of each track, in the order of time.
@@ -73,11 +74,13 @@ class Window:
         velocities: of those that do not.
         judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
+        origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
 
-    def __init__(self, camera: PinholeCamera, scans: int) -> None:
+    def __init__(self, camera: PinholeCamera, scans: int, sampled: int | None = None) -> None:
         self.camera = camera
         self.size = scans
+        self.sampled = scans if sampled is None else sampled
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.next_scan = 0
         self.next_image = 0
@@ -86,6 +89,7 @@ class Window:
     def restart(self) -> None:
         """Forget all scans, images and motions; numbers go on."""
         self.held = False
+        self.origin_ns: int | None = None
         self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
@@ -143,6 +147,7 @@ class Window:
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
         )
         self.scans.append((number, lean))
+        self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self._judge(number, features.stamp_ns)
         self.persistence.forget(self.first_scan)
@@ -154,6 +159,19 @@ class Window:
                 del by_scan[old]
         self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
         return number
+
+    def _thin_out(self) -> None:
+        """Drop the sample of the scan that has just ceased to be among the latest; it is most of a scan."""
+        if len(self.scans) > self.sampled:
+            number, scan = self.scans[-1 - self.sampled]
+            # Copies, for a part of an array keeps all of it.
+            thin = dataclasses.replace(
+                scan,
+                lPs=scan.lPs[:0].copy(),
+                classes=scan.classes[:0].copy(),
+                offsets_s=scan.offsets_s[:0].copy(),
+            )
+            self.scans[-1 - self.sampled] = (number, thin)
 
     def _judge(self, number: int, stamp_ns: int) -> None:
         """Which objects of the latest scans move: as the batch judges, from the sightings so far."""
@@ -264,6 +282,8 @@ class Window:
             raise DataError("tracker", f"a second image of stamp {features.stamp_ns} ns", "one image a stamp")
         self.images.insert(place, dataclasses.replace(features, index=self.next_image))
         self.next_image += 1
+        if self.origin_ns is None:
+            self.origin_ns = features.stamp_ns
 
     def forget_images(self, margin_ns: int, most: int) -> None:
         """Drop images that no scan can meet: those near the window's scans stay, and the newest ones.
@@ -308,5 +328,6 @@ class Window:
         if chosen is None and scans:
             # As in a drive: the k-th motion leads from the k-th scan to the next.
             motions = tuple(motion for motion in motions if motion.from_ns >= scans[0].stamp_ns)
-        drive = Drive("window", self.camera, tuple(scans), tuple(self.images), motions, ())
+        images = tuple(self.images)
+        drive = Drive("window", self.camera, tuple(scans), images, motions, (), origin_ns=self.origin_ns)
         return drive, numbers

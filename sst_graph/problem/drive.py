@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,8 @@ class ScanFeatures:
         undersides: boundary points of each class towards the ground, of objects that have others too.
     """
 
+    stored_apart: ClassVar[bool] = True
+
     index: int
     stamp_ns: int
     boundaries: dict[SemanticClass, Boundaries]
@@ -87,6 +89,8 @@ class ImageFeatures:
 
     Of the picture no more is kept than what it shows along the contours.
     """
+
+    stored_apart: ClassVar[bool] = True
 
     index: int
     stamp_ns: int
@@ -162,6 +166,7 @@ class Drive:
         left_out: what the data lacked.
         survey: what the raw frames show, for the search for causes; None where nobody looked.
         sweep: what was decided of the times of the points, or None where nobody asked.
+        origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
     """
 
     name: str
@@ -173,6 +178,7 @@ class Drive:
     left_out: LeftOut = field(default_factory=LeftOut)
     survey: Survey | None = None
     sweep: SweepDecision | None = None
+    origin_ns: int | None = None
 
     @property
     def scan_stamps_ns(self) -> list[int]:

@@ -353,7 +353,8 @@ class _Motions:
         drive, number = outlines.drive, outlines.number
         stamps = [drive.images[pair.image].stamp_ns for pair in pairs]
         shift_ns = round(state.offset_s(number) * 1e9)
-        since_s = np.array([stamp - drive.images[0].stamp_ns for stamp in stamps]) * 1e-9
+        origin_ns = drive.images[0].stamp_ns if drive.origin_ns is None else drive.origin_ns
+        since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
         l_twists = outlines.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
             rest = Motion(np.zeros(6), np.zeros(6))

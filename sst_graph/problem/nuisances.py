@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -81,19 +81,37 @@ def residual_columns(
         pose: the extrinsic, the time offset [s], and the camera's twist (6,) or (6, n) [rad/s, m/s].
         names: of the assumptions.
     """
-    cTl, offset_s, c_twist = pose
+    names = list(names)
+    _, J = residuals(alignment, *pose, 0.0)
+    columns = columns_beside(J, alignment, scene, base_tau_s, pose, names)
+    return dict(zip(names, columns.T, strict=True))
+
+
+def columns_beside(
+    J: FloatArray,
+    alignment: Alignment,
+    scene: Scene,
+    base_tau_s: float | FloatArray,
+    pose: tuple[gtsam.Pose3, float, FloatArray],
+    names: Sequence[str],
+) -> FloatArray:
+    """Derivatives (n, k) of residuals by assumptions' parameters, each multiplied as its row of J is.
+
+    Args:
+        J: (n, 14) by [rot, trans, offset, twist, bias], of residuals as they are or weighted.
+        alignment, scene, base_tau_s, pose, names: as of :func:`residual_columns`.
+    """
     view = scene.view(alignment.lPs, base_tau_s - alignment.base_taus_s, _pixels(alignment, *pose))
-    _, J = residuals(alignment, cTl, offset_s, c_twist)
     seen = np.isfinite(view.uvs).all(axis=1)
-    columns = {}
-    for name in names:
-        column = _column(alignment, J, cTl, ASSUMPTIONS[name].effect(view))
-        columns[name] = np.where(seen, column, 0.0)
+    columns = np.zeros((len(alignment), len(names)))
+    for place, name in enumerate(names):
+        column = _column(alignment, J, pose[0], ASSUMPTIONS[name].effect(view))
+        columns[:, place] = np.where(seen, column, 0.0)
     return columns
 
 
 def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effect) -> FloatArray:
-    """Derivatives (n,) by one parameter; J (n, 13) as :func:`factors.residuals` gives it."""
+    """Derivatives (n,) by one parameter, beside the rows J (n, 14) of residuals that may be weighted."""
     total = np.zeros(len(alignment))
     if effect.l_shift is not None:
         # A step of the extrinsic's translation (right perturbation) moves the point in the LiDAR frame.
@@ -102,7 +120,7 @@ def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effec
         total += J[:, 6] * effect.time_s
     if effect.pixel_shift is not None:
         assert alignment.normals is not None
-        total += np.einsum("ij,ij->i", alignment.normals, effect.pixel_shift)
+        total += J[:, 13] * np.einsum("ij,ij->i", alignment.normals, effect.pixel_shift)
     if effect.twist_shift is not None:
         total += (J[:, 7:13] @ np.asarray(cTl.AdjointMap()) * effect.twist_shift).sum(axis=1)
     return total

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
+from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
 from sst_graph.problem.graph import GraphConfig, PairMatches, joint_graph
 from sst_graph.problem.nuisances import residual_columns
@@ -141,11 +141,32 @@ def consider(
         robust: its covariance and matches.
         pairs, values, state: its last frozen problem.
     """
-    names = [name for name in ASSUMPTIONS if name not in dict(config.estimated)]
+    names = held_at_zero(config.estimate)
     columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
     size = 6 + len(state.offsets_s)
-    steps = -(robust.bread @ (robust.table.J.T @ columns))[:size]
-    return Considered(dict(zip(names, steps.T, strict=True)), {name: config.sigma(name) for name in names})
+    steps = steps_by(names, robust.bread, robust.table.J.T @ columns, size)
+    return considered(steps, config)
+
+
+def steps_by(
+    names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int
+) -> dict[str, FloatArray]:
+    """How the first ``size`` unknowns follow parameters that are held at 0: (size,) each, by name.
+
+    Args:
+        bread: (n, n) inverse of the information of the unknowns, motion marginalised out.
+        shared: (n, k) information that the unknowns share with the parameters.
+    """
+    return dict(zip(names, -(bread @ shared)[:size].T, strict=True))
+
+
+def considered(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
+    """What parameters that are held at 0 add to a covariance.
+
+    Args:
+        steps: by :func:`steps_by`.
+    """
+    return Considered(steps, {name: config.sigma(name) for name in steps})
 
 
 def motion_covariance(

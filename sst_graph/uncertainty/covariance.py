@@ -21,7 +21,7 @@ see :mod:`sst_graph.uncertainty.object_spread`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -83,6 +83,11 @@ class MatchTable:
         rest = self.root_weights[index], self.curvatures[index], self.r[index]
         return MatchTable(self.J[index], *rest, sides, side_frames, objects, self.views)
 
+    def moved(self, step: FloatArray) -> MatchTable:
+        """The matches after a step (n,) of the unknowns, their robust weights as they are."""
+        roots = np.maximum(self.root_weights, 1e-6)
+        return replace(self, r=np.where(self.root_weights > 1e-6, self.r + self.J @ step / roots, self.r))
+
     @property
     def flatness(self) -> float:
         """Mean robust weight over mean curvature: 1 for least squares, inf where the kernel bends over."""
@@ -103,8 +108,10 @@ def match_table(
         state: that the matches were made at.
         tracks: of each drive's objects.
     """
-    motion = _Motion(values, twist_responses(graph, values, unknowns))
+    made_at = state.nuisances
     state = state_from(values, state, pairs)
+    moved = {name: value - made_at.get(name, 0.0) for name, value in state.nuisances.items()}
+    motion = _Moved(values, twist_responses(graph, values, unknowns), moved)
     blocks, weights, residuals, curvatures = [], [], [], []
     sides, frames, objects, moving = [], [], [], []
     for number, pair in enumerate(pairs):
@@ -135,15 +142,22 @@ def match_table(
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """The twists at the optimum, and how each follows the other unknowns (6, n), by the twist's key."""
+class _Moved:
+    """What the optimum has moved beside the state.
+
+    Attributes:
+        values: with the twists at the optimum.
+        responses: (6, n) how each twist follows the other unknowns, by its key.
+        nuisances: steps of the assumptions' parameters since the matches were made, by name.
+    """
 
     values: gtsam.Values
     responses: Mapping[int, FloatArray]
+    nuisances: Mapping[str, float]
 
 
 def _rows(
-    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Motion
+    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Moved
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted Jacobian rows, roots of the weights, and whitened residuals of one class in one pair."""
     V_key = twist_key(pair.drive, pair.pair.image)
@@ -165,6 +179,7 @@ def _rows(
     block[np.arange(len(alignment)), columns] += J[:, 13]
     for name, column in pair.terms.get(c, {}).items():
         block[:, unknowns.column(nuisance_key(name))] += column * J[:, 13]
+        r = r + column * J[:, 13] * motion.nuisances.get(name, 0.0)
     return block, roots, unweighted(r, roots)
 
 

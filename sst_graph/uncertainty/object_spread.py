@@ -66,7 +66,12 @@ def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: floa
         alone = spread.correction / _OF_TWO
         model = _MODEL_SHARE * max(spread.disagreement(covariance), alone) * covariance
         covariance = model + _OBJECT_SHARE * spread.correction * spread.jackknife
-    return np.asarray(covariance * min(max(flatness, 1.0), _FLATTEST) ** 2)
+    return np.asarray(covariance * believed_flatness(flatness) ** 2)
+
+
+def believed_flatness(flatness: float) -> float:
+    """Mean robust weight over mean curvature, within what is believed of it."""
+    return min(max(flatness, 1.0), _FLATTEST)
 
 
 _MODEL_SHARE, _OBJECT_SHARE = 0.33, 0.145
