@@ -5,7 +5,7 @@
 Valid tiny files of every kind are mutated (benchmarks/fuzz_mutations.py) and read in a worker process whose
 memory is limited. Right ends are a value, an error of the package (one printable line), and for a command
 exit 0, 2 (one line on stderr) or 3. Wrong are any other exception, more than 5 s (of the processor), more
-than 1 GB, a process that dies, and lines of libraries on stderr. ``--kind calibrate`` runs whole calibrations
+than 1 GB, a process that dies, and lines of libraries. ``--kind calibrate`` runs whole calibrations
 of mutated drives. A case is made again from its number: ``--seed 1 --only 4711``.
 """
 
@@ -457,7 +457,7 @@ def tried(number: int, kind: str, seed: int, ground: Ground, noise: int) -> Case
     seconds = time.perf_counter() - began
     written = os.pread(noise, 400, 0)
     if written and verdict != "FAILURE":
-        verdict, why = "FAILURE", f"lines of a library on stderr: {written!r}"
+        verdict, why = "FAILURE", f"lines of a library: {written!r}"
     return Case(number, kind, verdict, why, seconds)
 
 
@@ -469,7 +469,8 @@ def _work(inputs: Path, seed: int, numbers: list[tuple[int, str]], answers: Conn
     """A worker: its own copy of the valid inputs, its own limits."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as noise:
         ground = Ground(Path(shutil.copytree(inputs, Path(folder) / "inputs")))
-        os.dup2(noise.fileno(), 2)
+        for stream in (1, 2):  # LAPACK writes to stdout; the package's own lines are captured above it
+            os.dup2(noise.fileno(), stream)
         logging.getLogger("sst_graph").addHandler(logging.NullHandler())
         signal.signal(signal.SIGALRM, _too_long)
         signal.signal(signal.SIGPROF, _too_long)
@@ -523,10 +524,11 @@ def main() -> int:
     usual = [kind for kind, (_, weight) in KINDS.items() if weight]
     parser.add_argument("--kind", action="append", choices=list(KINDS), help="only these (repeatable)")
     parser.add_argument("--only", type=int, metavar="NUMBER", help="one case, with its error")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case after so long")
     parser.add_argument("--started", action="store_true", help="the checkpoint's tracker has started")
     args = parser.parse_args()
     found: Counter[tuple[str, str]] = Counter()
-    slowest, failures = 0.0, 0
+    slowest, failures, done, began = Case(0, "", "", "", 0.0), 0, 0, time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
         prepare(Path(folder), args.started)
         numbers = plan(args.seed, args.count, args.kind or usual)
@@ -534,14 +536,20 @@ def main() -> int:
             numbers = [numbers[args.only]]
         for case in cases(Path(folder), args.seed, numbers):
             found[case.kind, case.verdict] += 1
-            slowest = max(slowest, case.seconds)
+            done += 1
+            slowest = max(slowest, case, key=lambda each: each.seconds)
             if case.verdict == "FAILURE" or args.only is not None:
                 failures += case.verdict == "FAILURE"
                 print(f"{case.number} {case.kind}: {case.verdict} {case.why}", flush=True)
+            if time.monotonic() - began > 60.0 * args.minutes:
+                break
     for kind in dict.fromkeys(kind for kind, _ in found):
         ends = ", ".join(f"{count} {verdict}" for (k, verdict), count in sorted(found.items()) if k == kind)
         print(f"{kind:<12} {ends}")
-    print(f"{args.count} inputs, seed {args.seed}: {failures} failures, slowest {slowest:.2f} s")
+    print(
+        f"{done} inputs, seed {args.seed}: {failures} failures, "
+        f"slowest {slowest.seconds:.2f} s ({slowest.number} {slowest.kind})"
+    )
     return 1 if failures else 0
 
 

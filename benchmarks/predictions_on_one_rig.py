@@ -19,7 +19,7 @@ from sst_graph.estimators import calibrate_prepared
 from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.frame_information import frames_of, with_offset
-from sst_graph.uncertainty.planning import predicted_covariance
+from sst_graph.uncertainty.planning import considered_covariance, predicted_covariance
 
 CUTS = (14, 28, 42)
 
@@ -51,7 +51,8 @@ def main() -> None:
         for count, result in zip(CUTS[1:], found[1:], strict=True):
             twists = [frame.l_twist for frame in frames_of(result)][len(record) :]
             more = np.sum([with_offset(view, twist) for twist in twists], axis=0)
-            predicted = np.sqrt(np.diag(predicted_covariance(found[0].covariance, more)))
+            lasting = considered_covariance(found[0])
+            predicted = np.sqrt(np.diag(predicted_covariance(found[0].covariance, more, lasting)))
             ratios = np.sqrt(np.diag(result.covariance)) / predicted
             mean = float(np.exp(np.log(ratios).mean()))
             print(f"seed {seed} +{count - CUTS[0]}: {ratios.round(2)}, geometric mean {mean:.2f}", flush=True)

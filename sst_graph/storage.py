@@ -15,11 +15,12 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import json
 import math
 import zlib
 from collections import deque
-from collections.abc import Callable, Mapping
-from functools import cached_property
+from collections.abc import Callable, Container, Mapping, Sequence
+from functools import cache, cached_property
 from typing import Any, Literal, TypeVar
 
 import gtsam
@@ -36,8 +37,7 @@ _Order = Literal["C", "F"]
 _Kept = TypeVar("_Kept")
 
 _PACKAGES = ("sst_graph.", "factors.")
-_SEQUENCES = (tuple, list, set, frozenset)
-_PLAIN = (bool, int, float, str, type(None))
+_PLAIN = frozenset([bool, int, float, str, type(None)])
 _COMPRESSED_BYTES = 65_536
 """Masks of this size or more are compressed."""
 
@@ -75,6 +75,103 @@ class PackedArray:
         return np.frombuffer(zlib.decompress(self.data), np.uint8).reshape(self.shape)
 
 
+_KINDS: dict[type, str] = {
+    PackedArray: "packed",
+    set: "set",
+    frozenset: "set",
+    tuple: "sequence",
+    list: "sequence",
+    deque: "deque",
+    dict: "dict",
+}
+"""How values of just these classes are stored."""
+_FAMILIES: tuple[tuple[type, str], ...] = (
+    (enum.Enum, "enum"),
+    (np.generic, "scalar"),
+    (np.ndarray, "array"),
+    (gtsam.Pose3, "pose"),
+    (cKDTree, "tree"),
+)
+"""How values of these classes, and of those derived from them, are stored; all others by their attributes."""
+
+
+@cache
+def _kind(cls: Any) -> str:
+    """How a value of a class is stored."""
+    return _KINDS.get(cls) or next((kind for family, kind in _FAMILIES if issubclass(cls, family)), "object")
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """A value that never changes, stored once.
+
+    Attributes:
+        number: by which others refer to it; above those that it refers to.
+        value: itself, so that its id is not used again.
+        text: its node, as JSON.
+        data: the bytes of its arrays.
+        within: numbers of the blocks that it refers to.
+    """
+
+    number: int
+    value: object
+    text: str
+    data: bytes
+    within: frozenset[int]
+
+
+class Blocks:
+    """Values that never change, each stored once however often what refers to them is stored.
+
+    These are the instances of classes with ``stored_apart = True``.
+    """
+
+    def __init__(self, classes: Classes | None = None) -> None:
+        """classes: the only ones that may be in them; None: any of the package."""
+        self.classes = classes
+        self._blocks: dict[int, Block] = {}
+        self._next = 0
+
+    def __contains__(self, value_id: object) -> bool:
+        """Whether the value of an id is one of them."""
+        return value_id in self._blocks
+
+    def number(self, value: object) -> int:
+        """The number of a value, which is stored if it has not been yet.
+
+        Raises:
+            TypeError: something in it cannot be stored.
+        """
+        block = self._blocks.get(id(value))
+        if block is None:
+            lay_out(value, self)
+            writer = _Writer(self.classes, self)
+            # What it refers to is stored first, and has lower numbers.
+            node = [*writer.parts_of(value), 0]
+            data, within = b"".join(writer.parts), frozenset(writer.referred)
+            block = Block(self._next, value, json.dumps(node, allow_nan=False), data, within)
+            self._blocks[id(value)] = block
+            self._next += 1
+        return block.number
+
+    def stored(self, value: object) -> tuple[Node, bytes, list[Block]]:
+        """As :func:`stored`, with the blocks that it refers to, by rising number; the others are forgotten.
+
+        Raises:
+            TypeError: something in it cannot be stored.
+        """
+        writer = _Writer(self.classes, self)
+        node = writer.node(value)
+        used, kept = set(writer.referred), []
+        for block in reversed(self._blocks.values()):
+            if block.number in used:
+                used |= block.within
+                kept.append(block)
+        kept.reverse()
+        self._blocks = {id(block.value): block for block in kept}
+        return node, b"".join(writer.parts), kept
+
+
 def stored(value: object, classes: Classes | None = None) -> tuple[Node, bytes]:
     """A value as JSON (with NaN and Infinity as text) and the bytes of its arrays.
 
@@ -89,17 +186,22 @@ def stored(value: object, classes: Classes | None = None) -> tuple[Node, bytes]:
     return node, b"".join(writer.parts)
 
 
-def restored(node: Node, data: bytes | memoryview, classes: Classes) -> Any:
-    """The value behind :func:`stored`.
+def restored(node: Node, data: bytes | memoryview, classes: Classes, blocks: Sequence[Node] = ()) -> Any:
+    """The value behind :func:`stored`, or behind :meth:`Blocks.stored`.
 
     Args:
         classes: the only ones that may be in it, by :func:`class_name`.
+        blocks: [number, start of its bytes in ``data``, how many, node] of each block it may refer to; blocks
+            refer to earlier ones.
 
     Raises:
         ValueError: it is not one, or one of classes that have changed since.
     """
     try:
-        return _Reader(memoryview(data), classes).value(node)
+        reader = _Reader(memoryview(data), classes)
+        for number, start, length, block in blocks:
+            reader.take_block(number, [start, length], block)
+        return reader.value(node)
     except (
         ArithmeticError,
         AssertionError,
@@ -114,16 +216,19 @@ def restored(node: Node, data: bytes | memoryview, classes: Classes) -> Any:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
-def lay_out(root: object) -> None:
+def lay_out(root: object, done: Container[int] = ()) -> None:
     """Give the arrays in an object the memory layout, and its sets the order, that they are read back with.
 
     How NumPy rounds depends on the layout: only so what was stored and what is read back go on alike, to the
     last bit.
+
+    Args:
+        done: ids of values that need not be looked at.
     """
     known: dict[int, tuple[object, object]] = {}  # the object too, so that its id is not used again
 
     def laid_out(value: object) -> object:
-        if isinstance(value, (*_PLAIN, enum.Enum)):
+        if type(value) in _PLAIN or id(value) in done:
             return value
         if id(value) not in known:
             known[id(value)] = (value, value)
@@ -135,7 +240,9 @@ def lay_out(root: object) -> None:
 
 def _laid_out(value: Any, part: Callable[[Any], Any]) -> Any:
     """A value with its parts laid out, in place where that goes."""
-    if isinstance(value, np.ndarray):
+    cls: Any = type(value)
+    kind = _kind(cls)
+    if kind == "array":
         dense = value.flags.c_contiguous or value.flags.f_contiguous
         return value if dense else np.ascontiguousarray(value)
     if type(value) is tuple:
@@ -145,13 +252,13 @@ def _laid_out(value: Any, part: Callable[[Any], Any]) -> Any:
         ordered = sorted(value, key=repr)
         value.clear()
         value.update(ordered)
-    elif isinstance(value, list | deque):
+    elif kind in ("sequence", "deque"):
         for place, one in enumerate(value):
             value[place] = part(one)
-    elif type(value) is dict:
+    elif kind == "dict":
         for key, one in value.items():
             value[key] = part(one)
-    elif class_name(type(value)).startswith(_PACKAGES):
+    elif kind == "object" and class_name(type(value)).startswith(_PACKAGES):
         attributes = vars(value) if hasattr(value, "__dict__") else {}
         for name, one in _state(value).items():
             # What is stored otherwise than it is kept is made anew when it is read.
@@ -166,45 +273,62 @@ def class_name(cls: type) -> str:
 
 
 class _Writer:
-    def __init__(self, classes: Classes | None) -> None:
+    def __init__(self, classes: Classes | None, blocks: Blocks | None = None) -> None:
         self.parts: list[bytes] = []
-        self._classes = classes
+        self.referred: set[int] = set()
+        self._classes, self._blocks = classes, blocks
         self._end = 0
         self._known: dict[int, tuple[int, object]] = {}  # the object too, so that its id is not used again
 
-    def node(self, value: object) -> Node:
-        if type(value) is float and not math.isfinite(value):
-            return ["float", repr(value)]
-        if type(value) in _PLAIN:
-            return value
-        if isinstance(value, enum.Enum):
-            return ["enum", self._name(type(value)), value.value]
-        if isinstance(value, np.generic):
+    def node(self, value: Any) -> Node:
+        cls: Any = type(value)
+        if cls in _PLAIN:
+            return ["float", repr(value)] if cls is float and not math.isfinite(value) else value
+        kind = _kind(cls)
+        if kind == "enum":
+            return ["enum", self._name(cls), value.value]
+        if kind == "scalar":
             return ["scalar", value.dtype.str, self._bytes(value.tobytes())]
-        if id(value) in self._known:
-            return ["same", self._known[id(value)][0]]
+        known = self._known.get(id(value))
+        if known is not None:
+            return ["same", known[0]]
+        if self._blocks is not None and getattr(cls, "stored_apart", False):
+            block = self._blocks.number(value)
+            self.referred.add(block)
+            return ["block", block]
         number = len(self._known)
-        self._known[id(value)] = (number, value)
-        return [*self._parts_of(value), number]
+        return [*self.parts_of(value), number]
 
-    def _parts_of(self, value: object) -> list[Node]:
-        if isinstance(value, np.ndarray):
-            return self._array(value)
-        if isinstance(value, PackedArray):
-            return ["array", "|u1", list(value.shape), "C", True, self._bytes(value.data)]
-        if isinstance(value, set | frozenset):
-            # In an order that does not depend on how it came to be.
-            return [type(value).__name__, [self.node(one) for one in sorted(value, key=repr)]]
-        if isinstance(value, _SEQUENCES) and type(value) in _SEQUENCES:
-            return [type(value).__name__, [self.node(one) for one in value]]
-        if isinstance(value, deque):
-            return ["deque", [self.node(one) for one in value], value.maxlen]
-        if type(value) is dict:
-            return ["dict", [[self.node(key), self.node(one)] for key, one in value.items()]]
-        if isinstance(value, gtsam.Pose3):
-            return ["pose", self.node(np.asarray(value.matrix()))]
-        if isinstance(value, cKDTree):
-            return ["tree", self.node(np.asarray(value.data))]
+    def parts_of(self, value: object) -> list[Node]:
+        """A value's node but for its number, the next one."""
+        self._known[id(value)] = (len(self._known), value)
+        cls: Any = type(value)
+        parts: list[Node] = getattr(self, f"_{_kind(cls)}")(value)
+        return parts
+
+    def _packed(self, value: PackedArray) -> list[Node]:
+        return ["array", "|u1", list(value.shape), "C", True, self._bytes(value.data)]
+
+    def _set(self, value: set[Any] | frozenset[Any]) -> list[Node]:
+        # In an order that does not depend on how it came to be.
+        return [type(value).__name__, [self.node(one) for one in sorted(value, key=repr)]]
+
+    def _sequence(self, value: list[Any] | tuple[Any, ...]) -> list[Node]:
+        return [type(value).__name__, [self.node(one) for one in value]]
+
+    def _deque(self, value: deque[Any]) -> list[Node]:
+        return ["deque", [self.node(one) for one in value], value.maxlen]
+
+    def _dict(self, value: dict[Any, Any]) -> list[Node]:
+        return ["dict", [[self.node(key), self.node(one)] for key, one in value.items()]]
+
+    def _pose(self, value: gtsam.Pose3) -> list[Node]:
+        return ["pose", self.node(np.asarray(value.matrix()))]
+
+    def _tree(self, value: cKDTree) -> list[Node]:
+        return ["tree", self.node(np.asarray(value.data))]
+
+    def _object(self, value: object) -> list[Node]:
         return ["object", self._name(type(value)), self.node(_state(value))]
 
     def _name(self, cls: type) -> str:
@@ -233,9 +357,11 @@ class _Reader:
         self._data = data
         self._classes = classes
         self._known: dict[int, Any] = {}
+        self._blocks: dict[int, Any] = {}
         self._array_bytes = 0
         self._readers: dict[str, Callable[..., Any]] = {
             "same": self._same,
+            "block": self._block,
             "enum": self._enum,
             "float": self._float,
             "scalar": self._scalar,
@@ -259,6 +385,17 @@ class _Reader:
         if not node or not isinstance(node[0], str) or node[0] not in self._readers:
             raise ValueError(f"an unknown tag {node[:1]!r:.60}")
         return self._readers[node[0]](*node[1:])
+
+    def take_block(self, number: int, place: list[int], node: Node) -> None:
+        """Read a block: its numbers and its bytes are its own."""
+        if type(number) is not int or number in self._blocks:
+            raise ValueError(f"the block {number!r:.60} twice, or none")
+        whole, self._data = self._data, self._bytes(place)
+        self._blocks[number] = self.value(node)
+        self._data, self._known = whole, {}
+
+    def _block(self, number: int) -> Any:
+        return self._blocks[number]
 
     def _keep(self, number: int, value: _Kept) -> _Kept:
         if type(number) is not int or number in self._known:
@@ -405,13 +542,20 @@ def _check_dataclass(value: Any, name: str) -> None:
         check(value)
 
 
+@cache
+def _fields(cls: Any) -> tuple[str, ...]:
+    """Names of a dataclass's fields."""
+    return tuple(field.name for field in dataclasses.fields(cls))
+
+
 def _state(value: object) -> Mapping[str, Any]:
     """Attributes of an object, without what it computed from them."""
     if type(value).__getstate__ is not object.__getstate__:
         state: Mapping[str, Any] = value.__getstate__()  # type: ignore[assignment]
         return state
     if dataclasses.is_dataclass(value):
-        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        cls: Any = type(value)
+        return {name: getattr(value, name) for name in _fields(cls)}
     return {
         name: one
         for name, one in vars(value).items()

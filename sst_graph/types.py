@@ -10,7 +10,7 @@ from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import gtsam
 import numpy as np
@@ -191,6 +191,8 @@ class RelativeMotion(ByValue):
         covariance: (6, 6) of aTb, [rot rad, trans m], right perturbation.
         ok: False where no motion could be estimated (aTb is then a prediction, covariance is large).
     """
+
+    stored_apart: ClassVar[bool] = True
 
     from_ns: int
     to_ns: int

@@ -13,7 +13,7 @@ from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError
-from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.estimators.checkpoint import Saver, load_checkpoint
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.resume import Setup, check_setup, frames_to_come
 from sst_graph.estimators.track_update import TrackUpdate
@@ -58,28 +58,37 @@ def _track(
     broken off and resumed or not.
     """
     update = None
-    for number, (frame, is_last) in enumerate(_with_last(frames), 1):
-        update = tracker.add(frame)
-        if args.checkpoint is not None:
-            tracker.make_ready()
-            if is_last or number % args.checkpoint_every == 0:
-                save_checkpoint(tracker, args.checkpoint)
-        if is_last:
-            tracker, update = _settled(args, source, tracker, update)
-        say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
-    if update is not None:
-        return tracker, update
-    # A save consolidates the tracker: what is saved already is not saved again.
-    if args.checkpoint is not None and not args.checkpoint.exists():
-        save_checkpoint(tracker, args.checkpoint)
-    return _settled(args, source, tracker, None)
+    with ExitStack() as outputs:
+        saver = None if args.checkpoint is None else outputs.enter_context(Saver(args.checkpoint))
+        if saver is not None:
+            saver.follow(tracker)
+        for number, (frame, is_last) in enumerate(_with_last(frames), 1):
+            update = tracker.add(frame)
+            if saver is not None:
+                saver.follow(tracker)
+                if is_last or number % args.checkpoint_every == 0:
+                    saver.save(tracker)
+            if is_last:
+                tracker, update = _settled(args, source, tracker, update, saver)
+            say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
+        if update is not None:
+            return tracker, update
+        # A save consolidates the tracker: what is saved already is not saved again.
+        if saver is not None and not args.checkpoint.exists():
+            saver.save(tracker)
+        return _settled(args, source, tracker, None, saver)
 
 
 def _settled(
-    args: argparse.Namespace, source: SweptSource, tracker: Tracker, update: TrackUpdate | None
+    args: argparse.Namespace,
+    source: SweptSource,
+    tracker: Tracker,
+    update: TrackUpdate | None,
+    saver: Saver | None,
 ) -> tuple[Tracker, TrackUpdate]:
     """The tracker that is saved, or the one given where none is, settled; and the last answer from it."""
-    if args.checkpoint is not None:
+    if saver is not None:
+        saver.finish()
         tracker = load_checkpoint(args.checkpoint)
     tracker.settle()
     last = tracker.current(update)

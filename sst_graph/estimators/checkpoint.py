@@ -16,9 +16,10 @@ import re
 import warnings
 import zipfile
 import zlib
-from functools import cache
+from collections.abc import Generator, Iterator, Sequence
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -26,13 +27,13 @@ from sst_graph.checked import checked_camera
 from sst_graph.errors import CheckpointError, DataError
 from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.resume import Setup, check_memory, check_setup
-from sst_graph.files import atomic_write_bytes
+from sst_graph.files import atomic_write_in_steps
 from sst_graph.input_files import FileKind, parse_json, read_file
-from sst_graph.storage import class_name, restored, stored
+from sst_graph.storage import Blocks, class_name, restored, stored
 from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
-VERSION = 17
+VERSION = 18
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -44,6 +45,8 @@ _NPY_HEADER = re.compile(
 """How NumPy begins the file of an array of bytes; its own reader evaluates more than that."""
 
 _MEMBERS = ("head", "data", "sha256")
+_STEP_BYTES = 8 * 1024 * 1024
+"""Are summed up, or written, in a step: some milliseconds."""
 _MAX_DEPTH = 200
 """Levels of a checkpoint's JSON; a tracker's has about forty."""
 
@@ -62,6 +65,73 @@ _PACKAGES = (
 """Where the classes are defined that a tracker is made of."""
 
 
+class Saver:
+    """Saves one tracker under one name, so that no frame takes long for it.
+
+    What a tracker keeps of a scan, an image or a pair never changes: it is stored once, with the frame that
+    brought it (:meth:`follow`). A save stores the rest; then the file is written, some with each frame. It
+    takes its name in one step, so that a kill at any moment leaves the former one whole, or the new one.
+
+    As a context it finishes where the block ends well, and leaves the former file where it does not.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = path
+        self._blocks = Blocks(checkpoint_classes())
+        self._writing: Generator[None] | None = None
+
+    def __enter__(self) -> Saver:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.finish()
+        elif self._writing is not None:
+            self._writing.close()
+
+    def follow(self, tracker: Tracker) -> None:
+        """After each frame: store what it brought, and write some of what was saved.
+
+        Raises:
+            OSError: it cannot be written; what stood there is untouched.
+        """
+        for value in _lasting(tracker):
+            self._blocks.number(value)
+        if self._writing is not None:
+            next(self._writing, None)
+
+    def save(self, tracker: Tracker) -> None:
+        """Save a tracker as it is; the file is there after :meth:`finish`, or some frames later.
+
+        The tracker is consolidated first (:meth:`Tracker.consolidate`), so that it and the one that is read
+        back go on to the same estimates.
+
+        Raises:
+            OSError: an earlier one cannot be written; what stood there is untouched.
+        """
+        self.finish()
+        tracker.consolidate(self._blocks)
+        node, rest, blocks = self._blocks.stored(tracker)
+        parts = [rest, *(block.data for block in blocks)]
+        places, start = [], len(rest)
+        for block in blocks:
+            places.append(f"[{block.number}, {start}, {len(block.data)}, {block.text}]")
+            start += len(block.data)
+        document = {"format": FORMAT, "version": VERSION, "tracker": node}
+        text = json.dumps(document, allow_nan=False)
+        head = f'{text[:-1]}, "blocks": [{", ".join(places)}]}}'.encode("ascii")
+        self._writing = atomic_write_in_steps(self._path, partial(_filling, head, parts))
+
+    def finish(self) -> None:
+        """Write all that is left to write.
+
+        Raises:
+            OSError: it cannot be written; what stood there is untouched.
+        """
+        for _ in self._writing or ():
+            pass
+
+
 def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
     """Write a tracker; a file that exists is replaced in one step.
 
@@ -71,14 +141,49 @@ def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
     Raises:
         OSError: it cannot be written; what stood there is untouched.
     """
-    tracker.consolidate()
-    node, data = stored(tracker, checkpoint_classes())
-    document = {"format": FORMAT, "version": VERSION, "tracker": node}
-    head = json.dumps(document, allow_nan=False).encode("ascii")
-    parts = {"head": head, "data": data, "sha256": _digest(head, data)}
-    stream = io.BytesIO()
-    np.savez(stream, **{name: np.frombuffer(part, np.uint8) for name, part in parts.items()})  # type: ignore[arg-type]
-    atomic_write_bytes(path, stream.getvalue())
+    with Saver(path) as saver:
+        saver.save(tracker)
+
+
+def _lasting(tracker: Tracker) -> Iterator[object]:
+    """What never changes of what a tracker holds, most of it; the rest of that is small."""
+    yield from (features for _, features in tracker.window.scans)
+    yield from tracker.window.images
+    if tracker.smoother is not None:
+        yield from tracker.smoother.entries.values()
+
+
+def _filling(head: bytes, parts: Sequence[bytes], stream: BinaryIO) -> Iterator[None]:
+    """Write JSON and bytes as :func:`numpy.savez` does, with their checksum, some with each step."""
+    sizes, digest = (len(head), sum(map(len, parts))), hashlib.sha256(len(head).to_bytes(8, "little"))
+    for portion in _portions([head, *parts]):
+        for part in portion:
+            digest.update(part)
+        yield
+    contents: list[tuple[int, Sequence[bytes]]] = [
+        (sizes[0], [head]),
+        (sizes[1], parts),
+        (digest.digest_size, [digest.digest()]),
+    ]
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, (size, content) in zip(_MEMBERS, contents, strict=True):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                array = {"descr": "|u1", "fortran_order": False, "shape": (size,)}
+                np.lib.format.write_array_header_1_0(member, array)
+                for portion in _portions(content):
+                    member.writelines(portion)
+                    yield
+
+
+def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:
+    """The parts, in order, some megabytes at a time."""
+    portion: list[bytes] = []
+    for part in parts:
+        portion.append(part)
+        if sum(map(len, portion)) >= _STEP_BYTES:
+            yield portion
+            portion = []
+    yield portion
 
 
 def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
@@ -109,17 +214,18 @@ def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     # Numbers of a forged file overflow where those of a tracker do not: no warning of NumPy's is ours.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        _rehearse(_tracker(document.get("tracker"), data, path), path)
-        tracker = _tracker(document.get("tracker"), data, path)
+        _rehearse(_tracker(document, data, path), path)
+        tracker = _tracker(document, data, path)
         tracker.starting.catch_up()
     if setup is not None:
         check_setup(tracker, setup, path)
     return tracker
 
 
-def _tracker(node: Any, data: memoryview, path: str | Path) -> Tracker:
+def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tracker:
     try:
-        tracker = restored(node, data, checkpoint_classes())
+        blocks = document.get("blocks", [])
+        tracker = restored(document.get("tracker"), data, checkpoint_classes(), blocks)
     except ValueError as error:
         raise CheckpointError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
     if not isinstance(tracker, Tracker):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,8 @@ class Entry:
         other: what the scan says with its other image.
         left_out: objects that were judged to move, with the tenths of their weight that they lost.
     """
+
+    stored_apart: ClassVar[bool] = True
 
     pair: PairMatches
     score: PairScore

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import Any
 
@@ -199,20 +199,18 @@ class Tracker(Tracking):
         beside = self.considered().covariance(7)
         return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
 
-    def consolidate(self) -> None:
+    def consolidate(self, laid_out: Container[int] = ()) -> None:
         """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
 
         The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
+
+        Args:
+            laid_out: ids of values that have their memory layout already.
         """
-        lay_out(self)
+        lay_out(self, laid_out)
         self.odometry.rebuild_map()
         if self.smoother is not None:
             self.smoother.relinearize()
-
-    def make_ready(self) -> None:
-        """Pack what the newest frame brought, so that saving a checkpoint takes no longer than a frame."""
-        if self.window.images:
-            _ = self.window.images[-1].packed
 
     def settle(self, most: int = 20) -> bool:
         """Solve the whole window again as the batch does, as at the end of a drive.

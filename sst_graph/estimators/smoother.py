@@ -203,7 +203,18 @@ class WindowSmoother:
 
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
-        self._go_on_with(*self._linearized(self.isam.calculateEstimate()))
+        values = self.isam.calculateEstimate()
+        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
+        self._go_on_with(isam, list(isam.update(self._held(), values).getNewFactorsIndices()))
+
+    def _held(self) -> gtsam.NonlinearFactorGraph:
+        """As :meth:`_whole`, the very factors that iSAM2 holds."""
+        links = [link for epoch in self._epochs for link in epoch.links or ()]
+        twists = [twist.index for twist in self.twists.values()]
+        held, graph = self.isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for index in [self.past_id, *links, *self.ids.values(), *twists]:
+            graph.add(held.at(index))
+        return graph
 
     def _whole(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the window: the past, the walks, the pairs, the twists."""

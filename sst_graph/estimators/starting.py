@@ -164,10 +164,9 @@ class Starting:
     def _search(self, window: Window) -> Search:
         """Over the latest scans, no more than twice as many as are needed: a step's work grows with them."""
         drive, _ = window.drive()
-        if self.config.start_work > 0:
-            scans = drive.scans[-2 * self.needed :]
-            motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
-            drive = replace(drive, scans=scans, lidar_motions=motions)
+        scans = drive.scans[-2 * self.needed :]
+        motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
+        drive = replace(drive, scans=scans, lidar_motions=motions)
         return Search(drive, self.guess, self.config)
 
     def _started(self, matcher: WindowMatcher, point: Point) -> Started:

@@ -151,6 +151,11 @@ class TrackerConfig(Settings):
     alarm: AlarmConfig = field(default_factory=AlarmConfig)
     adoption: AdoptionConfig = field(default_factory=AdoptionConfig)
 
+    @property
+    def searched_scans(self) -> int:
+        """Latest scans of the window that a start may be made of: half of it, or twice what a start needs."""
+        return max(2 * self.start_scans, 2 * self.restart_scans, self.window // 2)
+
     def __post_init__(self) -> None:
         scans = max(self.start_scans, self.restart_scans)
         self.expect_at_least("window", scans, "start_scans and restart_scans")

@@ -56,7 +56,7 @@ class Tracking:
         self.config = config = dataclasses.replace(config, calibration=config.calibration.estimating)
         calibration = self.config.calibration
         self.classes = calibration.classes
-        self.window = Window(camera, self.config.window)
+        self.window = Window(camera, config.window, config.searched_scans)
         self.matcher = WindowMatcher(self.window, self.config)
         self.odometry = LidarOdometry(calibration.prepare.lidar_odometry)
         self.last_scan: Scan | None = None

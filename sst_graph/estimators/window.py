@@ -64,6 +64,7 @@ class Window:
 
     Attributes:
         size: most scans, but while nothing may leave.
+        sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
         held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         sightings: the latest ones of each track, in the order of time.
@@ -76,9 +77,10 @@ class Window:
         origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
 
-    def __init__(self, camera: PinholeCamera, scans: int) -> None:
+    def __init__(self, camera: PinholeCamera, scans: int, sampled: int | None = None) -> None:
         self.camera = camera
         self.size = scans
+        self.sampled = scans if sampled is None else sampled
         self.objects = ObjectTracker(memory=OBJECT_MEMORY)
         self.next_scan = 0
         self.next_image = 0
@@ -145,6 +147,7 @@ class Window:
             features, depth_lPs=features.depth_lPs[:0], depth_offsets_s=features.depth_offsets_s[:0]
         )
         self.scans.append((number, lean))
+        self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self._judge(number, features.stamp_ns)
         self.persistence.forget(self.first_scan)
@@ -156,6 +159,19 @@ class Window:
                 del by_scan[old]
         self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
         return number
+
+    def _thin_out(self) -> None:
+        """Drop the sample of the scan that has just ceased to be among the latest; it is most of a scan."""
+        if len(self.scans) > self.sampled:
+            number, scan = self.scans[-1 - self.sampled]
+            # Copies, for a part of an array keeps all of it.
+            thin = dataclasses.replace(
+                scan,
+                lPs=scan.lPs[:0].copy(),
+                classes=scan.classes[:0].copy(),
+                offsets_s=scan.offsets_s[:0].copy(),
+            )
+            self.scans[-1 - self.sampled] = (number, thin)
 
     def _judge(self, number: int, stamp_ns: int) -> None:
         """Which objects of the latest scans move: as the batch judges, from the sightings so far."""

@@ -23,6 +23,7 @@ from sst_graph.files.output import (
     OutputFile,
     atomic_directory,
     atomic_write_bytes,
+    atomic_write_in_steps,
     atomic_write_text,
     output_file,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "abandon_all",
     "atomic_directory",
     "atomic_write_bytes",
+    "atomic_write_in_steps",
     "atomic_write_text",
     "check_file_target",
     "check_folder_target",

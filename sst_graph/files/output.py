@@ -8,9 +8,11 @@ import functools
 import itertools
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 from sst_graph.errors import ConfigError
 from sst_graph.files import staging
@@ -20,6 +22,9 @@ from sst_graph.files.targets import TEXT, FileKind, check_file_target, check_fol
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 """What a file system without hard links answers."""
+
+_PATIENCE = 50
+"""Steps that go by while the disk takes in what was written."""
 
 
 def atomic_write_bytes(path: str | Path, data: bytes) -> None:
@@ -32,6 +37,35 @@ def atomic_write_bytes(path: str | Path, data: bytes) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     with staging.temporary(target) as partial, _named(target, partial):
         _write_through(partial, data)
+        os.replace(partial, target)
+        _sync_folder(target.parent)
+
+
+def atomic_write_in_steps(path: str | Path, fill: Callable[[BinaryIO], Iterator[None]]) -> Generator[None]:
+    """As :func:`atomic_write_bytes`, some with each step; the disk takes it in aside.
+
+    While the disk has not taken it in, further steps do nothing, up to a number of them; then one waits. What
+    is not done to its end (or closed on the way) leaves what stood there.
+
+    Args:
+        fill: writes all of it, some with each step.
+
+    Raises:
+        OSError: the file cannot be written; what stood there is untouched.
+    """
+    target = real_path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with staging.temporary(target) as partial, _named(target, partial):
+        with open(partial, "xb") as stream, ThreadPoolExecutor(1) as aside:
+            staging.lock_file(stream.fileno())
+            yield from fill(stream)
+            stream.flush()
+            flushed = aside.submit(os.fsync, stream.fileno())
+            for _ in range(_PATIENCE):
+                yield
+                if flushed.done():
+                    break
+            flushed.result()
         os.replace(partial, target)
         _sync_folder(target.parent)
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -106,6 +107,8 @@ class _Step:
         gain: (6, r, 4, 4) of the smoother (Rauch, Tung, Striebel) from here to the motion before.
         squares, log_sizes: (6, r) sums so far of squared, whitened innovations, and of their log variances.
     """
+
+    stored_apart: ClassVar[bool] = True
 
     mean: FloatArray
     covariance: FloatArray

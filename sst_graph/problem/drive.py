@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,6 +70,8 @@ class ScanFeatures:
         undersides: boundary points of each class towards the ground, of objects that have others too.
     """
 
+    stored_apart: ClassVar[bool] = True
+
     index: int
     stamp_ns: int
     boundaries: dict[SemanticClass, Boundaries]
@@ -87,6 +89,8 @@ class ImageFeatures:
 
     Of the picture no more is kept than what it shows along the contours.
     """
+
+    stored_apart: ClassVar[bool] = True
 
     index: int
     stamp_ns: int

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import gtsam
 import numpy as np
@@ -211,6 +212,8 @@ class Velocities:
 @dataclass(frozen=True)
 class _Seen:
     """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects."""
+
+    stored_apart: ClassVar[bool] = True
 
     stamp_ns: int
     wTl: gtsam.Pose3

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.checked import MAX_SIGMA
+from sst_graph.errors import printable
 from sst_graph.result import CalibrationResult
 from sst_graph.uncertainty.assumptions import BUDGET
 
@@ -28,7 +30,7 @@ def budget_lines(result: CalibrationResult) -> list[str]:
         if name in ASSUMPTIONS and (sigmas**2 < _LEAST_SHARE * total).all():
             continue
         rotation, translation = np.degrees(sigmas[:3].max()), 100.0 * sigmas[3:6].max()
-        label = name if name not in ASSUMPTIONS else _label(name, result)
+        label = printable(name) if name not in ASSUMPTIONS else _label(name, result)
         lines.append(f"  {label:<44}{rotation:>7.3f} deg {translation:>8.2f} cm {1e3 * sigmas[6]:>9.2f} ms")
     return lines
 
@@ -39,7 +41,7 @@ def estimated_lines(result: CalibrationResult) -> list[str]:
     lines = []
     for name, entry in stored.items() if isinstance(stored, dict) else ():
         values = [entry.get(key) for key in ("value", "sigma")] if isinstance(entry, dict) else [None]
-        if name in ASSUMPTIONS and all(isinstance(v, float) and np.isfinite(v) for v in values):
+        if name in ASSUMPTIONS and all(_is_number(v) for v in values):
             lines.append(ASSUMPTIONS[name].figure(*values))
     return lines
 
@@ -57,7 +59,11 @@ def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
 
 
 def _is_sigma(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0.0 <= value < np.inf
+    return _is_number(value) and value >= 0.0
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
 
 
 def _label(name: str, result: CalibrationResult) -> str:

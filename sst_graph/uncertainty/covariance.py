@@ -21,7 +21,7 @@ see :mod:`sst_graph.uncertainty.object_spread`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -82,6 +82,11 @@ class MatchTable:
         )
         rest = self.root_weights[index], self.curvatures[index], self.r[index]
         return MatchTable(self.J[index], *rest, sides, side_frames, objects, self.views)
+
+    def moved(self, step: FloatArray) -> MatchTable:
+        """The matches after a step (n,) of the unknowns, their robust weights as they are."""
+        roots = np.maximum(self.root_weights, 1e-6)
+        return replace(self, r=np.where(self.root_weights > 1e-6, self.r + self.J @ step / roots, self.r))
 
     @property
     def flatness(self) -> float:

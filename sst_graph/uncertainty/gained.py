@@ -14,10 +14,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.errors import DataError
+from sst_graph.errors import DataError, printable
 from sst_graph.problem.hand_eye import HandEyePriors, HandEyeTerm, state_values
 from sst_graph.problem.state import State
 from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.uncertainty.frame_information import MAX_NUMBER
 
 FloatArray = NDArray[np.float64]
 
@@ -100,7 +101,7 @@ def gained_of(result: CalibrationResult) -> Gained | None:
         columns = zip(document["drive"], document["frame"], document["bits"], document["values"], strict=True)
         gains = tuple(
             Gain(
-                FrameId(str(drive), int(frame)),
+                FrameId(printable(drive), int(frame)),
                 None if bits is None else float(bits),
                 np.array(values, dtype=np.float64).reshape(7),
             )
@@ -108,8 +109,9 @@ def gained_of(result: CalibrationResult) -> Gained | None:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(place, f"no such columns ({error})", "drive, frame, bits, values (7)") from None
-    if not all(np.isfinite(gain.values).all() and np.isfinite(gain.bits or 0.0) for gain in gains):
-        raise DataError(place, "a value that is not finite", "finite numbers")
+    if not all((np.abs([*gain.values, gain.bits or 0.0]) <= MAX_NUMBER).all() for gain in gains):
+        expected = f"finite numbers of at most {MAX_NUMBER:g}"
+        raise DataError(place, "a value that is not finite, or huge", expected)
     return Gained(document["kind"], gains)
 
 

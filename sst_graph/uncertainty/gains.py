@@ -2,7 +2,9 @@
 
 Without a frame, the covariance is made anew from all other matches as
 :mod:`sst_graph.uncertainty.covariance` makes it: information, error model, and the objects left out in turn.
-Matches and estimate stay as they are.
+The matches and their robust weights stay as they are; the estimate takes the Gauss-Newton step to the optimum
+of the other frames, and the residuals follow. Without that step, the left-out frame's pull would stay in the
+residuals, and the spread over objects would take it for their disagreement.
 
 The covariance of the frames up to one, and of one by itself, is a sandwich under the error model of all: H
 sums the frames' information with the motion marginalised out, the surplus their scores; sides that several
@@ -38,20 +40,33 @@ IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
+class FrameTerm:
+    """What the factors of one frame say, its motion marginalised out.
+
+    Attributes:
+        columns: (c,) unknowns that it tells something about.
+        information: (c, c) H of its quadratic 1/2 d' H d - g' d.
+        pull: (c,) g.
+    """
+
+    columns: IntArray
+    information: FloatArray
+    pull: FloatArray
+
+
+@dataclass(frozen=True)
 class FramePart:
     """One frame's part in the sums behind the covariance.
 
     Attributes:
-        columns: (c,) unknowns that it tells something about.
-        information: (c, c) its information, motion marginalised out.
+        term: what its factors say.
         surplus: (c, c) variance of its score beyond that of independent matches, without what sides share
             over frames.
         sides: (s,) sides it sees.
         scores: (s, c) score of each side for a unit of the side's error.
     """
 
-    columns: IntArray
-    information: FloatArray
+    term: FrameTerm
     surplus: FloatArray
     sides: IntArray
     scores: FloatArray
@@ -75,10 +90,11 @@ class Sums:
 
     def add(self, part: FramePart, sign: float = 1.0) -> None:
         """Take a frame in, or out with ``sign`` -1."""
-        block = np.ix_(part.columns, part.columns)
-        self.information[block] += sign * part.information
+        columns = part.term.columns
+        block = np.ix_(columns, columns)
+        self.information[block] += sign * part.term.information
         self.surplus[block] += sign * part.surplus
-        self.scores[np.ix_(part.sides, part.columns)] += sign * part.scores
+        self.scores[np.ix_(part.sides, columns)] += sign * part.scores
 
     def covariance(self, columns: IntArray) -> FloatArray:
         """Cluster-robust covariance of some of the unknowns."""
@@ -103,7 +119,7 @@ def frame_gains(
     unknowns, table, model = robust.unknowns, robust.table, robust.model
     prior, twisted = _frame_information(graph, values, unknowns)
     groups = _groups(pairs)
-    parts = [_part(table, rows, *twisted[key], model) for key, (_, rows) in groups.items()]
+    parts = [_part(table, rows, twisted[key], model) for key, (_, rows) in groups.items()]
     sums = Sums(
         prior.copy(), np.zeros_like(prior), np.zeros((int(table.sides.max()) + 1, len(prior))), model.side
     )
@@ -118,7 +134,7 @@ def frame_gains(
     for (pair, rows), part, own, seen in zip(groups.values(), parts, columns, before, strict=True):
         full, without = (
             robust.matrix[np.ix_(own, own)],
-            _left_out(robust, sums, part, rows, moving)[np.ix_(own, own)],
+            _left_out(robust, sums, part.term, rows, moving)[np.ix_(own, own)],
         )
         view = _view(part, prior_covariance, int(own[6]), model.side)
         so_far = np.diag(seen) / np.diag(sums.covariance(own))
@@ -127,23 +143,24 @@ def frame_gains(
 
 
 def _left_out(
-    robust: RobustCovariance, sums: Sums, part: FramePart, rows: IntArray, moving: NDArray[np.bool_]
+    robust: RobustCovariance, sums: Sums, term: FrameTerm, rows: IntArray, moving: NDArray[np.bool_]
 ) -> FloatArray:
-    """(n, n) covariance of a calibration without a frame, its matches as they are.
+    """(n, n) covariance of a calibration without a frame, its matches and their weights as they are.
 
     The whole of it is made anew from the matches that are left, error model and objects left out in turn
     included: a frame that contradicts the others widens both, and leaving it out narrows them. ``moving``:
     (m,) whether the LiDAR moved, for each match.
     """
     information = sums.information.copy()
-    information[np.ix_(part.columns, part.columns)] -= part.information
+    information[np.ix_(term.columns, term.columns)] -= term.information
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     scaled = information * np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
     bread = np.asarray(np.linalg.inv(scaled)) * np.outer(scale, scale)
     kept = np.delete(np.arange(len(robust.table.r)), rows)
     if len(kept) == 0:
         return bread
-    table = robust.table.take(kept)
+    # All pulls sum to nothing at the optimum: those of the others to minus this one's.
+    table = robust.table.take(kept).moved(-bread[:, term.columns] @ term.pull)
     views = views_of(table.sides, table.side_frames, moving[kept], table.root_weights**2)
     table = replace(table, views=views)
     return covariance_of(0.5 * (bread + bread.T), table, fit_error_model(table))
@@ -168,8 +185,8 @@ def _own(unknowns: Unknowns, state: State, pair: PairMatches) -> IntArray:
 
 def _frame_information(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
-) -> tuple[FloatArray, dict[int, tuple[IntArray, FloatArray]]]:
-    """(n, n) information of all that no twist takes part in; of the rest by twist, over its own columns."""
+) -> tuple[FloatArray, dict[int, FrameTerm]]:
+    """(n, n) information of all that no twist takes part in; the rest by twist."""
     n, known = unknowns.size, set(unknowns.keys)
     prior = np.zeros((n, n))
     terms: dict[int, list[tuple[IntArray, FloatArray]]] = {}
@@ -182,7 +199,7 @@ def _frame_information(
             raise ValueError(f"a factor on {len(twists)} twists: frames are no longer separate")
         columns = np.concatenate([_columns(key, unknowns) for key in keys])
         if twists:
-            terms.setdefault(twists[0], []).append((columns, factor.information()))
+            terms.setdefault(twists[0], []).append((columns, factor.augmentedInformation()))
         else:
             prior[np.ix_(columns, columns)] += factor.information()
     return prior, {twist: _marginal(found, n) for twist, found in terms.items()}
@@ -195,29 +212,28 @@ def _columns(key: int, unknowns: Unknowns) -> IntArray:
     return np.arange(first, first + (6 if first == 0 else 1))
 
 
-def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> tuple[IntArray, FloatArray]:
-    """Columns below ``n`` that the terms touch, and their information with the twist marginalised out."""
+def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> FrameTerm:
+    """What augmented information says of the columns below ``n``, with the twist marginalised out."""
     columns = np.unique(np.concatenate([columns for columns, _ in terms]))
-    H = np.zeros((len(columns), len(columns)))
-    for touched, information in terms:
+    H, g = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    for touched, augmented in terms:
         at = np.searchsorted(columns, touched)
-        H[np.ix_(at, at)] += information
+        H[np.ix_(at, at)] += augmented[:-1, :-1]
+        g[at] += augmented[:-1, -1]
     m = int(np.searchsorted(columns, n))
-    return columns[:m], H[:m, :m] - H[:m, m:] @ np.linalg.solve(H[m:, m:], H[m:, :m])
+    response = np.linalg.solve(H[m:, m:], H[m:, :m])
+    return FrameTerm(columns[:m], H[:m, :m] - H[:m, m:] @ response, g[:m] - response.T @ g[m:])
 
 
-def _part(
-    table: MatchTable, rows: IntArray, columns: IntArray, information: FloatArray, model: ErrorModel
-) -> FramePart:
-    J, z = table.J[np.ix_(rows, columns)], table.root_weights[rows]
+def _part(table: MatchTable, rows: IntArray, term: FrameTerm, model: ErrorModel) -> FramePart:
+    J, z = table.J[np.ix_(rows, term.columns)], table.root_weights[rows]
     sides, of_side = np.unique(table.sides[rows], return_inverse=True)
     scores = np.stack([np.bincount(of_side, z * column, len(sides)) for column in J.T], axis=1)
     in_frame = np.unique(table.side_frames[rows], return_inverse=True)[1]
     sums = np.stack([np.bincount(in_frame, z * column) for column in J.T], axis=1)
     surplus = (model.match - 1.0) * (J.T @ J) + model.side_frame * (sums.T @ sums)
     return FramePart(
-        columns,
-        information,
+        term,
         np.asarray(surplus),
         np.asarray(sides, dtype=np.intp),
         np.asarray(scores, dtype=np.float64),
@@ -226,11 +242,11 @@ def _part(
 
 def _view(part: FramePart, prior_covariance: FloatArray, offset: int, side: float) -> FloatArray:
     """(6, 6) information on the extrinsic of one frame alone, the offset known, mask biases estimated."""
-    keep = np.flatnonzero(part.columns != offset)
-    columns = part.columns[keep]
+    keep = np.flatnonzero(part.term.columns != offset)
+    columns = part.term.columns[keep]
     prior = np.linalg.inv(prior_covariance[np.ix_(columns, columns)])
     alone = Sums(
-        prior + part.information[np.ix_(keep, keep)],
+        prior + part.term.information[np.ix_(keep, keep)],
         part.surplus[np.ix_(keep, keep)],
         part.scores[:, keep],
         side,

@@ -3,6 +3,9 @@
 A recorded frame's view (its information on the extrinsic) is combined with any motion: taken at
 twist l_twist it tells the offset through J_offset = -J_extrinsic l_twist. Frames are predicted at other
 places, each with objects and mask biases of its own, so that their information adds up.
+
+What is taken for granted (a focal length, a principal point) errs in every frame alike: the part of the
+covariance that considers it stays, however many frames are added.
 """
 
 from __future__ import annotations
@@ -17,10 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.result import CalibrationResult
-from sst_graph.uncertainty.frame_information import FrameInformation, with_offset
+from sst_graph.uncertainty.frame_information import (
+    MAX_NUMBER,
+    FrameInformation,
+    positive_part,
+    with_offset,
+)
 from sst_graph.uncertainty.observability import ObservabilityConfig, limits_of_unknowns
 
 FloatArray = NDArray[np.float64]
+
+ASSUMPTIONS = "assumptions"
+"""Key among a result's diagnostics of what it takes for granted: by name, deviation and sensitivity."""
 
 AT_REST_MPS = 0.3
 """Below this speed a frame counts as standing [m/s]."""
@@ -127,14 +138,13 @@ class Plan:
 
 def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation], count: int) -> Plan:
     """Predictions for ``count`` further frames; ``frames`` is not empty."""
-    limits = limits_of(result)
-    before = result.covariance
+    limits, lasting = limits_of(result), considered_covariance(result)
     views = np.stack([frame.view for frame in frames])
     proposals = motion_proposals(result.T_camera_lidar, frames, views.mean(axis=0))
     again = Proposal("as in this record", np.mean([frame.information for frame in frames], axis=0))
 
     def predicted(proposal: Proposal, number: int = count, search: bool = True) -> Prediction:
-        return predict(before, proposal, number, limits, search)
+        return predict(result.covariance, proposal, number, limits, search, lasting)
 
     motions = sorted((predicted(p) for p in (*proposals, again)), key=lambda p: (p.worst, -p.bits))
     twists = motion_twists(result.T_camera_lidar, frames)
@@ -149,7 +159,13 @@ def plan_recording(result: CalibrationResult, frames: Sequence[FrameInformation]
     return Plan(
         count,
         predicted(Proposal("now", prior), 0),
-        predict(_vague(), Proposal("the same frames, each at another place", alone), 1, limits),
+        predict(
+            _vague() + lasting,
+            Proposal("the same frames, each at another place", alone),
+            1,
+            limits,
+            lasting=lasting,
+        ),
         tuple(motions),
         predicted(Proposal("the best, with objects half as far", _mean_information(halved, twists[best]))),
         tuple(sorted(by_view, key=lambda view: view.prediction.worst)),
@@ -162,12 +178,14 @@ def predict(
     count: int,
     limits: ObservabilityConfig,
     search: bool = True,
+    lasting: FloatArray | None = None,
 ) -> Prediction:
     """What ``count`` frames of a proposal would make of a covariance (7, 7).
 
-    Without ``search`` the number of frames that is enough stays None.
+    Without ``search`` the number of frames that is enough stays None. ``lasting``: (7, 7) part of the
+    covariance that no frames reduce.
     """
-    after = predicted_covariance(covariance, count * proposal.information)
+    after = predicted_covariance(covariance, count * proposal.information, lasting)
     sigmas = np.sqrt(np.diag(covariance))
     gain = np.linalg.slogdet(_scaled(covariance, sigmas))[1] - np.linalg.slogdet(_scaled(after, sigmas))[1]
     return Prediction(
@@ -175,22 +193,52 @@ def predict(
         np.sqrt(np.maximum(np.diag(after), 0.0)),
         worst_ratio(after, limits),
         max(0.0, 0.5 * float(gain) / float(np.log(2.0))),
-        _enough(covariance, proposal, limits) if search else None,
+        _enough(covariance, proposal, limits, lasting) if search else None,
     )
 
 
-def predicted_covariance(covariance: FloatArray, information: FloatArray) -> FloatArray:
-    """(7, 7) covariance after independent ``information`` (7, 7) is added: (C^-1 + information)^-1.
+def predicted_covariance(
+    covariance: FloatArray, information: FloatArray, lasting: FloatArray | None = None
+) -> FloatArray:
+    """(7, 7) covariance after independent ``information`` (7, 7) is added: ((C - S)^-1 + information)^-1 + S.
 
     As C - C L (I + L' C L)^-1 L' C with information = L L', which needs no inverse of C.
+
+    Args:
+        lasting: S, (7, 7) part of C that no frames reduce; none by default.
     """
+    lasting = np.zeros((7, 7)) if lasting is None else lasting
+    own = positive_part(covariance - lasting) if lasting.any() else covariance
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     L = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    CL = covariance @ L
+    CL = own @ L
     # By least squares: beside a covariance of knowing nothing the unit matrix is lost in rounding.
-    after = covariance - CL @ np.linalg.lstsq(np.eye(len(L)) + L.T @ CL, CL.T)[0]
-    return np.asarray(0.5 * (after + after.T))
+    after = own - CL @ np.linalg.lstsq(np.eye(len(L)) + L.T @ CL, CL.T)[0]
+    return np.asarray(0.5 * (after + after.T) + lasting)
+
+
+def considered_covariance(result: CalibrationResult) -> FloatArray:
+    """(7, 7) part of a result's covariance by what it takes for granted; zeros where it does not tell."""
+    stored = result.diagnostics.get(ASSUMPTIONS)
+    found, variances = np.zeros((7, 7)), np.diag(result.covariance)
+    for entry in stored.values() if isinstance(stored, Mapping) else ():
+        numbers = _numbers(entry)
+        if numbers is not None:
+            step = numbers[0] * numbers[1:]
+            # A part of the covariance is no larger than the whole, whatever a file says.
+            if (step**2 <= variances * (1.0 + 1e-3)).all():
+                found += np.outer(step, step)
+    return found
+
+
+def _numbers(entry: Any) -> FloatArray | None:
+    """(8,) deviation and sensitivities of an assumption in a file; None where they are no such numbers."""
+    try:
+        numbers = np.array([entry["sigma"], *entry["sensitivity"]], dtype=np.float64)
+    except (KeyError, TypeError, ValueError, OverflowError):
+        return None
+    return numbers if numbers.shape == (8,) and (np.abs(numbers) <= MAX_NUMBER).all() else None
 
 
 def worst_ratio(covariance: FloatArray, limits: ObservabilityConfig) -> float:
@@ -276,11 +324,14 @@ def _mean_information(view: FloatArray, twists: FloatArray) -> FloatArray:
     return np.asarray(np.mean([with_offset(view, twist) for twist in twists], axis=0))
 
 
-def _enough(covariance: FloatArray, proposal: Proposal, limits: ObservabilityConfig) -> int | None:
+def _enough(
+    covariance: FloatArray, proposal: Proposal, limits: ObservabilityConfig, lasting: FloatArray | None
+) -> int | None:
     """Fewest frames of a proposal that bring every direction within the limits."""
 
     def ok(count: int) -> bool:
-        return worst_ratio(predicted_covariance(covariance, count * proposal.information), limits) <= 1.0
+        after = predicted_covariance(covariance, count * proposal.information, lasting)
+        return worst_ratio(after, limits) <= 1.0
 
     if ok(0) or not ok(MOST_FRAMES):
         return 0 if ok(0) else None

@@ -11,7 +11,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from test_variables import NAMES, Bench, D, E, X
+from factor_bench import NAMES, Bench, D, E, X
 
 from factors import (
     FactorError,

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from functools import cache
 
+import cv2
 import gtsam
 import numpy as np
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
-from sst_graph.types import SemanticClass
+from sst_graph.types import CameraImage, SemanticClass
 
 TRACKED_STREET = SimulationConfig(
     seed=3,
@@ -69,3 +70,17 @@ def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
     """Mahalanobis distance of a tracker's estimate from a calibration."""
     step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
     return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+
+
+def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
+    """The image of a turned camera; ``border`` says what it shows where it did not look before."""
+    K = street.camera.matrix
+    H = K @ R.matrix() @ np.linalg.inv(K)
+    size = (street.camera.width, street.camera.height)
+    mask = np.asarray(cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, **border), np.uint8)
+    return dataclasses.replace(image, mask=mask)
+
+
+def knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
+    """The image of a camera turned about its vertical axis."""
+    return turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from streets import standing_street
 
 from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.errors import ConfigError
@@ -24,7 +25,6 @@ from sst_graph.experiments.windows import (
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.odometry.sweep import SweepConfig
 from sst_graph.result import CalibrationResult
-from tests.sst_graph.streets import standing_street
 
 
 def drawn_results(template: CalibrationResult, count: int, claimed: float) -> list[CalibrationResult]:

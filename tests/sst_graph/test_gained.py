@@ -116,6 +116,7 @@ def test_where_nothing_can_be_said_it_says_why(method: str) -> None:
         {"kind": "of another kind"},
         {"kind": "as they came", "drive": ["a"], "frame": [1], "bits": [1.0]},
         {"kind": "as they came", "drive": ["a"], "frame": [1], "bits": [1.0], "values": [[1.0, 2.0]]},
+        {"kind": "as they came", "drive": ["a"], "frame": [1], "bits": [1.0], "values": [[1e300] * 7]},
         {"kind": "as they came", "drive": ["a"], "frame": [1, 2], "bits": [1.0], "values": [[1.0] * 7]},
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import gtsam
 import numpy as np
 import pytest
 
@@ -16,6 +17,9 @@ from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import (
     ErrorModel,
+    MatchTable,
+    covariance_of,
+    fit_error_model,
     match_table,
     robust_covariance,
     score_variance,
@@ -43,37 +47,64 @@ def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[Obj
 
 
 @cache
+def optimum(motion: str) -> gtsam.Values:
+    """Of all frames, their matches as they are."""
+    _, state, pairs, _ = matched(motion)
+    exact = gtsam.GaussNewtonParams()
+    exact.setRelativeErrorTol(0.0)
+    exact.setAbsoluteErrorTol(1e-12)
+    return gtsam.GaussNewtonOptimizer(*joint_graph(pairs, state, CONFIG), exact).optimize()
+
+
+@cache
 def gains(motion: str) -> tuple[ErrorModel, tuple[FrameInformation, ...]]:
     drive, state, pairs, objects = matched(motion)
-    graph, values = joint_graph(pairs, state, CONFIG)
-    robust = robust_covariance(graph, values, pairs, state, objects)
-    return robust.model, frame_gains(graph, values, pairs, state, [drive], robust)
+    graph, _ = joint_graph(pairs, state, CONFIG)
+    robust = robust_covariance(graph, optimum(motion), pairs, state, objects)
+    return robust.model, frame_gains(graph, optimum(motion), pairs, state, [drive], robust)
 
 
-def covariance_of(motion: str, positions: list[int]) -> np.ndarray:
-    """(7, 7) covariance of some of the frames, with the error model of all."""
+def frozen(motion: str, positions: list[int]) -> tuple[gtsam.NonlinearFactorGraph, np.ndarray, MatchTable]:
+    """Graph, bread and matches of some of the frames, at the optimum of all."""
     _, state, pairs, objects = matched(motion)
     some = [pairs[k] for k in positions]
-    graph, values = joint_graph(some, state, CONFIG)
+    graph, _ = joint_graph(some, state, CONFIG)
+    values = values_of(motion, graph)
     unknowns = Unknowns.of(state, some)
-    bread = marginal_covariance(graph, values, unknowns)
     table = match_table(graph, values, some, state, objects, unknowns)
+    return graph, marginal_covariance(graph, values, unknowns), table
+
+
+def values_of(motion: str, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
+    """The optimum of all frames, for the unknowns of a graph."""
+    values = gtsam.Values(optimum(motion))
+    for key in set(values.keys()) - set(graph.keyVector()):
+        values.erase(key)
+    return values
+
+
+def covariance_by_model(motion: str, positions: list[int]) -> np.ndarray:
+    """(7, 7) covariance of some of the frames, with the error model of all."""
+    _, bread, table = frozen(motion, positions)
     surplus = score_variance(table, gains(motion)[0]) - table.J.T @ table.J
     return (bread + bread @ surplus @ bread)[:7, :7]
 
 
 def claimed(motion: str, positions: list[int]) -> np.ndarray:
-    """(7, 7) covariance that a calibration from some of the frames claims, at the same estimate."""
-    _, state, pairs, objects = matched(motion)
-    some = [pairs[k] for k in positions]
-    graph, values = joint_graph(some, state, CONFIG)
-    return robust_covariance(graph, values, some, state, objects).matrix[:7, :7]
+    """(7, 7) covariance that a calibration from some of the frames claims at its own optimum, one
+    Gauss-Newton step away."""
+    _, state, pairs, _ = matched(motion)
+    graph, bread, table = frozen(motion, positions)
+    step = graph.linearize(values_of(motion, graph)).optimize()
+    unknowns = Unknowns.of(state, [pairs[k] for k in positions])
+    table = table.moved(np.concatenate([step.at(key) for key in unknowns.keys]))
+    return covariance_of(bread, table, fit_error_model(table))[:7, :7]
 
 
 @pytest.mark.parametrize("motion", ["standing", "constant"])
 def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
     _, frames = gains(motion)
-    covariance = covariance_of(motion, [0, 1, 2])
+    covariance = covariance_by_model(motion, [0, 1, 2])
     sigmas = np.sqrt(np.diag(covariance))
     assert len(frames) == 3
     for k, frame in enumerate(frames):
@@ -81,7 +112,7 @@ def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
         np.testing.assert_allclose(frame.without, np.sqrt(np.diag(rest) / np.diag(whole)), rtol=1e-4)
         bits = 0.5 * (np.linalg.slogdet(rest)[1] - np.linalg.slogdet(whole)[1]) / np.log(2.0)
         assert frame.bits == pytest.approx(bits, abs=1e-3)
-        first = covariance_of(motion, list(range(k + 1)))
+        first = covariance_by_model(motion, list(range(k + 1)))
         np.testing.assert_allclose(frame.so_far, np.sqrt(np.diag(first)) / sigmas, rtol=1e-6)
     np.testing.assert_allclose(frames[-1].so_far, 1.0, rtol=1e-9)
 
@@ -90,7 +121,7 @@ def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
 def test_a_view_is_the_frame_alone(motion: str) -> None:
     for k, frame in enumerate(gains(motion)[1]):
         priors = np.diag(np.repeat([CONFIG.rest_sigma_rad, CONFIG.rest_sigma_m], 3) ** -2.0)
-        alone = covariance_of(motion, [k])
+        alone = covariance_by_model(motion, [k])
         given_offset = np.linalg.inv(np.linalg.inv(alone)[:6, :6])
         found = np.linalg.inv(frame.view + priors)
         ratio = np.sqrt(np.diag(found) / np.diag(given_offset))

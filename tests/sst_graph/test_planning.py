@@ -14,6 +14,7 @@ from sst_graph.uncertainty.frame_information import FrameInformation, with_offse
 from sst_graph.uncertainty.observability import ObservabilityConfig
 from sst_graph.uncertainty.planning import (
     Proposal,
+    considered_covariance,
     driving_axes,
     limits_of,
     motion_twists,
@@ -59,6 +60,40 @@ def at_constant_speed(
         FrameInformation(FrameId("street/00", k), 0.1, ones, ones, view, twist, 80, 4, 6.0, 0.5)
         for k, view in enumerate(views)
     ]
+
+
+def test_what_is_taken_for_granted_stays() -> None:
+    """A principal point that is off is off in every frame: more of them leave its part of the sigma."""
+    result, frames = at_constant_speed()
+    step = np.array([0.0, 2e-3, 0.0, 0.0, 0.0, 0.0, 0.0])
+    entry = {"sigma": 0.5, "sensitivity": (2.0 * step).tolist()}
+    granted = replace(
+        result,
+        covariance=result.covariance + np.outer(step, step),
+        diagnostics={"assumptions": {"cx": entry}},
+    )
+    np.testing.assert_allclose(considered_covariance(granted), np.outer(step, step))
+    plan, without = plan_recording(granted, frames, 1000), plan_recording(result, frames, 1000)
+    for found, free in zip(plan.motions, without.motions, strict=True):
+        np.testing.assert_allclose(found.sigmas**2, free.sigmas**2 + step**2, rtol=1e-6)
+    assert plan.best.sigmas[1] > 2e-3 > 4.0 * without.best.sigmas[1]
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        None,
+        [],
+        {"sigma": 1.0},
+        {"sigma": "1", "sensitivity": [1e-3] * 6},
+        {"sigma": 10**400, "sensitivity": [0.0] * 7},
+        {"sigma": 1.0, "sensitivity": [1e9] * 7},
+        {"sigma": float("nan"), "sensitivity": [0.0] * 7},
+    ],
+)
+def test_an_assumption_that_makes_no_sense_is_none(entry: object) -> None:
+    result, _ = at_constant_speed()
+    assert not considered_covariance(replace(result, diagnostics={"assumptions": {"cx": entry}})).any()
 
 
 def test_information_adds_to_the_inverse() -> None:

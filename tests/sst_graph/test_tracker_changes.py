@@ -6,11 +6,10 @@ import dataclasses
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, sigmas_apart, tracker_from_truth
+from streets import EARLY_START, knocked, sigmas_apart, tracker_from_truth, turned
 
 from sst_graph import Tracker
 from sst_graph.data.simulator import SimulatedDrive
@@ -19,7 +18,7 @@ from sst_graph.estimators.history import HistoryEntry
 from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import AlarmConfig, DriftConfig
 from sst_graph.estimators.tracker_result import tracker_result
-from sst_graph.types import CameraImage, Frame, SemanticClass
+from sst_graph.types import Frame, SemanticClass
 from sst_graph.uncertainty.observability import ObservabilityConfig
 
 STEP = 20
@@ -30,20 +29,6 @@ HELD = 12
 
 BY_LABELS = AlarmConfig(warm_up=4, stamps=False)
 """What the labels alone tell of a clock."""
-
-
-def _turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
-    """The image of a turned camera; ``border`` says what it shows where it did not look before."""
-    K = street.camera.matrix
-    H = K @ R.matrix() @ np.linalg.inv(K)
-    size = (street.camera.width, street.camera.height)
-    mask = np.asarray(cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, **border), np.uint8)
-    return dataclasses.replace(image, mask=mask)
-
-
-def knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
-    """The image of a camera turned about its vertical axis."""
-    return _turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)
 
 
 @pytest.mark.parametrize("kind", ["knock", "clock"])
@@ -156,7 +141,7 @@ def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames
     for frame in frames:
         assert frame.image is not None
         later = frame.index >= STEP
-        image = _turned(frame.image, street, R, borderValue=255) if later else frame.image
+        image = turned(frame.image, street, R, borderValue=255) if later else frame.image
         alarms += [frame.index] if tracker.add(dataclasses.replace(frame, image=image)).alarm else []
     assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
     assert tracker.guess.search and tracker.started

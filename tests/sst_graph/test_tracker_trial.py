@@ -7,8 +7,7 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
-from streets import tracker_from_truth
-from test_tracker_changes import knocked
+from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.data.simulator import SimulatedDrive
