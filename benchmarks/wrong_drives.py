@@ -5,17 +5,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.simulator import SimulatedDrive
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
@@ -23,68 +23,49 @@ BASELINE_M = 0.54
 """Between the two colour cameras of KITTI's rig [m]."""
 
 
-@dataclass(frozen=True)
-class HeldDrive:
-    """A drive in memory (satisfies :class:`sst_graph.types.Source`)."""
-
-    name: str
-    camera: PinholeCamera
-    nominal: gtsam.Pose3 | None
-    truth: GroundTruth | None
-    frames: tuple[Frame, ...]
-
-    @classmethod
-    def of(cls, source: Source) -> HeldDrive:
-        return cls(source.name, source.camera, source.nominal, source.truth, tuple(source))
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, position: int) -> Frame:
-        return self.frames[position]
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
-
-    def with_scans(self, change: Callable[[Scan], Scan]) -> HeldDrive:
-        return replace(self, frames=tuple(_with(f, scan=f.scan and change(f.scan)) for f in self.frames))
-
-    def with_images(self, change: Callable[[CameraImage], CameraImage]) -> HeldDrive:
-        return replace(self, frames=tuple(_with(f, image=f.image and change(f.image)) for f in self.frames))
-
-    def with_points(self, M: FloatArray) -> HeldDrive:
-        """Every point multiplied by M (3, 3)."""
-        return self.with_scans(lambda s: replace(s, points=(s.points @ M.T).astype(np.float32)))
-
-    def with_camera(self, focal: float, scale: float = 1.0, resize: bool = False) -> HeldDrive:
-        """Another focal length; pictures and masks of another size, the camera's size following them."""
-        c = self.camera
-        if not resize:
-            return replace(self, camera=replace(c, fx=focal * c.fx, fy=focal * c.fy))
-        size = (round(c.width * scale), round(c.height * scale))
-        smaller = self.with_images(lambda i: _resized(i, size, pictures=True))
-        return replace(smaller, camera=replace(c, width=size[0], height=size[1]))
-
-    def with_stamps(self, factor: int, divisor: int = 1) -> HeldDrive:
-        later = self.with_scans(lambda s: replace(s, stamp_ns=s.stamp_ns * factor // divisor))
-        return later.with_images(lambda i: replace(i, stamp_ns=i.stamp_ns * factor // divisor))
-
-    def with_images_of(self, others: Sequence[Frame], masks: bool = True, pictures: bool = True) -> HeldDrive:
-        """Images (or only their masks, or pictures) of other frames, at this drive's stamps."""
-        frames = []
-        for frame, other in zip(self.frames, others, strict=False):
-            if frame.image is None or other.image is None:
-                continue
-            image = frame.image
-            if masks:
-                image = replace(image, mask=other.image.mask, instances=other.image.instances)
-            if pictures:
-                image = replace(image, pixels=other.image.pixels)
-            frames.append(replace(frame, image=image))
-        return replace(self, frames=tuple(frames))
+def with_points(drive: KeptDrive, M: FloatArray) -> KeptDrive:
+    """Every point multiplied by M (3, 3)."""
+    return drive.with_scans(lambda s: replace(s, points=(s.points @ M.T).astype(np.float32)))
 
 
-Lie = Callable[[HeldDrive, HeldDrive], HeldDrive]
+def with_camera(drive: KeptDrive, focal: float) -> KeptDrive:
+    """Another focal length."""
+    c = drive.camera
+    return replace(drive, camera=replace(c, fx=focal * c.fx, fy=focal * c.fy))
+
+
+def resized(drive: KeptDrive, scale: float) -> KeptDrive:
+    """Pictures and masks of another size, the camera's size following them, its focal length not."""
+    c = drive.camera
+    size = (round(c.width * scale), round(c.height * scale))
+    smaller = drive.with_images(lambda i: _resized(i, size, pictures=True))
+    return replace(smaller, camera=replace(c, width=size[0], height=size[1]))
+
+
+def with_stamps(drive: KeptDrive, factor: int, divisor: int = 1) -> KeptDrive:
+    """All stamps multiplied by a fraction."""
+    later = drive.with_scans(lambda s: replace(s, stamp_ns=s.stamp_ns * factor // divisor))
+    return later.with_images(lambda i: replace(i, stamp_ns=i.stamp_ns * factor // divisor))
+
+
+def with_images_of(
+    drive: KeptDrive, others: Sequence[Frame], masks: bool = True, pictures: bool = True
+) -> KeptDrive:
+    """Images (or only their masks, or pictures) of other frames, at this drive's stamps."""
+    frames = []
+    for frame, other in zip(drive.frames, others, strict=False):
+        if frame.image is None or other.image is None:
+            continue
+        image = frame.image
+        if masks:
+            image = replace(image, mask=other.image.mask, instances=other.image.instances)
+        if pictures:
+            image = replace(image, pixels=other.image.pixels)
+        frames.append(replace(frame, image=image))
+    return replace(drive, frames=tuple(frames))
+
+
+Lie = Callable[[KeptDrive, KeptDrive], KeptDrive]
 """From a drive, and another one, to the wrong drive; the calibration starts from its nominal pose."""
 
 
@@ -105,7 +86,7 @@ def _mirrored(image: CameraImage) -> CameraImage:
     )
 
 
-def shifted_masks(drive: HeldDrive, du: int, dv: int) -> HeldDrive:
+def shifted_masks(drive: KeptDrive, du: int, dv: int) -> KeptDrive:
     """Masks moved right and down against their pictures by whole pixels [px]."""
 
     def moved(image: CameraImage) -> CameraImage:
@@ -119,12 +100,12 @@ def shifted_masks(drive: HeldDrive, du: int, dv: int) -> HeldDrive:
     return drive.with_images(moved)
 
 
-def _half_masks(drive: HeldDrive) -> HeldDrive:
+def _half_masks(drive: KeptDrive) -> KeptDrive:
     size = (drive.camera.width // 2, drive.camera.height // 2)
     return drive.with_images(lambda image: _resized(image, size, pictures=False))
 
 
-def _background_only(drive: HeldDrive) -> HeldDrive:
+def _background_only(drive: KeptDrive) -> KeptDrive:
     def bare(scan: Scan) -> Scan:
         return replace(scan, classes=np.zeros_like(scan.classes), instances=None)
 
@@ -132,7 +113,7 @@ def _background_only(drive: HeldDrive) -> HeldDrive:
     return empty.with_images(lambda i: replace(i, mask=np.zeros_like(i.mask), instances=None))
 
 
-def _permuted(drive: HeldDrive) -> HeldDrive:
+def _permuted(drive: KeptDrive) -> KeptDrive:
     """Point classes renamed in a circle, as where an id table of another data set is used."""
     table = np.arange(256, dtype=np.uint8)
     named = [int(c) for c in (SemanticClass.VEHICLE, SemanticClass.GROUND, SemanticClass.BUILDING)]
@@ -140,7 +121,7 @@ def _permuted(drive: HeldDrive) -> HeldDrive:
     return drive.with_scans(lambda s: replace(s, classes=table[s.classes], instances=None))
 
 
-def _repeated(drive: HeldDrive, scans: bool) -> HeldDrive:
+def _repeated(drive: KeptDrive, scans: bool) -> KeptDrive:
     """The first scan's, or image's, contents in every frame under the frame's own stamp."""
     first = drive.frames[0]
     if scans:
@@ -152,18 +133,18 @@ def _repeated(drive: HeldDrive, scans: bool) -> HeldDrive:
     return drive.with_images(lambda i: replace(shown, stamp_ns=i.stamp_ns))
 
 
-def _later_images(drive: HeldDrive, frames: int) -> HeldDrive:
+def _later_images(drive: KeptDrive, frames: int) -> KeptDrive:
     """Every image under the number of one before it; the last scans are left without."""
-    kept = drive.with_images_of(drive.frames[frames:]).frames
+    kept = with_images_of(drive, drive.frames[frames:]).frames
     return replace(drive, frames=(*kept, *(_with(f, image=None) for f in drive.frames[len(kept) :])))
 
 
-def _shuffled(drive: HeldDrive) -> HeldDrive:
+def _shuffled(drive: KeptDrive) -> KeptDrive:
     order = np.random.default_rng(5).permutation(len(drive))
-    return drive.with_images_of([drive.frames[i] for i in order], pictures=False)
+    return with_images_of(drive, [drive.frames[i] for i in order], pictures=False)
 
 
-def _nominal(drive: HeldDrive, change: Callable[[gtsam.Pose3], gtsam.Pose3]) -> HeldDrive:
+def _nominal(drive: KeptDrive, change: Callable[[gtsam.Pose3], gtsam.Pose3]) -> KeptDrive:
     assert drive.nominal is not None
     return replace(drive, nominal=change(drive.nominal))
 
@@ -181,33 +162,33 @@ def _in_millimetres(cTl: gtsam.Pose3) -> gtsam.Pose3:
 _CAMERA_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 LIES: dict[str, Lie] = {
-    "half-size images": lambda d, o: d.with_camera(1.0, 0.5, resize=True),
+    "half-size images": lambda d, o: resized(d, 0.5),
     "half-size masks": lambda d, o: _half_masks(d),
-    "stamps in ms": lambda d, o: d.with_stamps(10**3),
-    "stamps in us": lambda d, o: d.with_stamps(10**6),
-    "stamps in ns": lambda d, o: d.with_stamps(10**9),
-    "clouds in mm": lambda d, o: d.with_points(1000.0 * np.eye(3)),
-    "clouds in cm": lambda d, o: d.with_points(100.0 * np.eye(3)),
-    "clouds in feet": lambda d, o: d.with_points(np.eye(3) / 0.3048),
-    "clouds in camera axes": lambda d, o: d.with_points(_CAMERA_AXES),
+    "stamps in ms": lambda d, o: with_stamps(d, 10**3),
+    "stamps in us": lambda d, o: with_stamps(d, 10**6),
+    "stamps in ns": lambda d, o: with_stamps(d, 10**9),
+    "clouds in mm": lambda d, o: with_points(d, 1000.0 * np.eye(3)),
+    "clouds in cm": lambda d, o: with_points(d, 100.0 * np.eye(3)),
+    "clouds in feet": lambda d, o: with_points(d, np.eye(3) / 0.3048),
+    "clouds in camera axes": lambda d, o: with_points(d, _CAMERA_AXES),
     "Tr inverted": lambda d, o: _nominal(d, lambda T: T.inverse()),
     "Tr in mm": lambda d, o: _nominal(d, _in_millimetres),
     "radians as degrees": lambda d, o: _nominal(d, _radians_as_degrees),
-    "x flipped": lambda d, o: d.with_points(np.diag([-1.0, 1.0, 1.0])),
-    "y flipped": lambda d, o: d.with_points(np.diag([1.0, -1.0, 1.0])),
-    "turned by 180 deg": lambda d, o: d.with_points(np.diag([-1.0, -1.0, 1.0])),
-    "upside down": lambda d, o: d.with_points(np.diag([1.0, -1.0, -1.0])),
-    "masks of another drive": lambda d, o: d.with_images_of(o.frames, pictures=False),
-    "images of another drive": lambda d, o: d.with_images_of(o.frames),
+    "x flipped": lambda d, o: with_points(d, np.diag([-1.0, 1.0, 1.0])),
+    "y flipped": lambda d, o: with_points(d, np.diag([1.0, -1.0, 1.0])),
+    "turned by 180 deg": lambda d, o: with_points(d, np.diag([-1.0, -1.0, 1.0])),
+    "upside down": lambda d, o: with_points(d, np.diag([1.0, -1.0, -1.0])),
+    "masks of another drive": lambda d, o: with_images_of(d, o.frames, pictures=False),
+    "images of another drive": lambda d, o: with_images_of(d, o.frames),
     "masks shuffled": lambda d, o: _shuffled(d),
     "images mirrored": lambda d, o: d.with_images(_mirrored),
     "labels permuted": lambda d, o: _permuted(d),
-    "stamps a tenth": lambda d, o: d.with_stamps(1, 10),
-    "stamps tenfold": lambda d, o: d.with_stamps(10),
+    "stamps a tenth": lambda d, o: with_stamps(d, 1, 10),
+    "stamps tenfold": lambda d, o: with_stamps(d, 10),
     "scans repeated": lambda d, o: _repeated(d, scans=True),
     "images repeated": lambda d, o: _repeated(d, scans=False),
-    "half the focal length": lambda d, o: d.with_camera(0.5),
-    "twice the focal length": lambda d, o: d.with_camera(2.0),
+    "half the focal length": lambda d, o: with_camera(d, 0.5),
+    "twice the focal length": lambda d, o: with_camera(d, 2.0),
     "images 15 frames late": lambda d, o: _later_images(d, 15),
     "only background": lambda d, o: _background_only(d),
     "masks shifted 3 px": lambda d, o: shifted_masks(d, 3, 0),
@@ -215,10 +196,10 @@ LIES: dict[str, Lie] = {
 }
 
 
-def right_camera(street: SimulatedDrive) -> HeldDrive:
+def right_camera(street: SimulatedDrive) -> KeptDrive:
     """A street as the right-hand camera of a stereo pair sees it, with the left one's nominal pose."""
     beside = gtsam.Pose3(gtsam.Rot3(), np.array([-BASELINE_M, 0.0, 0.0])) * street.truth.cTl
-    return HeldDrive.of(replace(street, truth=replace(street.truth, cTl=beside)))
+    return KeptDrive.of(replace(street, truth=replace(street.truth, cTl=beside)), sweep="auto")
 
 
 NAMED: dict[str, str] = {

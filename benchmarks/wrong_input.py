@@ -12,9 +12,10 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from wrong_drives import LIES, NAMED, HeldDrive, right_camera
+from wrong_drives import LIES, NAMED, right_camera
 
 from sst_graph import calibrate, open_source
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import SstGraphError
 from sst_graph.metrics import calibration_errors
@@ -22,13 +23,13 @@ from sst_graph.metrics import calibration_errors
 CLEAN, RIGHT = "clean", "right camera"
 
 
-def street(seed: int, right: bool = False) -> HeldDrive:
+def street(seed: int, right: bool = False) -> KeptDrive:
     """A street of a seed, seen by its own camera or by one beside it."""
     made = simulate(SimulationConfig(seed=seed, frames=30, width=621, height=188, azimuth_step_deg=0.3))
-    return right_camera(made) if right else HeldDrive.of(made)
+    return right_camera(made) if right else KeptDrive.of(made, sweep="auto")
 
 
-def row(name: str, drive: HeldDrive) -> tuple[str, bool]:
+def row(name: str, drive: KeptDrive) -> tuple[str, bool]:
     """A line of the table, and whether it is as it should be: a lie named and not ok, clean data silent."""
     try:
         result = calibrate(drive, drive.nominal)
@@ -47,11 +48,11 @@ def row(name: str, drive: HeldDrive) -> tuple[str, bool]:
     return f"{result.status} | {error_text} | {first}", named
 
 
-def drives(args: argparse.Namespace) -> Iterator[tuple[str, HeldDrive, HeldDrive, HeldDrive | None]]:
+def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive, KeptDrive | None]]:
     """Name, drive, another drive of the same size, and the drive by the right camera where it can be had."""
-    other = HeldDrive.of(open_source(args.other)) if args.other else None
+    other = KeptDrive.of(open_source(args.other), sweep="auto") if args.other else None
     for path in args.drive:
-        drive = HeldDrive.of(open_source(path, image_shift=args.image_shift))
+        drive = KeptDrive.of(open_source(path, image_shift=args.image_shift), sweep="auto")
         yield path.name, drive, other or drive, None
     for seed in args.seeds:
         yield str(seed), street(seed), street(seed + 1000), street(seed, right=RIGHT in args.lies)

@@ -35,6 +35,7 @@ LINE_DELAY = Assumption(
     sigma=1e-7,
     source="global shutter; rolling shutters take 1e-5 to 5e-5 s a row",
     span=1e-4,
+    prevalence=0.1,  # of the cameras on vehicles most have a global shutter
     finding="rows of the pictures are exposed one after the other (rolling shutter)",
     remedy="use a camera with a global shutter, or estimate it with --estimate line_delay",
 )

@@ -38,6 +38,7 @@ K1 = Assumption(
     sigma=1e-3,
     source=_SOURCE,
     span=0.3,
+    prevalence=0.5,  # pictures come as they were taken about as often as undistorted
     finding=_FINDING,
     remedy=_REMEDY,
 )

@@ -81,6 +81,8 @@ class Assumption:
         sigma: deviation that a careful set-up leaves: considered in the covariance.
         source: where ``sigma`` comes from.
         span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
+        prevalence: probability beforehand that a set-up breaks the assumption; a judgement: about one camera
+            matrix in fifty belongs to another lens, crop or image size.
         finding: what it means that the data contradict it, for people.
         remedy: what to do about it.
         by_matches: whether the matches test it. They do not test the sweep: at constant speed it looks like a
@@ -95,6 +97,7 @@ class Assumption:
     span: float
     finding: str
     remedy: str
+    prevalence: float = 0.02
     by_matches: bool = True
 
     def figure(self, value: float, sigma: float) -> str:

@@ -1,9 +1,10 @@
 """Do the data contradict what is taken for granted? Each assumption's parameter is let free and looked at.
 
-A score test of all of them comes first: from matches made anew under a kernel wide enough to keep those
-that a wrong assumption has pushed away, one Gauss-Newton step of each parameter with all unknowns free.
-Where it hints at something the whole problem is solved again with that parameter as a variable, from matches
-far away to near ones, and the estimate over its cluster-robust deviation decides (Wald).
+The problem is solved again with the parameters of all assumptions as variables, from matches far away to
+near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
+parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
+others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). Whatever
+seems contradicted is solved once more, alone.
 """
 
 from __future__ import annotations
@@ -18,49 +19,60 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 from scipy.stats import t as student_t
 
-from factors.robust import RobustKernel
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.errors import EstimationError
+from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.graph import Tracks, associate, joint_graph
+from sst_graph.problem.graph import Tracks, state_from
 from sst_graph.problem.objects import ObjectId
 from sst_graph.problem.state import State, nuisance_key
-from sst_graph.uncertainty.assumptions import AssumptionConfig, Considered, columns_of, weighted_columns
-from sst_graph.uncertainty.covariance import RobustCovariance, match_table, robust_covariance
+from sst_graph.uncertainty.assumptions import AssumptionConfig, Considered
+from sst_graph.uncertainty.broken_assumptions import Evidence, considered_sigmas
+from sst_graph.uncertainty.covariance import (
+    MatchTable,
+    RobustCovariance,
+    covariance_of,
+    fit_error_model,
+    match_table,
+    robust_covariance,
+)
 from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
 FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
-_HINT_KERNEL = 5.0 / 3.0
-"""Scale of the score test's kernel, in units of the last one: scales of 5, 10 and 20 px put the parameter of
-a lens at two thirds of its true size alike, and the widest lets neighbouring objects in."""
-_HINT_SIGMAS = 1.5
-"""Score in deviations, if all matches were independent, from which the problem is solved again. They are not,
-so that hints come too often rather than too seldom."""
 _LEAST_FREEDOM = 8
 """Degrees of freedom that few objects have: each has several sides, and the error model a floor."""
-_WIDE_PX = (20.0, 10.0, 7.0)
-"""Kernel scales with which a new solve begins [px]."""
+_ALL_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
+"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. That it
+still moves after them does not matter: the linear step to one parameter's estimate goes the rest of the way.
+"""
+_ALONE_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
+"""... and of the solution with one of them free, which starts near its end [px]."""
+_SETTLING = 4
+"""Most further outer iterations of the latter at the last scale."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the data say of one assumption's parameter.
+    """What the data say of one assumption's parameter while all other assumptions hold.
 
     Attributes:
         assumption: which.
         value, sigma: estimate and its deviation, in the parameter's unit.
-        step: (7,) how far the answer moves when the parameter is estimated with it [rad, m, s].
         contradicted: whether the assumption is.
     """
 
     assumption: Assumption
     value: float
     sigma: float
-    step: FloatArray
     contradicted: bool
+
+    @property
+    def score(self) -> float:
+        """Distance of the estimate from zero in deviations."""
+        return abs(self.value) / self.sigma
 
     @property
     def sentence(self) -> str:
@@ -70,7 +82,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class TestedProblem:
+class SolvedProblem:
     """A solved problem whose assumptions are to be tested.
 
     Attributes:
@@ -87,69 +99,125 @@ class TestedProblem:
     config: JointConfig
     guess: State
 
+    def solve_with(
+        self, names: Sequence[str], start: State, kernel_px: tuple[float, ...], most_outer: int
+    ) -> JointSolution:
+        """The problem with the parameters of some assumptions as variables, their spans as priors.
 
-def check_assumptions(problem: TestedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
-    """What the data say of the assumptions that the score test hints at, the most contradicted first."""
+        Raises:
+            EstimationError: too few matches at any step.
+        """
+        graph = replace(self.config.graph, estimate=(*self.config.graph.estimate, *names))
+        free = replace(self.config, kernel_px=kernel_px, max_outer=most_outer, graph=graph)
+        return solve_joint(self.drives, start, free, None, self.guess, self.tracks)
+
+
+def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
+    """What the data say of every assumption that the matches test, the most contradicted first."""
     if not config.test:
         return ()
-    free = dict(named_sigmas(problem.config.graph.estimate))
-    names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in free]
-    found = []
-    for name, score in zip(names, scores(problem, names), strict=True):
-        if abs(score) > _HINT_SIGMAS and (finding := _estimated(problem, name, config)) is not None:
-            found.append(finding)
-    return tuple(sorted(found, key=lambda finding: -abs(finding.value) / finding.sigma))
-
-
-def scores(problem: TestedProblem, names: Sequence[str]) -> FloatArray:
-    """(k,) one step of each parameter, let free alone, over its deviation if all matches were independent."""
-    state = problem.solution.state
-    graph_config = problem.config.graph
-    kernel = RobustKernel("geman_mcclure", _HINT_KERNEL * problem.config.kernel_px[-1])
-    pairs = associate(problem.drives, problem.tracks, state, kernel, graph_config)
-    graph, values = joint_graph(pairs, state, graph_config, problem.guess)
-    unknowns = Unknowns.of(state, pairs)
-    P = marginal_covariance(graph, values, unknowns)
-    table = match_table(graph, values, pairs, state, problem.objects, unknowns)
-    C = weighted_columns(table, pairs, columns_of(pairs, values, state, names))
-    r = table.root_weights * table.r
-    # The answer moves to its optimum under this kernel, and the parameter by what is left beside it.
-    JC = table.J.T @ C
-    gradient = -(C.T @ r) + JC.T @ (P @ (table.J.T @ r))
-    information = np.einsum("mk,mk->k", C, C) - np.einsum("nk,nk->k", JC, P @ JC)
-    spans = np.array([ASSUMPTIONS[name].span for name in names])
-    return np.asarray(gradient / np.sqrt(np.maximum(information, 0.0) + spans**-2.0))
-
-
-def _estimated(problem: TestedProblem, name: str, config: AssumptionConfig) -> Finding | None:
-    """The problem solved with one parameter as a variable; None where it cannot be."""
-    assumption, before = ASSUMPTIONS[name], problem.solution.state
-    narrow = tuple(scale for scale in problem.config.kernel_px if scale < _WIDE_PX[-1])
-    free = replace(
-        problem.config,
-        kernel_px=(*_WIDE_PX, *(narrow or problem.config.kernel_px[-1:])),
-        graph=replace(
-            problem.config.graph, estimate=(*problem.config.graph.estimate, name)
-        ),
-    )
-    start = replace(before, nuisances={**before.nuisances, name: 0.0})
+    estimated = dict(named_sigmas(problem.config.graph.estimate))
+    names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
     try:
-        solution = solve_joint(problem.drives, start, free, None, problem.guess, problem.tracks)
+        linear = LinearProblem.of(problem, names)
+        findings = sorted((linear.alone(name, config) for name in names), key=lambda f: -f.score)
+        return _confirmed(problem, findings, config)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        _LOG.info("assumptions not tested: %s", error)
+        return ()
+
+
+def _confirmed(
+    problem: SolvedProblem, findings: Sequence[Finding], config: AssumptionConfig
+) -> tuple[Finding, ...]:
+    """The findings, from the first one that a solution with its parameter alone confirms on.
+
+    Those before it, which were not confirmed, contradict nothing; those after it would explain the data less
+    well.
+    """
+    confirmed = list(findings)
+    for place, finding in enumerate(findings):
+        if not finding.contradicted:
+            break
+        confirmed[place] = _solved_alone(problem, finding, config)
+        if confirmed[place].contradicted:
+            return (confirmed.pop(place), *confirmed)
+    return tuple(confirmed)
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """The problem with many parameters free, linear about its optimum.
+
+    Attributes:
+        table: its matches.
+        unknowns: columns of the table.
+        information: (n, n) of the unknowns, motion marginalised out, priors included.
+        values: of the free parameters at the optimum, by name.
+    """
+
+    table: MatchTable
+    unknowns: Unknowns
+    information: FloatArray
+    values: dict[str, float]
+
+    @classmethod
+    def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
+        """The problem with these parameters free."""
+        before = problem.solution.state
+        start = replace(before, nuisances={**before.nuisances, **dict.fromkeys(names, 0.0)})
+        solution = problem.solve_with(names, start, _ALL_PX, len(_ALL_PX))
+        graph, at, pairs = solution.graph, solution.values, solution.pairs
+        unknowns = Unknowns.of(solution.state, pairs)
+        table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
+        information = scaled_inverse(marginal_covariance(graph, at, unknowns))
+        found = state_from(at, solution.state, pairs).nuisances
+        return cls(table, unknowns, information, {name: found[name] for name in names})
+
+    def alone(self, name: str, config: AssumptionConfig) -> Finding:
+        """Estimate of one parameter while the others of them are zero.
+
+        With the others' steps d_o to zero given, the rest moves by d = -Λ_dd^-1 Λ_do d_o.
+        """
+        columns = {each: self.unknowns.column(nuisance_key(each)) for each in self.values}
+        fixed = np.array([column for each, column in columns.items() if each != name], dtype=np.intp)
+        kept = np.setdiff1d(np.arange(self.unknowns.size), fixed)
+        step = np.zeros(self.unknowns.size)
+        step[fixed] = [-value for each, value in self.values.items() if each != name]
+        bread = scaled_inverse(self.information[np.ix_(kept, kept)])
+        step[kept] = -bread @ (self.information[np.ix_(kept, fixed)] @ step[fixed])
+        moved = self.table.moved(step)
+        table = _centred(replace(moved, J=moved.J[:, kept]), bread)
+        covariance = covariance_of(bread, table, fit_error_model(table))
+        place = int(np.searchsorted(kept, columns[name]))
+        sigma = float(np.sqrt(covariance[place, place]))
+        sigma *= few_objects(int(table.objects.max()) + 1, config.threshold)
+        value = self.values[name] + float(step[columns[name]])
+        return Finding(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
+
+
+def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
+    """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
+    zero, and the jackknife over objects would take that for a disagreement among them."""
+    return table.moved(-bread @ (table.J.T @ (table.root_weights * table.r)))
+
+
+def _solved_alone(problem: SolvedProblem, finding: Finding, config: AssumptionConfig) -> Finding:
+    """The finding by a solution with its parameter alone; as it was where there is none."""
+    name, before = finding.assumption.name, problem.solution.state
+    start = replace(before, nuisances={**before.nuisances, name: finding.value})
+    try:
+        solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _SETTLING)
     except EstimationError as error:
         _LOG.info("assumption %s: %s", name, error)
-        return None
+        return finding
     robust = robust_covariance(
         solution.graph, solution.values, solution.pairs, solution.state, problem.objects
     )
     column = robust.unknowns.column(nuisance_key(name))
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
     sigma *= few_objects(int(robust.table.objects.max()) + 1, config.threshold)
-    step = np.append(
-        np.asarray(before.cTl.logmap(solution.state.cTl)),
-        solution.state.offsets_s[0] - before.offsets_s[0],
-    )
-    contradicted = solution.converged and abs(value) > config.threshold * sigma
-    return Finding(assumption, value, sigma, step, contradicted)
+    return replace(finding, value=value, sigma=sigma, contradicted=abs(value) > config.threshold * sigma)
 
 
 def few_objects(objects: int, threshold: float) -> float:
@@ -161,6 +229,22 @@ def few_objects(objects: int, threshold: float) -> float:
     """
     tail = float(norm.sf(threshold))
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
+
+
+def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
+    """What is considered, with the deviations of the parameters that the data leave open."""
+    evidence = {
+        f.assumption.name: Evidence(
+            f.value,
+            f.sigma,
+            considered.sigmas[f.assumption.name],
+            f.assumption.span,
+            f.assumption.prevalence,
+        )
+        for f in findings
+        if f.assumption.name in considered.sigmas
+    }
+    return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
 
 
 def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
@@ -179,8 +263,8 @@ def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
 def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
     """JSON-able: what each assumption adds to the covariance, and what the data say of it.
 
-    By name: ``sigma`` of its parameter, ``sensitivity`` (7) of the answer [rad, m, s per unit], and where the
-    parameter was estimated ``estimate`` and ``estimate_sigma``.
+    By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the answer
+    [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.
     """
     said = {finding.assumption.name: finding for finding in findings}
     report: dict[str, Any] = {}

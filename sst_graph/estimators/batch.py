@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.estimators.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
 from sst_graph.estimators.assumption_tests import (
-    TestedProblem,
+    SolvedProblem,
     assumption_report,
     check_assumptions,
     contradiction_of,
     estimated_report,
+    told_by,
 )
 from sst_graph.estimators.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.estimators.causes import with_causes
@@ -195,10 +196,10 @@ def answer_joint(
             by_standing = standing_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
-    considered = consider(robust, *frozen, config.assumptions)
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
-    problem = TestedProblem(drives, tracks, objects, solution, config.joint, centre)
+    problem = SolvedProblem(drives, tracks, objects, solution, config.joint, centre)
     findings = check_assumptions(problem, config.assumptions)
+    considered = told_by(consider(robust, *frozen, config.assumptions), findings)
     size = 6 + len(solution.state.offsets_s)
     motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
     parts_of_sigma = budget(covariance, motion, considered)

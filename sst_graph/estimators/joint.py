@@ -76,6 +76,7 @@ class JointSolution:
         graph, values: the last frozen graph and its optimum.
         outer_iterations: outer iterations done.
         converged: the last step was short beside the frozen problem's own uncertainty.
+        matched_at: the state that the matches were made at.
     """
 
     state: State
@@ -84,6 +85,7 @@ class JointSolution:
     values: gtsam.Values
     outer_iterations: int
     converged: bool
+    matched_at: State
 
 
 def solve_joint(
@@ -148,7 +150,7 @@ def solving_joint(
                 converged = step < config.circle_sigmas
                 break
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, len(pairs))
-    return JointSolution(state, pairs, graph, values, outer + 1, converged)
+    return JointSolution(state, pairs, graph, values, outer + 1, converged, last)
 
 
 def support(solution: JointSolution) -> float:

@@ -9,14 +9,13 @@ and
     theta = a'g / (a'H a / f + s^-2)
 
 is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
-threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.estimators.assumption_tests`). The
-objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
+threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.estimators.assumption_tests`).
+Objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.errors import EstimationError
@@ -25,8 +24,6 @@ from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.uncertainty.assumptions import AssumptionConfig
 from sst_graph.uncertainty.object_spread import believed_flatness
-
-FloatArray = NDArray[np.float64]
 
 EVERY = 10
 """Scans between two tests: they cost about as much as the covariance, which each frame has."""
@@ -58,20 +55,20 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
             continue
         value, sigma = float(values[place]), float(sigmas[place])
         contradicted = abs(value) > config.threshold * sigma
-        found.append(Finding(assumption, value, sigma, value * follows[:7, place], contradicted))
-    return tuple(sorted(found, key=lambda finding: -abs(finding.value) / finding.sigma))
+        found.append(Finding(assumption, value, sigma, contradicted))
+    return tuple(sorted(found, key=lambda finding: -finding.score))
 
 
 class AssumptionTests:
     """When a running tracker tests what it takes for granted, and what it has found.
 
     Attributes:
-        found: findings of the last test, by name of the assumption: (value, sigma, step (7,), contradicted).
+        found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
     """
 
     def __init__(self, config: AssumptionConfig) -> None:
         self.config = config
-        self.found: dict[str, tuple[float, float, FloatArray, bool]] = {}
+        self.found: dict[str, tuple[float, float, bool]] = {}
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -95,6 +92,6 @@ class AssumptionTests:
         """
         if self.config.test:
             self.found = {
-                finding.assumption.name: (finding.value, finding.sigma, finding.step, finding.contradicted)
+                finding.assumption.name: (finding.value, finding.sigma, finding.contradicted)
                 for finding in score_findings(smoother, self.config)
             }

@@ -2,34 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.config import Settings, setting
-from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
-from sst_graph.experiments.wrong_drives import WRONG, KeptDrive
+from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
 from sst_graph.problem.drive import Progress
-from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]
 
 SIZES: dict[str, tuple[float, ...]] = {
-    "focal": (0.002, 0.005, 0.01, 0.02),
-    "cx": (1.0, 5.0, 15.0, 30.0),
-    "cy": (1.0, 5.0, 15.0, 30.0),
-    "k1": (0.003, 0.01, 0.03, 0.1),
-    "k2": (0.003, 0.01, 0.03, 0.1),
-    "skew": (0.002, 0.005, 0.01, 0.02),
-    "range_bias": (0.02, 0.1, 0.3, 1.0),
-    "range_scale": (0.005, 0.02, 0.05, 0.1),
+    "focal": (0.003, 0.01, 0.02, 0.04, 0.08),
+    "cx": (1.0, 5.0, 15.0, 30.0, 60.0),
+    "cy": (1.0, 5.0, 15.0, 30.0, 60.0),
+    "k1": (0.01, 0.03, 0.06, 0.1, 0.3),
+    "k2": (0.01, 0.03, 0.06, 0.1, 0.3),
+    "skew": (0.003, 0.01, 0.02, 0.04, 0.08),
+    "line_delay": (2e-5, 1e-4, 4e-4),
+    "range_bias": (0.03, 0.1, 0.3, 1.0, 2.0),
+    "range_scale": (0.003, 0.01, 0.03, 0.1, 0.3),
 }
 """Sizes by which each assumption is broken, in its unit, in either sense."""
+
+CLEAN, DRAWN = "clean", "drawn"
+"""A street as it is, and with all parameters drawn from their prior deviations at once."""
+CASES = (CLEAN, DRAWN, *SIZES)
+_TOLD_SIGMAS = 5.0
+"""A size above this many of the deviations that its parameter would have as a variable is to be found."""
+_SILENT_NEES = 9.0
+"""NEES per dimension of an answer that is three sigmas off all round."""
 
 
 @dataclass(frozen=True)
@@ -39,104 +49,179 @@ class AssumptionTableConfig(Settings):
     Attributes:
         streets: simulated streets.
         seed: of the first one; the next ones follow.
-        frames: of each drive.
-        names: assumptions that are broken; none: all.
-        clean: whether the streets are calibrated as they are, too.
+        street: what they are like; its own seed does not matter.
+        cases: ``clean``, ``drawn`` (all parameters from their prior deviations at once), and names of
+            assumptions that are broken; none: all of them.
+        sizes: by which assumptions are broken; none: :data:`SIZES` of each.
         calibration: settings of the method.
     """
 
     streets: int = setting(5, at_least=1, at_most=10_000)
     seed: int = setting(700, at_least=0, at_most=2**31)
-    frames: int = setting(30, at_least=3, at_most=1000)
-    names: tuple[str, ...] = ()
-    clean: bool = True
+    street: SimulationConfig = field(default_factory=lambda: SimulationConfig(frames=30, time_offset_s=0.1))
+    cases: tuple[str, ...] = ()
+    sizes: tuple[float, ...] = setting((), at_least=0.0, at_most=1000.0, length=(0, 100))
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
     def __post_init__(self) -> None:
-        if unknown := [name for name in self.names if name not in WRONG]:
-            raise ConfigError(f"names: found {', '.join(unknown)}, expected some of {', '.join(WRONG)}")
+        if unknown := [name for name in self.cases if name not in CASES]:
+            raise ConfigError(f"cases: found {', '.join(unknown)}, expected some of {', '.join(CASES)}")
 
 
 @dataclass(frozen=True)
-class _Run:
-    """One calibration: what was found, and how far it was off (7,) [rad, m, s]."""
+class Run:
+    """One calibration of one street.
 
-    result: CalibrationResult
+    Attributes:
+        seed: of the street.
+        case: what was done to it.
+        size: by how much, with its sign; 0 where nothing was, or all.
+        status: of the result.
+        error: (7,) how far the answer is off [rad, m, s].
+        covariance: (7, 7) that it claims.
+        estimates: what the data say of each parameter: estimate and deviation, by name.
+        contradicted: assumptions that the data contradict, the most contradicted first.
+    """
+
+    seed: int
+    case: str
+    size: float
+    status: str
     error: FloatArray
-
-    @property
-    def contradicted(self) -> list[str]:
-        """Assumptions that the data contradict, by name."""
-        report = self.result.diagnostics.get("assumptions", {})
-        return [name for name, entry in report.items() if entry.get("contradicted")]
+    covariance: FloatArray
+    estimates: Mapping[str, tuple[float, float]]
+    contradicted: tuple[str, ...]
 
     @property
     def nees(self) -> float:
         """Normalised error squared over its dimension."""
-        return float(self.error @ np.linalg.solve(self.result.covariance, self.error)) / 7.0
+        return float(self.error @ np.linalg.solve(self.covariance, self.error)) / len(self.error)
+
+    @property
+    def silent(self) -> bool:
+        """``ok`` and more than three sigmas off."""
+        return self.status == "ok" and self.nees > _SILENT_NEES
 
 
 def run(config: AssumptionTableConfig, progress: Progress | None = None) -> str:
-    """A Markdown table: a row for each assumption and size, both senses together.
+    """A Markdown table: a row for each case and size, both senses together, and what they come to."""
+    return table(list(runs_of(config, progress)))
 
-    "Silent" runs are ``ok`` with a NEES above 9 per dimension: more than three sigmas off.
-    """
-    names = config.names or tuple(WRONG)
-    cases = [("none", 0.0)] if config.clean else []
-    cases += [(name, sign * size) for name in names for size in SIZES[name] for sign in (1.0, -1.0)]
-    runs: dict[tuple[str, float], list[_Run]] = {}
-    for street in range(config.streets):
-        drive = simulate(SimulationConfig(seed=config.seed + street, frames=config.frames, time_offset_s=0.1))
-        kept = KeptDrive.of(drive)
-        for number, (name, size) in enumerate(cases):
-            broken = kept if name == "none" else WRONG[name](kept, size)
-            runs.setdefault((name, abs(size)), []).append(_calibrated(broken, config.calibration))
+
+def runs_of(config: AssumptionTableConfig, progress: Progress | None = None) -> Iterator[Run]:
+    """All calibrations of the table: street by street, each simulated once."""
+    cases = [
+        (name, sign * size)
+        for name in config.cases or CASES
+        for size in ((config.sizes or SIZES[name]) if name in SIZES else (0.0,))
+        for sign in ((1.0, -1.0) if size else (1.0,))
+    ]
+    for number in range(config.streets):
+        street = simulate(replace(config.street, seed=config.seed + number))
+        kept = KeptDrive.of(street)
+        for done, (name, size) in enumerate(cases):
+            yield _calibrated(_broken(street, kept, name, size), (street.config.seed, name, size), config)
             if progress is not None:
-                progress("assumptions", street * len(cases) + number + 1, config.streets * len(cases))
-    rows = [_row(name, size, some) for (name, size), some in runs.items()]
-    return "\n".join([_HEADER, "|---|---|---|---|---|---|---|---|---|", *rows]) + "\n"
+                progress("assumptions", number * len(cases) + done + 1, config.streets * len(cases))
 
 
-def _calibrated(drive: KeptDrive, config: CalibrationConfig) -> _Run:
-    result = calibrate_prepared(prepare_drives([drive], config), drive.nominal, config)
+def _broken(street: SimulatedDrive, kept: KeptDrive, case: str, size: float) -> KeptDrive:
+    if case == CLEAN:
+        return kept
+    if case == DRAWN:
+        rng = np.random.default_rng([street.config.seed, 71])
+        for name, wrong in WRONG.items():
+            kept = wrong(kept, ASSUMPTIONS[name].sigma * float(rng.standard_normal()))
+        return kept
+    return with_line_delay(street, kept, size) if case == "line_delay" else WRONG[case](kept, size)
+
+
+def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: AssumptionTableConfig) -> Run:
+    settings = config.calibration
+    result = calibrate_prepared(prepare_drives([drive], settings), drive.nominal, settings)
     assert drive.truth is not None
     step = np.asarray(gtsam.Pose3.Logmap(result.T_camera_lidar.between(drive.truth.cTl)))
-    return _Run(result, np.append(step, (drive.truth.time_offset_s or 0.0) - result.time_offset_s))
+    error = np.append(step, (drive.truth.time_offset_s or 0.0) - result.time_offset_s)
+    told = {
+        name: (entry["estimate"], entry["estimate_sigma"])
+        for name, entry in result.diagnostics.get("assumptions", {}).items()
+        if "estimate" in entry
+    }
+    report = result.diagnostics.get("assumptions", {})
+    against = [name for name in told if report[name]["contradicted"]]
+    against.sort(key=lambda name: -abs(told[name][0]) / told[name][1])
+    return Run(*case, result.status, error, result.covariance, told, tuple(against))
 
 
-_HEADER = (
-    "| assumption | off by ± | runs | contradicted | named first | not ok | silent "
-    "| error [deg, cm, ms], median | NEES / dimension, median |"
+def table(runs: Sequence[Run]) -> str:
+    """The table of some runs, with a summary below.
+
+    "Told" is the size over the deviation that the parameter would have as a variable on the same street.
+    "Silent" runs are ``ok`` and have a NEES above 9 per dimension.
+    """
+    rows: dict[tuple[str, float], list[Run]] = {}
+    for one in runs:
+        rows.setdefault((one.case, abs(one.size)), []).append(one)
+    sigmas = {
+        (one.seed, name): sigma
+        for one in runs
+        if one.case == CLEAN
+        for name, (_, sigma) in one.estimates.items()
+    }
+    lines = [_row(case, size, some, sigmas) for (case, size), some in rows.items()]
+    head = "| " + " | ".join(_COLUMNS) + " |\n|" + "---|" * len(_COLUMNS)
+    return "\n".join([head, *lines, "", *_summary(runs, sigmas)]) + "\n"
+
+
+_COLUMNS = (
+    "broken",
+    "by ±",
+    "told [σ]",
+    "runs",
+    "contradicted",
+    "named first",
+    "not ok",
+    "silent",
+    "error [deg, cm, ms], median",
+    "NEES / dimension: median, mean",
 )
 
 
-def _row(name: str, size: float, runs: Sequence[_Run]) -> str:
-    count = len(runs)
-    found = sum(bool(run.contradicted) for run in runs)
-    named = sum(_first(run) == name for run in runs)
-    doubted = sum(run.result.status != "ok" for run in runs)
-    silent = sum(run.result.status == "ok" and run.nees > 9.0 for run in runs)
-    turn = np.degrees(np.median([np.linalg.norm(run.error[:3]) for run in runs]))
-    shift = 100.0 * np.median([np.linalg.norm(run.error[3:6]) for run in runs])
-    offset = 1e3 * np.median([abs(run.error[6]) for run in runs])
-    nees = np.median([run.nees for run in runs])
+def _told(one: Run, sigmas: Mapping[tuple[int, str], float]) -> float:
+    """Size over the deviation of its parameter on the clean street; NaN where that was not calibrated."""
+    return abs(one.size) / sigmas.get((one.seed, one.case), np.nan)
+
+
+def _row(case: str, size: float, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> str:
+    told = np.array([_told(one, sigmas) for one in runs])
+    errors = np.array([one.error for one in runs])
+    turn = np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1)))
+    shift = 100.0 * np.median(np.linalg.norm(errors[:, 3:6], axis=1))
+    offset = 1e3 * np.median(np.abs(errors[:, 6]))
+    nees = [one.nees for one in runs]
     cells = [
-        name,
+        case,
         f"{size:g}" if size else "–",
-        str(count),
-        str(found),
-        str(named) if size else "–",
-        str(doubted),
-        str(silent),
+        f"{np.median(told):.1f}" if size and np.isfinite(told).all() else "–",
+        str(len(runs)),
+        str(sum(bool(one.contradicted) for one in runs)),
+        str(sum(one.contradicted[:1] == (case,) for one in runs)) if size else "–",
+        str(sum(one.status != "ok" for one in runs)),
+        str(sum(one.silent for one in runs)),
         f"{turn:.3f}, {shift:.2f}, {offset:.2f}",
-        f"{nees:.2f}",
+        f"{np.median(nees):.2f}, {np.mean(nees):.2f}",
     ]
     return "| " + " | ".join(cells) + " |"
 
 
-def _first(run: _Run) -> str | None:
-    """The assumption that is contradicted most."""
-    report = run.result.diagnostics.get("assumptions", {})
-    entries = {name: report[name] for name in run.contradicted}
-    ratios = {name: abs(e["estimate"]) / e["estimate_sigma"] for name, e in entries.items()}
-    return max(ratios, key=lambda name: ratios[name], default=None)
+def _summary(runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> list[str]:
+    broken = [one for one in runs if one.size]
+    large = [one for one in broken if _told(one, sigmas) > _TOLD_SIGMAS]
+    groups = {f"sizes above {_TOLD_SIGMAS:g} σ": large, "all sizes": broken}
+    groups |= {case: [one for one in runs if one.case == case] for case in (CLEAN, DRAWN)}
+    return [
+        f"- {name}: {len(some)} runs, {sum(bool(one.contradicted) for one in some)} contradicted, "
+        f"{sum(one.status != 'ok' for one in some)} not ok, {sum(one.silent for one in some)} silent"
+        for name, some in groups.items()
+        if some
+    ]

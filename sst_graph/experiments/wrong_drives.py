@@ -5,53 +5,19 @@ Made by changing what is recorded, never by the effects in :mod:`sst_graph.assum
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import cv2
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass, Source
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.data.simulator import SimulatedDrive
+from sst_graph.types import CameraImage, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class KeptDrive:
-    """A drive whose frames are held in memory (satisfies :class:`sst_graph.types.Source`)."""
-
-    name: str
-    camera: PinholeCamera
-    nominal: gtsam.Pose3 | None
-    truth: GroundTruth | None
-    frames: Sequence[Frame]
-    sweep: str = "auto"
-
-    @classmethod
-    def of(cls, source: Source) -> KeptDrive:
-        """All frames of a source, read now; a word of the source on its sweep is kept."""
-        sweep = getattr(source, "sweep", "auto")
-        return cls(source.name, source.camera, source.nominal, source.truth, tuple(source), sweep)
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, position: int) -> Frame:
-        return self.frames[position]
-
-    def __iter__(self) -> Iterator[Frame]:
-        return iter(self.frames)
-
-    def with_images(self, change: Callable[[CameraImage], CameraImage]) -> KeptDrive:
-        """The drive with every image changed."""
-        return replace(self, frames=tuple(replace(f, image=f.image and change(f.image)) for f in self.frames))
-
-    def with_scans(self, change: Callable[[Scan], Scan]) -> KeptDrive:
-        """The drive with every scan changed."""
-        return replace(self, frames=tuple(replace(f, scan=f.scan and change(f.scan)) for f in self.frames))
 
 
 def with_focal(drive: KeptDrive, size: float) -> KeptDrive:
@@ -110,6 +76,50 @@ def with_skew(drive: KeptDrive, size: float) -> KeptDrive:
         return replace(image, stamp_ns=first + round((image.stamp_ns - first) / (1.0 + size)))
 
     return drive.with_images(change)
+
+
+_BANDS = 12
+"""Bands of rows that share an instant: the edge of a car is 20 to 60 of 375 rows high."""
+
+
+def with_line_delay(street: SimulatedDrive, drive: KeptDrive, size: float) -> KeptDrive:
+    """Every row exposed ``size`` seconds after the one above it, the middle one at the picture's stamp.
+
+    Put together from bands of rows, each from a picture of the street at the band's own instant.
+
+    Args:
+        street: that ``drive`` was kept of.
+    """
+    height = drive.camera.height
+    bands = np.array_split(np.arange(height), _BANDS)
+    frames = list(drive.frames)
+    for rows in bands:
+        late_s = size * (float(rows.mean()) - 0.5 * (height - 1))
+        offset_s = street.config.time_offset_s + late_s
+        then = replace(street, config=replace(street.config, time_offset_s=offset_s))
+        for position, frame in enumerate(frames):
+            seen = then.image(position)
+            if frame.image is not None:
+                frames[position] = replace(frame, image=_with_rows(frame.image, seen, rows))
+    return replace(drive, frames=tuple(frames))
+
+
+def _with_rows(image: CameraImage, other: CameraImage, rows: NDArray[np.intp]) -> CameraImage:
+    """An image with some rows of another one."""
+    band = slice(int(rows[0]), int(rows[-1]) + 1)
+
+    def mixed(own: NDArray[np.generic], its: NDArray[np.generic]) -> NDArray[Any]:
+        whole = own.copy()
+        whole[band] = its[band]
+        return whole
+
+    assert image.instances is not None and other.instances is not None
+    return replace(
+        image,
+        mask=mixed(image.mask, other.mask),
+        pixels=mixed(image.pixels, other.pixels),
+        instances=mixed(image.instances, other.instances),
+    )
 
 
 WRONG: dict[str, Callable[[KeptDrive, float], KeptDrive]] = {

@@ -108,8 +108,10 @@ def match_table(
         state: that the matches were made at.
         tracks: of each drive's objects.
     """
-    motion = _Motion(values, twist_responses(graph, values, unknowns))
+    made_at = state.nuisances
     state = state_from(values, state, pairs)
+    moved = {name: value - made_at.get(name, 0.0) for name, value in state.nuisances.items()}
+    motion = _Moved(values, twist_responses(graph, values, unknowns), moved)
     blocks, weights, residuals, curvatures = [], [], [], []
     sides, frames, objects, moving = [], [], [], []
     for number, pair in enumerate(pairs):
@@ -140,15 +142,22 @@ def match_table(
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """The twists at the optimum, and how each follows the other unknowns (6, n), by the twist's key."""
+class _Moved:
+    """What the optimum has moved beside the state.
+
+    Attributes:
+        values: with the twists at the optimum.
+        responses: (6, n) how each twist follows the other unknowns, by its key.
+        nuisances: steps of the assumptions' parameters since the matches were made, by name.
+    """
 
     values: gtsam.Values
     responses: Mapping[int, FloatArray]
+    nuisances: Mapping[str, float]
 
 
 def _rows(
-    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Motion
+    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Moved
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Weighted Jacobian rows, roots of the weights, and whitened residuals of one class in one pair."""
     V_key = twist_key(pair.drive, pair.pair.image)
@@ -172,6 +181,7 @@ def _rows(
         block[index, unknowns.column(key)] += J[:, 13]
         for name, column in pair.terms.get(c, {}).items():
             block[index, unknowns.column(nuisance_key(name))] += column[index] * J[:, 13]
+            r = r + column[index] * J[:, 13] * motion.nuisances.get(name, 0.0)
         roots[index] = root
         residuals[index] = unweighted(r, root)
     return block, roots, residuals

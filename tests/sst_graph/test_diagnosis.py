@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.wrong_drives import LIES, NAMED, HeldDrive, shifted_masks
+from benchmarks.wrong_drives import LIES, NAMED, shifted_masks
 from factors.camera import PinholeCamera
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.association.mask_shift import contour_profiles, mask_shift
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size
@@ -44,7 +45,7 @@ BY_THEMSELVES = (
 """Lies that are certain before anything is solved."""
 
 
-def street(seed: int, frames: int) -> HeldDrive:
+def street(seed: int, frames: int) -> KeptDrive:
     config = SimulationConfig(
         seed=seed,
         frames=frames,
@@ -56,20 +57,20 @@ def street(seed: int, frames: int) -> HeldDrive:
         motion="no_stop",
         speed_mps=7.0,
     )
-    return HeldDrive.of(simulate(config))
+    return KeptDrive.of(simulate(config), sweep="auto")
 
 
 @cache
-def drive() -> HeldDrive:
+def drive() -> KeptDrive:
     return street(31, 10)
 
 
 @cache
-def other() -> HeldDrive:
+def other() -> KeptDrive:
     return street(32, 10)
 
 
-def causes(data: HeldDrive) -> list[str]:
+def causes(data: KeptDrive) -> list[str]:
     drives = prepare_drives([data], CalibrationConfig())
     return [finding.sentence for finding in preflight(drives, data.nominal, CLASSES)]
 

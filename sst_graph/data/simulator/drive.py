@@ -118,9 +118,13 @@ class SimulatedDrive:
             IndexError: beyond the drive.
         """
         index = self._checked(position)
+        return Frame(index, self.scan(index), self.image(index))
+
+    def image(self, position: int) -> CameraImage:
+        """The picture of a frame, without its scan."""
+        index = self._checked(position)
         pixels, kinds, instances = self._image(index)
-        image = CameraImage(int(self.stamps_ns[index]), SEMANTIC_CLASS[kinds], pixels, instances)
-        return Frame(index, self.scan(index), image)
+        return CameraImage(int(self.stamps_ns[index]), SEMANTIC_CLASS[kinds], pixels, instances)
 
     def scan(self, position: int) -> Scan:
         """The scan of a frame, without its picture."""
