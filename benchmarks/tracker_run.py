@@ -82,10 +82,10 @@ class Timed:
 
     def add(self, frame: Frame) -> TrackUpdate:
         began, k = time.process_time(), len(self.ms)
-        update = self.tracker.add(frame)
-        self.saves.append(self._every > 0 and k % self._every == self._every - 1)
         if self._every:
             self._saver.follow(self.tracker)
+        update = self.tracker.add(frame)
+        self.saves.append(self._every > 0 and k % self._every == self._every - 1)
         if self.saves[-1]:
             self._saver.save(self.tracker)
         self.ms.append(1e3 * (time.process_time() - began))

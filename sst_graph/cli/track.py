@@ -60,14 +60,12 @@ def _track(
     update = None
     with ExitStack() as outputs:
         saver = None if args.checkpoint is None else outputs.enter_context(Saver(args.checkpoint))
-        if saver is not None:
-            saver.follow(tracker)
         for number, (frame, is_last) in enumerate(_with_last(frames), 1):
-            update = tracker.add(frame)
             if saver is not None:
                 saver.follow(tracker)
-                if is_last or number % args.checkpoint_every == 0:
-                    saver.save(tracker)
+            update = tracker.add(frame)
+            if saver is not None and (is_last or number % args.checkpoint_every == 0):
+                saver.save(tracker)
             if is_last:
                 tracker, update = _settled(args, source, tracker, update, saver)
             say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))

@@ -70,9 +70,11 @@ _PACKAGES = (
 class Saver:
     """Saves one tracker under one name, so that no frame takes long for it.
 
-    What a tracker keeps of a scan, an image or a pair never changes: it is stored once, with the frame that
-    brought it (:meth:`follow`). A save stores the rest; then the file is written, some with each frame. It
-    takes its name in one step, so that a kill at any moment leaves the former one whole, or the new one.
+    ``saver.follow(tracker)`` goes before each frame, ``saver.save(tracker)`` behind one that is to be saved.
+    What a tracker keeps of a scan, an image or a pair never changes: it is stored once, with the frame after
+    the one that brought it. A save consolidates the tracker; before the next frame the rest of it is stored,
+    and then the file is written, some with each frame. It takes its name in one step, so that a kill at any
+    moment leaves the former one whole, or the new one.
 
     As a context it finishes where the block ends well, and leaves the former file where it does not.
     """
@@ -80,6 +82,7 @@ class Saver:
     def __init__(self, path: str | Path) -> None:
         self._path = path
         self._blocks = Blocks(checkpoint_classes())
+        self._saved: Tracker | None = None
         self._writing: Generator[None] | None = None
 
     def __enter__(self) -> Saver:
@@ -92,30 +95,39 @@ class Saver:
             self._writing.close()
 
     def follow(self, tracker: Tracker) -> None:
-        """After each frame: store what it brought, and write some of what was saved.
+        """Store what the last frame brought, and the rest of a tracker that was saved, or write some of it.
 
         Raises:
             OSError: it cannot be written; what stood there is untouched.
         """
         for value in _lasting(tracker):
             self._blocks.number(value)
-        if self._writing is not None:
+        if self._saved is not None:
+            self._store()
+        elif self._writing is not None:
             next(self._writing, None)
 
     def save(self, tracker: Tracker) -> None:
         """Save a tracker as it is; the file is there after :meth:`finish`, or some frames later.
 
-        The tracker is consolidated first (:meth:`Tracker.consolidate`), so that it and the one that is read
-        back go on to the same estimates.
+        The tracker is consolidated (:meth:`Tracker.consolidate`), so that it and the one that is read back go
+        on to the same estimates. It may change after the next :meth:`follow`, not before.
 
         Raises:
             OSError: an earlier one cannot be written; what stood there is untouched.
         """
         self.finish()
         tracker.consolidate(self._blocks)
+        self._saved = tracker
+
+    def _store(self) -> None:
+        """Store the tracker that was saved; a large file is still to be written."""
         with _uncollected():
-            node, rest, blocks = self._blocks.stored(tracker)
+            node, rest, blocks = self._blocks.stored(self._saved)
+        self._saved = None
         self._writing = atomic_write_in_steps(self._path, partial(_filling, node, rest, blocks))
+        if len(rest) + sum(len(block.data) for block in blocks) < _STEP_BYTES:
+            self.finish()
 
     def finish(self) -> None:
         """Write all that is left to write.
@@ -123,6 +135,8 @@ class Saver:
         Raises:
             OSError: it cannot be written; what stood there is untouched.
         """
+        if self._saved is not None:
+            self._store()
         for _ in self._writing or ():
             pass
 

@@ -18,6 +18,7 @@ import pytest
 from sst_graph import Tracker
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import CheckpointError
+from sst_graph.estimators import checkpoint
 from sst_graph.estimators.checkpoint import Saver, load_checkpoint, save_checkpoint
 from sst_graph.storage import stored
 
@@ -67,21 +68,26 @@ def test_what_was_saved_is_read(tmp_path: Path, good: bytes) -> None:
     assert load_checkpoint(path).window.next_scan == 3
 
 
-def test_a_save_is_written_with_the_frames_that_follow(tmp_path: Path) -> None:
+def test_a_save_is_written_with_the_frames_that_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The former file stands until the new one is whole; what is broken off leaves it, and nothing else."""
     street, path = simulate(SMALL), tmp_path / "tracker.npz"
     tracker = Tracker(street.camera, None, street.nominal)
     tracker.add(street[0])
     save_checkpoint(tracker, path)
+    monkeypatch.setattr(checkpoint, "_STEP_BYTES", 100_000)  # such a small file is written at once
     former = path.read_bytes()
     with pytest.raises(KeyboardInterrupt), Saver(path) as saver:
         tracker.add(street[1])
         saver.save(tracker)
-        saver.follow(tracker)
+        for _ in range(3):
+            saver.follow(tracker)
         raise KeyboardInterrupt
     assert path.read_bytes() == former and list(tmp_path.iterdir()) == [path]
     with Saver(path) as saver:
         saver.save(tracker)
+        saver.follow(tracker)
         tracker.add(street[2])
         saver.follow(tracker)
         assert path.read_bytes() == former
@@ -98,9 +104,9 @@ def test_what_is_saved_does_not_depend_on_when_it_was_stored(tmp_path: Path) -> 
         tracker = Tracker(street.camera, None, street.nominal)
         with Saver(path) as saver:
             for k in range(len(street)):
-                tracker.add(street[k])
                 if path.name == "followed":
                     saver.follow(tracker)
+                tracker.add(street[k])
             saver.save(tracker)
     documents = [parts_of(path.read_bytes())[0] for path in paths]
     trackers = [load_checkpoint(path) for path in paths]
