@@ -10,7 +10,7 @@ contradicted most is solved for once more, alone and from where that step leads,
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -69,6 +69,14 @@ class Finding:
     value: float
     sigma: float
     contradicted: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        return {**vars(self), "assumption": self.assumption.name}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        for name, value in {**state, "assumption": ASSUMPTIONS[state["assumption"]]}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def score(self) -> float:

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Point, scaled_inverse
+from sst_graph.estimators.gaussian import Point, scaled_inverse, with_room
 from sst_graph.problem.state import object_bias_key, twist_key
 
 if TYPE_CHECKING:
@@ -130,9 +130,8 @@ class Change:
         beliefs = (self.past, self.bent, self.alone)
         self.past, self.bent, self.alone = (b.with_objects(new, sigma_px) for b in beliefs)
         self.sums.grow(self.past.point.size)
-        self.undecided = self.undecided.through(
-            np.eye(self.past.point.size, len(self.bent.vector) - len(new))
-        )
+        size = self.past.point.size
+        self.undecided = self.undecided.through(with_room(size - len(new), size, self.bent.held))
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
             self._values.insert(object_bias_key(0, track), np.array([bias]))
@@ -248,7 +247,7 @@ class Change:
         self.past, self.bent, self.alone = (b.at(self.point) for b in beliefs)
         self.undecided = self.undecided.moved(before.local(self.bent.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
-        self._add(self.bent.factor(keys), "past", 0)
+        self._add(self.bent.without_held().factor(keys), "past", 0)
 
     def _add(self, factor: gtsam.NonlinearFactor, kind: str, number: int) -> None:
         self._graph.add(factor)

@@ -291,6 +291,14 @@ def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...], held: i
     return np.array([*range(core), *objects, *range(size, size + held)], dtype=np.intp)
 
 
+def with_room(before: int, after: int, held: int) -> FloatArray:
+    """T (after + held, before + held) from some unknowns to more of them, before what is held."""
+    T = np.zeros((after + held, before + held))
+    T[:before, :before] = np.eye(before)
+    T[after:, before:] = np.eye(held)
+    return T
+
+
 def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     """(k, m) steps from each point to another, over [extrinsic, offset, biases, parameters]."""
     turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)

@@ -116,7 +116,7 @@ class WindowMatcher:
         pairs = associate([part], tracks, state, kernel, self.graph)
         if not pairs or len(pairs[0]) < self.config.min_frame_matches:
             return None
-        score = self._score(pairs[0], number, point, 1.0, by_object=False)
+        score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
         return Other(score.bent, middle_s, early)
 
     def scores(

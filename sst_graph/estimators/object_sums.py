@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectBeliefs:
-    """The matches of each object of a frame alone, on extrinsic, offset, mask biases and its own bias if any.
+    """The matches of each object of a frame alone, on extrinsic, offset, mask biases, parameters and its own
+    bias if any.
 
     Attributes:
         point: where the frame is linearized.
@@ -104,6 +105,11 @@ class ObjectSums:
     weight: float = 0.0
     weight2: float = 0.0
     live: dict[int, ObjectBelief] = field(default_factory=dict)
+
+    @classmethod
+    def empty(cls, n: int) -> ObjectSums:
+        """Nothing yet, over n unknowns."""
+        return cls(np.zeros((n, n)))
 
     def add(self, objects: ObjectBeliefs) -> None:
         """Take in the objects of a frame."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.silhouettes import SIDES
-from sst_graph.estimators.gaussian import scattered
+from sst_graph.estimators.gaussian import scattered, with_room
 from sst_graph.estimators.object_sums import ObjectSums
 from sst_graph.estimators.scores import PairScore, summed_rows
 from sst_graph.uncertainty.covariance import (
@@ -50,7 +50,7 @@ class ScoreSums:
     closed: FloatArray
     live: dict[int, tuple[FloatArray, int]] = field(default_factory=dict)
     recent: deque[FloatArray] = field(default_factory=lambda: deque(maxlen=150))
-    objects: ObjectSums = field(default_factory=lambda: ObjectSums(np.zeros((0, 0))))
+    objects: ObjectSums = field(default_factory=lambda: ObjectSums.empty(0))
     weight: float = 0.0
     curvature: float = 0.0
     held: int = 0
@@ -59,7 +59,7 @@ class ScoreSums:
     def empty(cls, n: int, held: int = 0) -> ScoreSums:
         """n: unknowns; held: further parameters."""
         nothing = np.zeros((n + held, n + held))
-        return cls(nothing, nothing, nothing, objects=ObjectSums(np.zeros((n, n))), held=held)
+        return cls(nothing, nothing, nothing, objects=ObjectSums.empty(n), held=held)
 
     def add(
         self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
@@ -94,11 +94,7 @@ class ScoreSums:
 
     def grow(self, n: int) -> None:
         """Make room for further unknowns, n in all."""
-        before = len(self.JJ) - self.held
-        T = np.zeros((n + self.held, len(self.JJ)))
-        T[:before, :before] = np.eye(before)
-        T[n:, before:] = np.eye(self.held)
-        self.transform(T)
+        self.transform(with_room(len(self.JJ) - self.held, n, self.held))
 
     def transform(self, T: FloatArray) -> None:
         """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""

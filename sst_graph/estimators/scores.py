@@ -65,8 +65,8 @@ class PairScore:
     Attributes:
         belief: on [extrinsic, offset, biases, parameters, and the biases of the objects it sees]; it may hold
             parameters of assumptions.
-        bent: the same on the unknowns alone, with the robust loss's second derivatives in place of the
-            weights: how the gradient of matches that cannot be made anew follows an estimate that moves on.
+        bent: the same with the robust loss's second derivatives in place of the weights: how the gradient of
+            matches that cannot be made anew follows an estimate that moves on.
         JJ: (n, n) sum of J'J of its matches, motion marginalised out, times their common share; in the
             columns of the belief, what it holds included, as are ``sides`` and ``sums``.
         sides: by side.
@@ -146,10 +146,8 @@ def score_pair(
     columns = [*range(7), *range(m, m + 6)]
     motion[np.ix_(columns, columns)] = _motion_information(pair, point, config)
     belief, gain = _without_twist(point, H + motion, g)
+    bent, _ = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
     known = np.array([*range(n), *range(m, m + 6)])
-    H_known, motion_known = H[np.ix_(known, known)], motion[np.ix_(known, known)]
-    bend_share = min(max(bend / weight, _LEAST_BEND), 1.0)
-    bent, _ = _without_twist(point, bend_share * H_known + motion_known, g[known])
     J = J - JV @ gain  # as the answer follows a residual, the twist following the answer
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
@@ -165,7 +163,7 @@ def score_pair(
         ObjectBeliefs.of(J[:, :n], r, roots, track, point) if by_object else None,
         weight,
         bend,
-        _by_standing(pair, point, A[:, known], motion_known),
+        _by_standing(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
 
 

@@ -81,9 +81,9 @@ class WindowSmoother:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
         self.held_names = held_at_zero(graph.estimate)
-        self.prior = self.bent = self.alone = prior
-        self.past = prior.holding(len(self.held_names))
-        self.undecided = Undecided.none(prior.point.size)
+        self.prior = self.alone = prior
+        self.past = self.bent = prior.holding(len(self.held_names))
+        self.undecided = Undecided.none(len(self.bent.vector))
         self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, Entry] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
@@ -202,9 +202,7 @@ class WindowSmoother:
 
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
-        values = self.isam.calculateEstimate()
-        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
-        self._go_on_with(isam, list(isam.update(self._held(), values).getNewFactorsIndices()))
+        self._go_on_with(*self._linearized(self.isam.calculateEstimate(), self._held()))
 
     def _held(self) -> gtsam.NonlinearFactorGraph:
         """As :meth:`_whole`, the very factors that iSAM2 holds."""
@@ -218,7 +216,8 @@ class WindowSmoother:
     def _whole(self) -> gtsam.NonlinearFactorGraph:
         """Every factor of the window: the past, the walks, the pairs, the twists."""
         graph = gtsam.NonlinearFactorGraph()
-        graph.add(self.bent.factor(self.keys(self._epochs[0].number, self.past.point.tracks)))
+        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
+        graph.add(self.bent.without_held().factor(keys))
         for old, new in pairwise(self._epochs):
             for factor in self.drift_factors(old, new):
                 graph.add(factor)
@@ -228,10 +227,13 @@ class WindowSmoother:
             graph.add(self.twist_factor(self.entries[twist.scan]))
         return graph
 
-    def _linearized(self, values: gtsam.Values) -> tuple[gtsam.ISAM2, list[int]]:
-        """A fresh iSAM2 of all factors at some values, and the factors' indices."""
+    def _linearized(
+        self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
+    ) -> tuple[gtsam.ISAM2, list[int]]:
+        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
         isam = gtsam.ISAM2(_parameters(self.graph.estimate))
-        return isam, list(isam.update(self._whole(), values).getNewFactorsIndices())
+        whole = self._whole() if graph is None else graph
+        return isam, list(isam.update(whole, values).getNewFactorsIndices())
 
     def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
         """Go on with an iSAM2 of :meth:`_whole`."""
@@ -270,15 +272,16 @@ class WindowSmoother:
         unknowns of ``past`` and what it holds."""
         return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
 
-    def whole(self) -> Gaussian:
-        """All that past and window say of the last epoch, at the estimate, what ``past`` holds included."""
-        belief = self.past.at(self._point)
+    def vector(self) -> FloatArray:
+        """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
+        unknowns of ``past`` and what it holds."""
+        belief = self.bent.at(self._point)
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 belief = belief.drifted(self.walk(self._seconds(i)))
             seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
             belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
-        return belief
+        return belief.vector
 
     def information_of_standing(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
@@ -318,13 +321,11 @@ class WindowSmoother:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        scores = [entry.score for entry in self.entries.values()]
         robust = naive + naive @ self.surplus() @ naive
         spread = None
         if not self.drift.enabled:
-            found = [score.objects for score in scores if score.objects is not None]
-            point_now = self.past.at(self._point).point
-            spread = self.sums.objects.spread(found, naive, point_now)
+            found = [e.score.objects for e in self.entries.values() if e.score.objects is not None]
+            spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
         robust = composed(robust, spread, self.flatness)
         return 0.5 * (robust + robust.T), naive
 

@@ -3,13 +3,14 @@
 What leaves the window is kept as one belief on the unknowns x that carries the parameters of all assumptions
 along (:class:`~sst_graph.estimators.gaussian.Gaussian`), and as sums of the scores of sides over both. With H
 the information of past and window on [x, theta], g its vector at the estimate and a = [-H_xx^-1 H_xt, 1], the
-score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of matches add
-(:mod:`sst_graph.uncertainty.covariance`), and
+score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of matches add,
+and
 
     theta = a'g / (a'H a / f + s^-2)
 
-is one Newton step: f is the mean robust weight over the mean curvature, s the parameter's span. The
+is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
 threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.estimators.assumption_tests`).
+Objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
 """
 
 from __future__ import annotations
@@ -34,26 +35,25 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     Raises:
         EstimationError: a direction without any information.
     """
-    whole, n = smoother.whole(), smoother.past.point.size
-    H, g = whole.information, whole.vector
+    H, g, n = smoother.information(), smoother.vector(), smoother.past.point.size
     try:
         follows = -(scaled_inverse(H[:n, :n]) @ H[:n, n:])
     except np.linalg.LinAlgError as error:
         raise EstimationError(str(error)) from error
-    A = np.concatenate([follows, np.eye(whole.held)])
+    A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
     surplus = np.einsum("nk,nm,mk->k", A, smoother.surplus(with_held=True), A)
-    flatness = believed_flatness(smoother.flatness)
-    wider = few_objects(smoother.objects, config.threshold)
+    before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
+    curvature = np.maximum(information, 0.0) / believed_flatness(smoother.flatness) + before
+    values = score / curvature
+    sigmas = np.sqrt(np.maximum(information + surplus, 0.0) + before) / curvature
+    sigmas *= few_objects(smoother.objects, config.threshold)
     found = []
     for place, name in enumerate(smoother.held_names):
         assumption = ASSUMPTIONS[name]
         if not assumption.by_matches:
             continue
-        before = assumption.span**-2.0
-        curvature = max(float(information[place]), 0.0) / flatness + before
-        variance = max(float(information[place] + surplus[place]), 0.0) + before
-        value, sigma = float(score[place]) / curvature, float(np.sqrt(variance)) / curvature * wider
+        value, sigma = float(values[place]), float(sigmas[place])
         contradicted = abs(value) > config.threshold * sigma
         found.append(Finding(assumption, value, sigma, contradicted))
     return tuple(sorted(found, key=lambda finding: -finding.score))
@@ -63,16 +63,21 @@ class AssumptionTests:
     """When a running tracker tests what it takes for granted, and what it has found.
 
     Attributes:
-        findings: of the last test, the most contradicted first.
+        found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
     """
 
     def __init__(self, config: AssumptionConfig) -> None:
         self.config = config
-        self.findings: tuple[Finding, ...] = ()
+        self.found: dict[str, tuple[float, float, bool]] = {}
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Of the last test, the most contradicted first."""
+        return tuple(Finding(ASSUMPTIONS[name], *said) for name, said in self.found.items())
 
     def restart(self) -> None:
         """A new calibration begins."""
-        self.findings = ()
+        self.found = {}
 
     def take(self, scan: int, smoother: WindowSmoother) -> None:
         """The smoother knows a scan of this number."""
@@ -86,4 +91,7 @@ class AssumptionTests:
             EstimationError: a direction without any information.
         """
         if self.config.test:
-            self.findings = score_findings(smoother, self.config)
+            self.found = {
+                finding.assumption.name: (finding.value, finding.sigma, finding.contradicted)
+                for finding in score_findings(smoother, self.config)
+            }

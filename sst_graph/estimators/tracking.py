@@ -15,7 +15,7 @@ from factors.camera import PinholeCamera
 from sst_graph.estimators.admission import StampOrder, check_lateness
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.arrivals import Arrivals
-from sst_graph.estimators.assumption_tests import contradiction_of
+from sst_graph.estimators.assumption_tests import contradiction_of, told_by
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History
 from sst_graph.estimators.known import Known
@@ -113,7 +113,8 @@ class Tracking:
 
     def considered(self) -> Considered:
         """How the present estimate follows the assumptions that are not estimated beside it."""
-        return considered(self.known.steps, self.config.calibration.assumptions)
+        beside = considered(self.known.steps, self.config.calibration.assumptions)
+        return told_by(beside, self.tests.findings)
 
     @property
     def estimated_names(self) -> tuple[str, ...]:
@@ -191,9 +192,8 @@ class Tracking:
             return self.answer(stamp_ns, f"no start yet: {' '.join(str(error).split())}")
         if started is not None:
             return self.begin(started, stamp_ns)
-        search = self.starting.search
-        looks = "collecting frames for a start" if search is None else "looking for a start"
-        return self.answer(stamp_ns, looks)
+        under_way = self.starting.under_way
+        return self.answer(stamp_ns, "looking for a start" if under_way else "collecting frames for a start")
 
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""

@@ -39,7 +39,8 @@ class Other:
 
 @dataclass(frozen=True)
 class Undecided:
-    """Other pairings less those in use, one row a scan, about a point.
+    """Other pairings less those in use, one row a scan, about a point, in the columns of the past and of what
+    it holds.
 
     Attributes:
         middles_s: (k,) time offsets at which the scans lie half way between their images [s].
@@ -58,12 +59,13 @@ class Undecided:
 
     def plus(self, used: Gaussian, other: Other, point: Point) -> Undecided:
         """One more scan; objects of the other pairing that are not known at the point are left out."""
-        n, difference = point.size, (np.zeros((point.size, point.size)), np.zeros(point.size))
+        n = point.size + used.held
+        difference = np.zeros((n, n)), np.zeros(n)
         for belief, sign in ((other.belief, 1.0), (used, -1.0)):
             unknown = [track for track in belief.point.tracks if track not in point.tracks]
             belief = belief.without(unknown)[0] if unknown else belief
             belief = belief.at(point)
-            columns = point.columns(belief.point.tracks)
+            columns = point.columns(belief.point.tracks, belief.held)
             difference[0][np.ix_(columns, columns)] += sign * belief.information
             difference[1][columns] += sign * belief.vector
         return Undecided(
@@ -74,8 +76,9 @@ class Undecided:
         )
 
     def moved(self, step: FloatArray) -> Undecided:
-        """About a point that lies a step (n,) away."""
-        return Undecided(self.middles_s, self.early, self.information, self.vector - self.information @ step)
+        """About a point that lies a step away; (m,) of the unknowns, without what is held."""
+        moved = self.information[:, :, : len(step)] @ step
+        return Undecided(self.middles_s, self.early, self.information, self.vector - moved)
 
     def through(self, T: FloatArray) -> Undecided:
         """In other unknowns: scores follow T (m, n), as :meth:`Gaussian.without` tells it."""
@@ -86,8 +89,8 @@ class Undecided:
         changed = (offset_s >= self.middles_s) != self.early
         if not changed.any():
             return self, past
-        information = past.information + self.information[changed].sum(axis=0)
-        if np.linalg.eigvalsh(information)[0] <= 0.0:
+        information, n = past.information + self.information[changed].sum(axis=0), past.point.size
+        if np.linalg.eigvalsh(information[:n, :n])[0] <= 0.0:
             return self, past
         past = Gaussian(past.point, information, past.vector + self.vector[changed].sum(axis=0))
         sign = np.where(changed, -1.0, 1.0)
