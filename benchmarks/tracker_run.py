@@ -1,6 +1,7 @@
 """A long run of the tracker: cost of a frame, its growth, memory, alarms. Prints one JSON document.
 
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000
+    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --checkpoint-every 10
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --street heavy
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
 
@@ -8,8 +9,9 @@
 
 Streets: ``plain`` has about 5,000 labelled points a scan, ``heavy`` twice as many. A simulated drive (no
 time offset) is played forth and back under rising stamps: a drive reversed in time is a drive. Times are
-CPU seconds of this process on one thread, for a busy machine must not count. All after the first hundred do,
-with those in which the tracker settles; these are told apart as well.
+CPU seconds of this process on one thread, for a busy machine must not count. ``all_frames`` are all, from the
+first on, with the start and the saves; the other times are of those after the first hundred, with those in
+which the tracker settles, which are told apart as well.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig, open_source
 from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators.checkpoint import save_checkpoint
+from sst_graph.estimators.checkpoint import Saver
+from sst_graph.estimators.track_update import TrackUpdate
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.types import Frame
 
@@ -64,37 +67,56 @@ def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
         "median": float(np.median(costs)),
         "p99": float(np.quantile(costs, 0.99)),
         "max": float(costs.max()),
+        "max_over_median": float(costs.max() / np.median(costs)),
     }
 
 
-def drive_report(path: str, image_shift: int, every: int, start_work: int) -> dict[str, object]:
-    """Cost of each frame of a drive, those with a save apart, and of settling at its end."""
-    source = open_source(path, image_shift=image_shift)
-    tracker = Tracker(source.camera, TrackerConfig(start_work=start_work), source.nominal)
-    costs, saved, started = [], [], None
-    with tempfile.TemporaryDirectory() as folder:
+class Timed:
+    """A tracker that saves now and then, and what each frame costs with that."""
+
+    def __init__(self, tracker: Tracker, saver: Saver, every: int) -> None:
+        """every: frames between saves; 0: none."""
+        self.tracker, self._saver, self._every = tracker, saver, every
+        self.ms: list[float] = []
+        self.saves: list[bool] = []
+
+    def add(self, frame: Frame) -> TrackUpdate:
+        began, k = time.process_time(), len(self.ms)
+        update = self.tracker.add(frame)
+        self.saves.append(self._every > 0 and k % self._every == self._every - 1)
+        if self._every:
+            self._saver.follow(self.tracker)
+        if self.saves[-1]:
+            self._saver.save(self.tracker)
+        self.ms.append(1e3 * (time.process_time() - began))
+        return update
+
+    def report(self) -> dict[str, object]:
+        """All frames, and those with a save."""
+        each, saves = np.array(self.ms), np.array(self.saves)
+        return {
+            "all_frames": _quantiles(each),
+            "with_a_save": _quantiles(each[saves]),
+            "largest": {int(k): float(each[k]) for k in np.argsort(-each)[:5]},
+        }
+
+
+def drive_report(path: str, image_shift: int, every: int, config: TrackerConfig) -> dict[str, object]:
+    """Cost of each frame of a drive, and of settling at its end."""
+    source, started = open_source(path, image_shift=image_shift), None
+    with tempfile.TemporaryDirectory() as folder, Saver(f"{folder}/tracker.npz") as saver:
+        timed = Timed(Tracker(source.camera, config, source.nominal), saver, every)
         for k, frame in enumerate(source):
-            began = time.process_time()
-            tracker.add(frame)
-            if every:
-                tracker.make_ready()
-            saved.append(every > 0 and k % every == every - 1)
-            if saved[-1]:
-                save_checkpoint(tracker, f"{folder}/tracker.npz")
-            costs.append(1e3 * (time.process_time() - began))
-            started = k if started is None and tracker.started else started
+            timed.add(frame)
+            started = k if started is None and timed.tracker.started else started
     began = time.process_time()
-    tracker.settle()
-    settled = time.process_time() - began
-    each, saves = np.array(costs), np.array(saved)
+    timed.tracker.settle()
     return {
-        "frames": len(each),
+        "frames": len(timed.ms),
         "started_with_frame": started,
-        "ms": _quantiles(each[~saves]),
-        "ms_with_a_save": _quantiles(each[saves]),
-        "max_over_median": float(each[~saves].max() / np.median(each)),
-        "settle_s": settled,
-        "status": tracker.current().status,
+        **timed.report(),
+        "settle_s": time.process_time() - began,
+        "status": timed.tracker.current().status,
     }
 
 
@@ -109,15 +131,16 @@ def main() -> None:
     parser.add_argument("--drive", help="a drive on disk instead of a street: the cost of all its frames")
     parser.add_argument("--image-shift", type=int, default=0)
     parser.add_argument("--checkpoint-every", type=int, default=0, help="frames between saves; 0: none")
-    parser.add_argument("--start-work", type=int, default=0, help="as the setting start_work")
+    default = TrackerConfig()
+    parser.add_argument(
+        "--start-work", type=int, default=default.start_work, help="as the setting start_work"
+    )
     args = parser.parse_args()
+    config = dataclasses.replace(default, start_work=args.start_work, drift=DriftConfig(enabled=args.drift))
     if args.drive is not None:
         cv2.setNumThreads(1)
-        print(
-            json.dumps(
-                drive_report(args.drive, args.image_shift, args.checkpoint_every, args.start_work), indent=2
-            )
-        )
+        report = drive_report(args.drive, args.image_shift, args.checkpoint_every, config)
+        print(json.dumps(report, indent=2))
         return
     if args.frames < WARM_UP + 20:
         parser.error(f"--frames {args.frames}: expected {WARM_UP + 20} or more, for {WARM_UP} warm up")
@@ -132,26 +155,23 @@ def main() -> None:
         )
     )
     frames, step = list(drive), STEPS.get(args.step)
-    tracker = Tracker(
-        drive.camera,
-        TrackerConfig(start_work=args.start_work, drift=DriftConfig(enabled=args.drift)),
-        drive.nominal,
-    )
-    costs, memory, alarms, chi2, settling = [], [], [], [], []
-    for frame in endless(frames, args.frames):
-        if step is not None and frame.index >= args.step_at:
-            assert frame.image is not None
-            frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
-        at_work = tracker.settling is not None
-        began = time.process_time()
-        update = tracker.add(frame)
-        costs.append(1e3 * (time.process_time() - began))
-        settling.append(at_work)
-        memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
-        if update.alarm:
-            alarms.append(frame.index)
-        if update.chi2 is not None:
-            chi2.append(update.chi2)
+    tracker = Tracker(drive.camera, config, drive.nominal)
+    memory, alarms, chi2, settling, started = [], [], [], [], None
+    with tempfile.TemporaryDirectory() as folder, Saver(f"{folder}/tracker.npz") as saver:
+        timed = Timed(tracker, saver, args.checkpoint_every)
+        for frame in endless(frames, args.frames):
+            if step is not None and frame.index >= args.step_at:
+                assert frame.image is not None
+                frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
+            settling.append(tracker.settling is not None)
+            update = timed.add(frame)
+            started = frame.index if started is None and tracker.started else started
+            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+            if update.alarm:
+                alarms.append(frame.index)
+            if update.chi2 is not None:
+                chi2.append(update.chi2)
+    costs = timed.ms
     steady, settles = np.array(costs[WARM_UP:]), np.array(settling[WARM_UP:])
     block = min(500, len(steady) // 2)
     truth = drive.truth.cTl
@@ -163,13 +183,14 @@ def main() -> None:
         "street": args.street,
         "labelled_points": int(np.median([(f.scan.classes == 1).sum() for f in frames if f.scan])),
         "points": int(np.median([len(f.scan.points) for f in frames if f.scan])),
+        "started_with_frame": started,
+        **timed.report(),
         "ms_median": float(np.median(steady)),
         "ms_p99": float(np.quantile(steady, 0.99)),
         "ms_max": float(steady.max()),
         "settling_frames": int(settles.sum()),
         "ms_settling": _quantiles(steady[settles]),
         "ms_not_settling": _quantiles(steady[~settles]),
-        "ms_largest_before_warm_up": sorted(costs[:WARM_UP])[-3:],
         "ms_last_over_first": float(steady[-block:].mean() / steady[:block].mean()),
         "memory_mb_after_200": memory[min(200, len(memory) - 1)],
         "memory_mb_at_end": memory[-1],

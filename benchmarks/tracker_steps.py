@@ -101,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=700)
     parser.add_argument("--streets", type=int, default=len(KINDS))
-    parser.add_argument("--before", type=int, default=44, help="frames before the step")
+    parser.add_argument("--before", type=int, default=64, help="frames before the step")
     parser.add_argument("--after", type=int, default=30, help="frames after it")
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -122,7 +122,7 @@ def main() -> None:
         )
         drive = simulate(config)
         frames = list(drive)
-        tracker = Tracker(drive.camera, TrackerConfig(start_work=0), drive.truth.cTl.retract(GUESS))
+        tracker = Tracker(drive.camera, TrackerConfig(), drive.truth.cTl.retract(GUESS))
         early = sum(tracker.add(frame).alarm for frame in frames[: args.before])
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = Path(folder) / "tracker.npz"

@@ -324,6 +324,9 @@ def frame_residual(
     for alignment in alignments:
         if not isinstance(alignment, Alignment):
             raise FactorError(f"alignments of {name}", described(alignment), "factors.Alignment")
+        if alignment.c_acceleration.ndim > 1:
+            found = f"shape {alignment.c_acceleration.shape}"
+            raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")
     variables = _Variables(name)
     pose = variables.source("cTl", pose_or_key(name, "cTl", cTl), gtsam.Pose3)
     offset = variables.source("offset_s", number_or_key(name, "offset_s", offset_s), Vector(1))

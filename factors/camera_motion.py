@@ -106,8 +106,8 @@ def _error(
     keys: tuple[int, ...], chain: _Chain, error_of: MotionError, *values: Any, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
     predicted, P_H = chain.motion(dict(zip(keys, values, strict=True)), jacobians)
-    error, error_H_P = error_of(predicted)
-    return error, [error_H_P @ P_H[key] for key in keys] if jacobians else None
+    error, error_H_P = error_of(predicted, jacobians)
+    return error, None if error_H_P is None else [error_H_P @ P_H[key] for key in keys]
 
 
 @dataclass(frozen=True)

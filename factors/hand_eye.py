@@ -26,7 +26,7 @@ from .variables import Kind, Vector
 
 FloatArray = NDArray[np.float64]
 
-MotionError = Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]
+MotionError = Callable[[gtsam.Pose3, bool], tuple[FloatArray, FloatArray | None]]
 """Of a predicted motion of the camera: error (6,) and derivative (6, 6) by its right perturbation."""
 
 LOW_TRANSLATION_M = 0.02
@@ -69,9 +69,9 @@ def hand_eye_factor(
 def _hand_eye(
     motion: _LidarMotion, error_of: MotionError, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
-    predicted, P_H = motion.in_camera(cTl, offset)
-    error, error_H_P = error_of(predicted)
-    return error, [error_H_P @ H for H in P_H] if jacobians else None
+    predicted, P_H = motion.in_camera(cTl, offset, jacobians)
+    error, error_H_P = error_of(predicted, jacobians)
+    return error, None if error_H_P is None else [error_H_P @ H for H in P_H]
 
 
 def rotation_hand_eye(
@@ -102,7 +102,7 @@ def rotation_hand_eye(
 def _rotation_hand_eye(
     motion: _LidarMotion, c1Rc2: gtsam.Rot3, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
-    predicted, P_H = motion.in_camera(cTl, offset)
+    predicted, P_H = motion.in_camera(cTl, offset, jacobians)
     error = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
     if not jacobians:
         return error, None
@@ -128,16 +128,20 @@ class _LidarMotion:
         self.offset_0 = float(checked_array("offset_0", [offset_0], (1,))[0])
 
     def in_camera(
-        self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...]
+        self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...], jacobians: bool
     ) -> tuple[gtsam.Pose3, list[FloatArray]]:
-        """cTl . l1Tl2(d) . cTl^-1 and its Jacobians (6, dim) by cTl [and the offset], right perturbations."""
+        """cTl . l1Tl2(d) . cTl^-1, and where they are asked for its Jacobians (6, dim) by cTl [and the
+        offset], right perturbations."""
         d = float(offset[0][0]) - self.offset_0 if offset else 0.0
         moved = gtsam.Pose3.Expmap(-d * self.twist_1) * self.l1Tl2 * gtsam.Pose3.Expmap(d * self.twist_2)
+        predicted = cTl * moved * cTl.inverse()
+        if not jacobians:
+            return predicted, []
         back, cAd = moved.inverse().AdjointMap(), cTl.AdjointMap()
         H = [cAd @ (back - np.eye(6))]
         if offset:
             H.append((cAd @ (self.twist_2 - back @ self.twist_1)).reshape(6, 1))
-        return cTl * moved * cTl.inverse(), H
+        return predicted, H
 
 
 def camera_motion_error(
@@ -158,22 +162,27 @@ def camera_motion_error(
     return partial(_direction_error, c1Tc2.rotation(), t / length), noise
 
 
-def _pose_error(c1Tc2: gtsam.Pose3, predicted: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+def _pose_error(
+    c1Tc2: gtsam.Pose3, predicted: gtsam.Pose3, jacobians: bool
+) -> tuple[FloatArray, FloatArray | None]:
     error = np.asarray(gtsam.Pose3.Logmap(c1Tc2.between(predicted)))
-    return error, np.asarray(gtsam.Pose3.LogmapDerivative(error))
+    return error, np.asarray(gtsam.Pose3.LogmapDerivative(error)) if jacobians else None
 
 
 def _direction_error(
-    c1Rc2: gtsam.Rot3, direction: FloatArray, predicted: gtsam.Pose3
-) -> tuple[FloatArray, FloatArray]:
+    c1Rc2: gtsam.Rot3, direction: FloatArray, predicted: gtsam.Pose3, jacobians: bool
+) -> tuple[FloatArray, FloatArray | None]:
     log = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
     t = np.asarray(predicted.translation())
     length = np.sqrt(t @ t + LOW_TRANSLATION_M**2)
+    error = np.concatenate([log, t / length - direction])
+    if not jacobians:
+        return error, None
     H = np.zeros((6, 6))
     H[:3, :3] = gtsam.Rot3.LogmapDerivative(log)
     # t of P Exp([w, v]) is t + R v
     H[3:, 3:] = (np.eye(3) - np.outer(t, t) / length**2) / length @ predicted.rotation().matrix()
-    return np.concatenate([log, t / length - direction]), H
+    return error, H
 
 
 def _direction_covariance(c1Tc2: gtsam.Pose3, covariance: FloatArray) -> FloatArray:

@@ -21,6 +21,9 @@ FloatArray = NDArray[np.float64]
 class Alignment:
     """Matches (lP_i, q_i) of one image, frozen for an inner optimisation.
 
+    Those of many images of one camera can stand in one, too, where each match has its own ``c_acceleration``;
+    :func:`factors.residuals` then takes a twist for each. A factor has the matches of one image.
+
     Shapes are checked and arrays copied (read-only) once, here. No match at all (n = 0) is allowed.
 
     Attributes:
@@ -32,7 +35,7 @@ class Alignment:
         normals: (n, 2) unit normals of the contour at the pixels, towards the outside of the mask (the
             side on which the signed distance is positive), or None for point-to-pixel matches.
         kernel: robust kernel on each match's whitened residual (its 2-norm where it has two rows).
-        c_acceleration: (6,) twist's rate of change [rad/s^2, m/s^2].
+        c_acceleration: (6,) twist's rate of change, or (n, 6) of each match's image [rad/s^2, m/s^2].
         motion_model: "se3" or the first-order "translation" (see :mod:`factors.motion`).
         weights: (n,) or one number: factor on the cost of each match (after the kernel).
         l_velocities: (n, 3) velocity over ground of the object that each point lies on, in the LiDAR frame
@@ -71,7 +74,8 @@ class Alignment:
         if self.l_velocities is not None:
             velocities = checked_array("l_velocities of an alignment", self.l_velocities, (n, 3))
             store(self, "l_velocities", velocities)
-        acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, (6,))
+        shape = (n, 6) if np.ndim(self.c_acceleration) == 2 else (6,)
+        acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, shape)
         store(self, "c_acceleration", acceleration)
         if self.motion_model not in get_args(MotionModel):
             raise FactorError("motion model", repr(self.motion_model), " or ".join(get_args(MotionModel)))
@@ -83,6 +87,20 @@ class Alignment:
 
     def take(self, index: NDArray[np.intp]) -> Alignment:
         """Some of the matches, by position."""
+        each = self.c_acceleration
+        return self._some(index, each if each.ndim == 1 else each[index])
+
+    def of_one_image(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
+        """Some of the matches of many images, which belong to one.
+
+        Args:
+            c_acceleration: (6,) of that image's twist [rad/s^2, m/s^2].
+        """
+        some = self._some(index, c_acceleration)
+        stands = some.l_velocities is not None and not some.l_velocities.any()
+        return replace(some, l_velocities=None) if stands else some
+
+    def _some(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         return replace(
             self,
             lPs=self.lPs[index],
@@ -91,6 +109,7 @@ class Alignment:
             sigmas_px=self.sigmas_px[index],
             normals=None if self.normals is None else self.normals[index],
             weights=self.weights[index],
+            c_acceleration=c_acceleration,
             l_velocities=None if self.l_velocities is None else self.l_velocities[index],
         )
 

@@ -95,10 +95,10 @@ def exponential_coefficients(x: FloatArray) -> FloatArray:
 
 
 def twist_ad(xi: FloatArray) -> FloatArray:
-    """(6, 6) matrix ad(xi) of one twist [omega, v]."""
-    ad = np.zeros((6, 6))
-    ad[:3, :3] = ad[3:, 3:] = _skew(xi[:3])
-    ad[3:, :3] = _skew(xi[3:])
+    """(..., 6, 6) matrices ad(xi) of twists (..., 6) [omega, v]."""
+    ad = np.zeros((*xi.shape, 6))
+    ad[..., :3, :3] = ad[..., 3:, 3:] = _skew(xi[..., :3])
+    ad[..., 3:, :3] = _skew(xi[..., 3:])
     return ad
 
 
@@ -118,7 +118,13 @@ def se3_left_jacobian(xi: FloatArray) -> FloatArray:
 
 
 def _skew(a: FloatArray) -> FloatArray:
-    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+    """(..., 3, 3) matrices [a]_x of vectors (..., 3)."""
+    return np.asarray(a @ _SKEW).reshape(*a.shape, 3)
+
+
+_SKEW = np.zeros((3, 9))
+"""[a]_x, row by row, is linear in a."""
+_SKEW[[2, 1, 2, 0, 1, 0], [1, 2, 3, 5, 6, 7]] = [-1.0, 1.0, 1.0, -1.0, -1.0, 1.0]
 
 
 @dataclass(frozen=True)
@@ -239,21 +245,25 @@ def move_points(
         cTl: pose of the LiDAR in the camera.
         lPs: (3, n) points in the LiDAR [m].
         taus_s: (n,) interval of each point, or one float for all [s].
-        c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
-        c_acceleration: (6,) its rate of change [rad/s^2, m/s^2].
+        c_twist: (6,) camera twist at the image's instant, or (6, n) where the points belong to several images
+            [rad/s, m/s].
+        c_acceleration: (6,) or (6, n) its rate of change [rad/s^2, m/s^2].
         model: see :data:`MotionModel`.
         l_velocities: (3, n) velocity u over ground of the object that each point lies on, in the LiDAR frame
             [m/s]; None where all stand.
     """
-    if l_velocities is not None:
+    one_motion = c_twist.ndim == 1 and c_acceleration.ndim == 1
+    if l_velocities is not None or not one_motion:
         taus_s = np.broadcast_to(np.asarray(taus_s, np.float64), lPs.shape[1:])
+    if l_velocities is not None:
         lPs = lPs + taus_s * l_velocities
     if isinstance(taus_s, float):
         return _move_rigidly(cTl, lPs, taus_s, c_twist, c_acceleration, model)
     R = np.asarray(cTl.rotation().matrix())
     cPs = R @ lPs + np.asarray(cTl.translation()).reshape(3, 1)
-    xis = np.outer(c_twist, -taus_s) + np.outer(0.5 * c_acceleration, taus_s**2)
-    rates = c_twist[:, None] - np.outer(c_acceleration, taus_s)
+    twists, changes = c_twist.reshape(6, -1), c_acceleration.reshape(6, -1) * taus_s
+    xis = -taus_s * (twists - 0.5 * changes)
+    rates = twists - changes
     cPs = cPs + xis[3:] if model == "translation" else _move(xis, cPs)
     return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, model, l_velocities)
 
@@ -268,12 +278,26 @@ def _move_rigidly(
 ) -> RigidlyMoved:
     xi = -tau_s * (c_twist - 0.5 * tau_s * c_acceleration)
     rate = c_twist - tau_s * c_acceleration
-    if model == "translation":
-        moved = gtsam.Pose3(cTl.rotation(), cTl.translation() + xi[3:])
-    else:
-        moved = gtsam.Pose3.Expmap(xi) * cTl
+    moved = _moved_pose(cTl, xi, model)
     R, t = np.asarray(moved.rotation().matrix()), np.asarray(moved.translation())
     return RigidlyMoved(R @ lPs + t.reshape(3, 1), moved, tau_s, xi, rate, model)
+
+
+def moved_pose(
+    cTl: gtsam.Pose3,
+    tau_s: float,
+    c_twist: FloatArray,
+    c_acceleration: FloatArray,
+    model: MotionModel = "se3",
+) -> gtsam.Pose3:
+    """cTl' of all points that share one tau, cP = cTl' . lP; arguments as in :func:`move_points`."""
+    return _moved_pose(cTl, -tau_s * (c_twist - 0.5 * tau_s * c_acceleration), model)
+
+
+def _moved_pose(cTl: gtsam.Pose3, xi: FloatArray, model: MotionModel) -> gtsam.Pose3:
+    if model == "translation":
+        return gtsam.Pose3(cTl.rotation(), cTl.translation() + xi[3:])
+    return gtsam.Pose3.Expmap(xi) * cTl
 
 
 def _move(xis: FloatArray, points: FloatArray) -> FloatArray:

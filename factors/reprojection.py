@@ -63,7 +63,8 @@ def residuals(
         alignment: n matches.
         cTl: pose of the LiDAR in the camera.
         offset_s: time offset [s].
-        c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
+        c_twist: (6,) camera twist at the image's instant, or (6, n) at the instant of each match's image
+            [rad/s, m/s].
         bias_px: silhouettes only: how far the mask's contour lies outside the true outline [px]
             (dilation positive), one number or (n,); given, it is the last column of the Jacobian.
         jacobians: False saves the work and returns None for J.
@@ -190,7 +191,7 @@ def evaluate(
         )
     twist = np.asarray(c_twist, dtype=np.float64)
     taus_s = alignment.taus_s(float(offset_s))
-    acceleration, model = alignment.c_acceleration, alignment.motion_model
+    acceleration, model = alignment.c_acceleration.T, alignment.motion_model
     moved = move_points(cTl, lPs, taus_s, twist, acceleration, model, alignment.velocity_columns)
     X, Y, Z = moved.cPs
     behind = Z <= MIN_DEPTH_M

@@ -60,9 +60,36 @@ def _twist_error(
     *,
     jacobians: bool,
 ) -> tuple[FloatArray, list[FloatArray] | None]:
-    Ad = np.asarray(cTl.AdjointMap())
-    now = measured + (float(offset_s[0]) - offset_0_s) * rate
-    error = twist - Ad @ now
-    if not jacobians:
+    error, by_cTl, by_offset = transferred(
+        measured, rate, float(offset_s[0]) - offset_0_s, twist, cTl, jacobians
+    )
+    if by_cTl is None or by_offset is None:
         return error, None
-    return error, [np.eye(6), Ad @ twist_ad(now), -(Ad @ rate)[:, None]]
+    return error, [np.eye(6), by_cTl, by_offset[:, None]]
+
+
+def transferred(
+    l_twists: FloatArray,
+    l_accelerations: FloatArray,
+    since_s: float | FloatArray,
+    c_twists: FloatArray,
+    cTl: gtsam.Pose3,
+    jacobians: bool,
+) -> tuple[FloatArray, FloatArray | None, FloatArray | None]:
+    """The error of :func:`twist_transfer_factor`, of one image or of many.
+
+    Args:
+        l_twists, l_accelerations: (..., 6) of the LiDAR, as there.
+        since_s: time offset less the one under which they were looked up, one for all or (..., 1) [s].
+        c_twists: (..., 6) of the camera.
+
+    Returns:
+        Errors (..., 6) and, where ``jacobians`` is true, their derivatives by the extrinsic (..., 6, 6) and
+        the time offset (..., 6); that by the camera's twist is the identity.
+    """
+    Ad = np.asarray(cTl.AdjointMap())
+    now = l_twists + since_s * l_accelerations
+    error = c_twists - now @ Ad.T
+    if not jacobians:
+        return error, None, None
+    return error, Ad @ twist_ad(now), -(l_accelerations @ Ad.T)

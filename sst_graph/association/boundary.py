@@ -95,13 +95,26 @@ class Boundaries:
 
     def joined(self, other: Boundaries) -> Boundaries:
         """These points and others of the same scan."""
-        names = [field.name for field in fields(self)]
-        return Boundaries(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+        return joined([self, other])
 
     def take(self, index: IntArray) -> Boundaries:
         """Some of the points, by position."""
-        parts = {field.name: getattr(self, field.name)[index] for field in fields(self)}
-        return Boundaries(**parts)
+        return Boundaries(
+            self.lPs[index],
+            self.outward[index],
+            self.half_gaps_m[index],
+            self.offsets_s[index],
+            self.edges[index],
+            self.objects[index],
+        )
+
+
+def joined(parts: Sequence[Boundaries]) -> Boundaries:
+    """The points of one or more, one after the other; objects keep their numbers."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [field.name for field in fields(Boundaries)]
+    return Boundaries(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def find_boundaries(

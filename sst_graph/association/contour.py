@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -10,9 +11,11 @@ from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.association.sampling import sampled
+from sst_graph.shelf import Shelf, shelvable
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 FloatMap = NDArray[np.float32]
 
 _SMOOTHING_PX = 1.0
@@ -43,9 +46,10 @@ class ContourFeet:
     valid: NDArray[np.bool_]
 
 
+@shelvable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
-    """Signed distance field of one class in one mask.
+    """Signed distance field of one class in one mask; on a shelf, it is read whenever it is asked for.
 
     Attributes:
         distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
@@ -102,37 +106,79 @@ class ContourMap:
             unknown |= unseen
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
 
+    def on(self, shelf: Shelf) -> ContourMap:
+        """The same with its fields on a shelf."""
+        return replace(self, distance=shelf.put(self.distance), unknown=shelf.put(self.unknown))
+
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
-        valid = self.well_inside(uvs[:, 0], uvs[:, 1])
-        if len(uvs) == 0:
-            return ContourFeet(np.zeros(0), uvs, uvs, valid)
-        safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
-        # All at once: with few points a call costs more than what it does.
-        u, v = safe[:, None] - np.array([self.left, self.top])[:, None, None] + _CROSS
-        centre, right, left, below, above = np.asarray(sampled(self.distance, u, v), np.float64)
-        gradient = 0.5 * np.stack([right - left, below - above])
-        length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
-        steep = length > 1e-6
-        normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
-        feet = safe - centre * normals
-        valid &= length > MIN_GRADIENT
-        valid &= ~self.is_unknown(feet.T)
-        return ContourFeet(centre, normals.T, feet.T, valid)
+        return nearest_contours([self], [(0, len(uvs))], uvs)
 
-    def is_unknown(self, feet: FloatArray) -> NDArray[np.bool_]:
-        """Whether nothing is known of the contour at points of it, (n, 2)."""
-        rows, columns = self.unknown.shape
-        column, row = np.rint(feet - [self.left, self.top]).astype(np.intp).T
-        found = self.unknown[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        return np.asarray(found > 0, np.bool_)
 
-    def well_inside(self, u: FloatArray, v: FloatArray) -> NDArray[np.bool_]:
-        """Whether columns and rows are on the image and not close to its border; False for NaN."""
-        with np.errstate(invalid="ignore"):
-            inside = (u > BORDER_PX) & (u < self.width - 1 - BORDER_PX)
-            inside &= (v > BORDER_PX) & (v < self.height - 1 - BORDER_PX)
-        return np.asarray(inside)
+def nearest_contours(
+    contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], uvs: FloatArray
+) -> ContourFeet:
+    """Nearest contour of pixels uvs (n, 2) of several images; rows with NaN are not valid.
+
+    Args:
+        contours: at least one.
+        spans: where the pixels of each begin and end, one after the other.
+    """
+    n, counts = len(uvs), [b - a for a, b in spans]
+    if n == 0:
+        return ContourFeet(np.zeros(0), uvs, uvs, np.zeros(0, np.bool_))
+    # All at once: with few points a call costs more than what it does.
+    sizes = {(contour.width, contour.height) for contour in contours}
+    width, height = (
+        next(iter(sizes))
+        if len(sizes) == 1
+        else np.repeat([(contour.width, contour.height) for contour in contours], counts, axis=0).T
+    )
+    valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
+    corners = np.array([(contour.left, contour.top) for contour in contours])
+    corner = corners.T if len(contours) == 1 else np.repeat(corners, counts, axis=0).T
+    safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
+    u, v = (safe - corner)[:, None] + _CROSS
+    u, v = u.astype(np.float32), v.astype(np.float32)
+    samples = np.empty((5, n), np.float32)
+    for contour, (a, b) in zip(contours, spans, strict=True):
+        if b > a:
+            samples[:, a:b] = sampled(contour.distance, u[:, a:b], v[:, a:b])
+    centre, right, left, below, above = samples.astype(np.float64)
+    gradient = 0.5 * np.stack([right - left, below - above])
+    length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
+    steep = length > 1e-6
+    normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
+    feet = safe - centre * normals
+    valid &= length > MIN_GRADIENT
+    valid &= ~are_unknown(contours, spans, feet - corner)
+    return ContourFeet(centre, normals.T, feet.T, valid)
+
+
+def are_unknown(
+    contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], places: FloatArray
+) -> NDArray[np.bool_]:
+    """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
+    :func:`nearest_contours`."""
+    column, row = np.maximum(np.rint(places).astype(np.intp), 0)
+    found = np.empty(places.shape[1], np.uint8)
+    for contour, (a, b) in zip(contours, spans, strict=True):
+        if b > a:
+            unknown = contour.unknown
+            rows, columns = unknown.shape
+            at = np.minimum(row[a:b], rows - 1) * columns + np.minimum(column[a:b], columns - 1)
+            found[a:b] = unknown.reshape(-1)[at]
+    return found > 0
+
+
+def well_inside(
+    u: FloatArray, v: FloatArray, width: IntArray | int, height: IntArray | int
+) -> NDArray[np.bool_]:
+    """Whether columns u and rows v are on an image and not close to its border; False for NaN."""
+    with np.errstate(invalid="ignore"):
+        inside = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
+        inside &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
+    return np.asarray(inside)
 
 
 def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:

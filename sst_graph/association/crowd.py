@@ -18,7 +18,7 @@ from factors.camera import PinholeCamera
 from factors.motion import cross
 from factors.robust import RobustKernel
 from sst_graph.association.boundary import Boundaries, Edge
-from sst_graph.association.contour import MIN_GRADIENT, ContourMap
+from sst_graph.association.contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
 from sst_graph.association.silhouettes import SIDE_OF, SIDES, MatchConfig
 from sst_graph.types import SemanticClass
 
@@ -226,16 +226,19 @@ class Outlines:
         # 1. Where nothing moved: most points are far from the image.
         near = self._roughly_in_view(poses, views, config)
         pose, point = np.nonzero(near)
-        R, t = poses.rotations[pose], poses.translations[pose]
+        # By row, for rows that lie together are worked on faster.
+        R = np.ascontiguousarray(poses.rotations.reshape(-1, 9).T)
+        t = np.ascontiguousarray(poses.translations.T)
         lPs, rates = self._moved(poses, views, pose, point)
-        cPs = np.einsum("kij,jk->ik", R, lPs) + t.T
+        cPs = _rotated(R[:, pose], lPs) + t[:, pose]
         # 2. Where they are at the image's instant.
         ahead = np.maximum(cPs[2], _MIN_DEPTH_M)
         uvs = np.stack([camera.fx * cPs[0] / ahead + camera.cx, camera.fy * cPs[1] / ahead + camera.cy])
         inside = np.flatnonzero((cPs[2] > _MIN_DEPTH_M) & camera.in_image(uvs.T))
-        R, pose, point = R[inside], pose[inside], point[inside]
-        ways = np.einsum("kij,jk->ik", R, self.ways[:, point])
-        rates = None if rates is None else np.einsum("kij,jk->ik", R, rates[:, inside])
+        pose, point = pose[inside], point[inside]
+        turns = R[:, pose]
+        ways = _rotated(turns, self.ways[:, point])
+        rates = None if rates is None else _rotated(turns, rates[:, inside])
         return _Seen(pose, point, cPs[:, inside], ways, uvs[:, inside], rates)
 
     def _roughly_in_view(self, poses: Poses, views: Views, config: MatchConfig) -> NDArray[np.bool_]:
@@ -264,7 +267,12 @@ class Outlines:
             return lPs, None
         scan = self.scans[point]
         taus = poses.offsets[pose] + views.base_taus_s[pose, scan] - self.offsets_s[point]
-        now, change = views.twists[pose, scan].T, views.accelerations[pose, scan].T * taus
+        number = pose * views.images.shape[1] + scan
+        now, change = (
+            np.ascontiguousarray(each.reshape(-1, 6).T)[:, number]
+            for each in (views.twists, views.accelerations)
+        )
+        change *= taus
         mean, last = now - 0.5 * change, now - change
         step = taus * (cross(mean[:3], lPs) + mean[3:])
         moved = lPs - step + 0.5 * taus * cross(mean[:3], step)
@@ -278,11 +286,20 @@ class Outlines:
         key = image * len(self.classes) + self.kinds[seen.point]
         order = np.argsort(key, kind="stable")
         names, starts = np.unique(key[order], return_index=True)
-        for name, part in zip(names, np.split(order, starts[1:]), strict=True):
-            number, kind = divmod(int(name), len(self.classes))
-            contour = self.contours[number].get(self.classes[kind])
-            if contour is not None:
-                distance[part], normals[:, part] = _foot(contour, seen.uvs[:, part])
+        contours = [
+            self.contours[number].get(self.classes[kind])
+            for number, kind in (divmod(name, len(self.classes)) for name in names.tolist())
+        ]
+        ends = [*starts[1:].tolist(), len(order)]
+        spans = list(zip(starts.tolist(), ends, strict=True))
+        known = [
+            (contour, a, b) for contour, (a, b) in zip(contours, spans, strict=True) if contour is not None
+        ]
+        some = np.concatenate([order[:0], *(order[a:b] for _, a, b in known)])
+        if len(some):
+            counts = [b - a for _, a, b in known]
+            fields = [contour for contour, _, _ in known]
+            distance[some], normals[:, some] = _feet(fields, counts, seen.uvs[:, some])
         return distance, normals
 
     def _rows(self, seen: _Seen, normals: FloatArray, kind: IntArray, classes: int) -> FloatArray:
@@ -299,6 +316,11 @@ class Outlines:
         return rows
 
 
+def _rotated(R: FloatArray, x: FloatArray) -> FloatArray:
+    """(3, k) vectors x turned by a matrix each, (9, k) row by row."""
+    return np.stack([R[i] * x[0] + R[i + 1] * x[1] + R[i + 2] * x[2] for i in (0, 3, 6)])
+
+
 def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatArray]:
     """(2, k) unit ways out of the objects in the image, and the lengths (k,) of the steps [px]."""
     X, Y, Z = seen.cPs
@@ -309,24 +331,40 @@ def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatAr
     return step / np.maximum(length, 1e-9), length
 
 
-def _foot(contour: ContourMap, uvs: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Signed distances (k,) and normals (2, k) at pixels (2, k) on the image; infinite at ridges."""
-    rows, columns = contour.distance.shape
+def _feet(
+    contours: Sequence[ContourMap], counts: Sequence[int], uvs: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Signed distances (k,) and normals (2, k) of contours at pixels (2, k) on their images; infinite at
+    ridges.
+
+    Args:
+        counts: pixels of each contour, one contour's after the other's.
+    """
+    fields = [contour.distance for contour in contours]
+    boxes = [
+        (contour.left, contour.top, *field.shape[::-1], contour.width, contour.height)
+        for contour, field in zip(contours, fields, strict=True)
+    ]
+    left, top, columns, rows, width, height = np.repeat(boxes, counts, axis=0).T
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
-    x0, y0 = column - contour.left, row - contour.top
-    valid = contour.well_inside(u, v) & (x0 >= 0) & (y0 >= 0) & (x0 < columns - 1) & (y0 < rows - 1)
+    x0, y0 = column - left, row - top
+    valid = well_inside(u, v, width, height) & (x0 >= 0) & (y0 >= 0) & (x0 < columns - 1) & (y0 < rows - 1)
     at = np.where(valid, y0 * columns + x0, 0)
-    field = contour.distance.reshape(-1)
-    a, b, c, d = (field[at + step].astype(np.float64) for step in (0, 1, columns, columns + 1))
+    corners = at + np.stack([np.zeros_like(columns), np.ones_like(columns), columns, columns + 1])
+    values = np.empty(corners.shape, np.float32)
+    spans = list(itertools.pairwise(np.cumsum([0, *counts]).tolist()))
+    for field, (start, end) in zip(fields, spans, strict=True):
+        values[:, start:end] = field.reshape(-1)[corners[:, start:end]]
+    a, b, c, d = values.astype(np.float64)
     x, y = u - column, v - row
-    top, bottom = a + x * (b - a), c + x * (d - c)
-    distance = top + y * (bottom - top)
-    gradient = np.stack([(1.0 - y) * (b - a) + y * (d - c), bottom - top])
+    above, below = a + x * (b - a), c + x * (d - c)
+    distance = above + y * (below - above)
+    gradient = np.stack([(1.0 - y) * (b - a) + y * (d - c), below - above])
     length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
     valid &= length > MIN_GRADIENT
     normals = gradient / np.maximum(length, MIN_GRADIENT)
-    valid &= ~contour.is_unknown((uvs - distance * normals).T)
+    valid &= ~are_unknown(contours, spans, uvs - distance * normals - [left, top])
     return np.where(valid, distance, np.inf), normals
 
 

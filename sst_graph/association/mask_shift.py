@@ -147,10 +147,10 @@ def sum_of(profiles: Sequence[ContourProfile]) -> FloatArray:
 
 
 def _gradients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(2, h, w, 3) derivatives of the lightly blurred picture to the right and down."""
+    """(h, w, 6) derivatives of the lightly blurred picture: to the right of each channel, and down."""
     blurred = cv2.GaussianBlur(picture, (0, 0), 1.0).astype(np.float32)
     parts = [cv2.Sobel(blurred, cv2.CV_32F, *way, ksize=3, scale=0.125) for way in ((1, 0), (0, 1))]
-    return np.asarray(np.stack(parts), np.float32)
+    return np.asarray(np.concatenate(parts, axis=2), np.float32)
 
 
 def _normals(inside: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -173,7 +173,9 @@ def _strength(
     steps = np.arange(-REACH_PX, REACH_PX + 1)
     rows = (v[None, :] + steps[:, None])[:, None, :]
     columns = (u[None, :] + steps[:, None])[None, :, :]
-    along = gradients[0][rows, columns] * nx[:, None] + gradients[1][rows, columns] * ny[:, None]
+    # Both derivatives of all channels lie side by side: one look-up.
+    found = gradients.reshape(-1, 6).take(rows * gradients.shape[1] + columns, axis=0)
+    along = found[..., :3] * nx[:, None] + found[..., 3:] * ny[:, None]
     size = np.sqrt((along**2).sum(axis=-1))
     return np.asarray(np.minimum(size, 4.0 * np.median(size) + 1e-6).mean(axis=-1), np.float64)
 

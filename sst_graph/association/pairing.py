@@ -6,6 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -30,15 +34,41 @@ def pair_by_time(
         scan_stamps_ns, image_stamps_ns: rising stamps of either clock [ns].
         max_interval_s: pairs farther apart in true time are left out [s].
     """
+    images, base_taus_s = nearest_images(
+        scan_stamps_ns, image_stamps_ns, np.array([offset_s]), max_interval_s
+    )
+    return [
+        Pair(scan, int(images[0, scan]), float(base_taus_s[0, scan]))
+        for scan in np.flatnonzero(images[0] >= 0).tolist()
+    ]
+
+
+def nearest_images(
+    scan_stamps_ns: Sequence[int],
+    image_stamps_ns: Sequence[int],
+    offsets_s: FloatArray,
+    max_interval_s: float,
+) -> tuple[IntArray, FloatArray]:
+    """:func:`pair_by_time` under several time offsets at once.
+
+    Args:
+        offsets_s: (m,).
+
+    Returns:
+        Position of each scan's image, (m, scans), -1 where none is near; and the image's stamp minus the
+        scan's (m, scans) [s].
+    """
+    shape = (len(offsets_s), len(scan_stamps_ns))
     if not len(scan_stamps_ns) or not len(image_stamps_ns):
-        return []
+        return np.full(shape, -1, np.intp), np.zeros(shape)
     epoch = int(scan_stamps_ns[0])
     scans = (np.asarray(scan_stamps_ns, dtype=np.int64) - epoch) * 1e-9
     base = (np.asarray(image_stamps_ns, dtype=np.int64) - epoch) * 1e-9
-    images = base + offset_s
-    right = np.clip(np.searchsorted(images, scans), 1, max(1, len(images) - 1))
+    away = offsets_s[:, None]
+    right = np.clip(np.searchsorted(base, scans - away), 1, max(1, len(base) - 1))
     left = right - 1
-    right = np.minimum(right, len(images) - 1)
-    nearest = np.where(np.abs(images[left] - scans) <= np.abs(images[right] - scans), left, right)
-    close = np.flatnonzero(np.abs(images[nearest] - scans) <= max_interval_s)
-    return [Pair(int(k), int(nearest[k]), float(base[nearest[k]] - scans[k])) for k in close]
+    right = np.minimum(right, len(base) - 1)
+    early, late = (np.abs(base[side] + away - scans) for side in (left, right))
+    nearest = np.where(early <= late, left, right)
+    close = np.minimum(early, late) <= max_interval_s
+    return np.where(close, nearest, -1), base[nearest] - scans

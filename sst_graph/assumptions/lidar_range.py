@@ -15,7 +15,7 @@ def _bias(view: View) -> Effect:
 
 def _scale(view: View) -> Effect:
     """Every range grows by its own length, and with it all motion that is measured by ranges."""
-    return Effect(l_shift=view.lPs, twist_shift=np.concatenate([np.zeros(3), view.l_twist[3:]]))
+    return Effect(l_shift=view.lPs, twist_shift=view.l_twist * np.repeat([0.0, 1.0], 3))
 
 
 RANGE_BIAS = Assumption(

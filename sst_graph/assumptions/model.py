@@ -25,15 +25,16 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class View:
-    """Points of one scan as one image sees them.
+    """Points of one scan as one image sees them, or of several of one drive.
 
     Attributes:
         lPs: (n, 3) points in the LiDAR frame [m].
         offsets_s: (n,) time of each point relative to its scan's stamp [s].
         uvs: (n, 2) their pixels by the ideal camera; NaN behind it [px].
         camera: the ideal camera.
-        l_twist: (6,) the LiDAR's twist at the image's instant [rad/s, m/s]; zeros where it is not known.
-        image_s: stamp of the image minus that of the drive's first image [s].
+        l_twist: (6,) the LiDAR's twist at the image's instant [rad/s, m/s], or (k, 6) of several images or
+            of each point; zeros where it is not known.
+        image_s: stamp of the image minus that of the drive's first image, or (n,) of each point's [s].
         period_s: time between two scans [s].
     """
 
@@ -42,7 +43,7 @@ class View:
     uvs: FloatArray
     camera: PinholeCamera
     l_twist: FloatArray
-    image_s: float
+    image_s: float | FloatArray
     period_s: float
 
     @property
@@ -61,7 +62,7 @@ class Effect:
         l_shift: (n, 3) moves the points, in the LiDAR frame [m].
         time_s: (n,) is added to the interval tau from the point to its image [s].
         pixel_shift: (n, 2) moves their pixels [px].
-        twist_shift: (6,) is added to the LiDAR's measured twist [rad/s, m/s].
+        twist_shift: (6,) or (k, 6) is added to the LiDAR's measured twists [rad/s, m/s].
     """
 
     l_shift: FloatArray | None = None
@@ -108,7 +109,7 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Scene:
-    """What the effects of assumptions depend on beside the points: of one scan and one image.
+    """What the effects of assumptions depend on beside the points: of one scan and one image, or of several.
 
     Attributes:
         camera, l_twist, image_s, period_s: as in :class:`View`.
@@ -116,7 +117,7 @@ class Scene:
 
     camera: PinholeCamera
     l_twist: FloatArray
-    image_s: float
+    image_s: float | FloatArray
     period_s: float
 
     @property

@@ -12,6 +12,7 @@ from sst_graph.cli.messages import complain
 from sst_graph.cli.pictures import overlay, png, telling_positions
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
+from sst_graph.frame_parts import RecentReader
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.report import Comparison, markdown_report
@@ -54,10 +55,11 @@ def write_calibration(
 ) -> list[str]:
     """Write the result's files into ``folder`` (which exists) and return their names."""
     pictures = []
-    for source in (with_sweep_of(source, result.diagnostics) for source in sources):
-        for position in telling_positions(source, result, max(1, PICTURES // len(sources))):
-            name = f"overlay_{_file_name(source.name)}_{source[position].index:06d}.png"
-            picture = overlay(source, position, result, _before(result, source))
+    for source in sources:
+        drive = RecentReader(with_sweep_of(source, result.diagnostics))
+        for position in telling_positions(drive, result, max(1, PICTURES // len(sources))):
+            name = f"overlay_{_file_name(source.name)}_{drive.number(position):06d}.png"
+            picture = overlay(drive, position, result, _before(result, source))
             (folder / name).write_bytes(png(picture))
             pictures.append(name)
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")

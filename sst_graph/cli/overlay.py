@@ -12,6 +12,7 @@ from sst_graph.cli.pictures import overlay, png, position_of
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
+from sst_graph.frame_parts import RecentReader
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.reference import load_initial
 from sst_graph.result import CalibrationResult
@@ -28,10 +29,11 @@ def run(args: argparse.Namespace) -> int:
     with output_file(args.out, args.overwrite, PNG_FILE) as out:
         result = result_at(args.result)
         source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
-        position = len(source) // 2 if args.frame is None else position_of(source, args.frame)
+        drive = RecentReader(source)
+        position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
         before = _before(args.before, result, source)
-        out.write_bytes(png(overlay(source, position, result, before)))
-    mention(f"wrote {args.out}: frame {source[position].index} of {source.name}")
+        out.write_bytes(png(overlay(drive, position, result, before)))
+    mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
     return 0
 
 

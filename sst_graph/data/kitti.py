@@ -93,10 +93,25 @@ class KittiSource:
         if isinstance(position, slice):
             return replace(self, indices=self.indices[position])
         index = self.indices[position]
-        return Frame(index, self._scan(index), self._image(index))
+        scan, image = self._scan(index), self._image(index)
+        if image is not None:
+            image = replace(image, instances=self._instances(index))
+        return Frame(index, scan, image)
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[position] for position in range(len(self)))
+
+    def frame_number(self, position: int) -> int:
+        """Scan index of the frame at a position; nothing is read."""
+        return self.indices[position]
+
+    def read_scan(self, position: int) -> Scan | None:
+        """Scan of the frame at a position; errors as of the frame."""
+        return self._scan(self.indices[position])
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """Image of the frame at a position, without instances; errors as of the frame."""
+        return self._image(self.indices[position])
 
     def _scan(self, index: int) -> Scan | None:
         path = self.files.scans.get(index)
@@ -143,7 +158,6 @@ class KittiSource:
             stamp_ns=int(self.stamps_ns[index]),
             mask=self._mask(self.files.masks.get(number)),
             pixels=self._pixels(self.files.images.get(number)),
-            instances=self._instances(self.files.instances.get(number)),
         )
 
     @property
@@ -159,7 +173,8 @@ class KittiSource:
     def _pixels(self, path: Path | None) -> NDArray[np.uint8]:
         return NO_PICTURE if path is None else read_picture(path, self._size)
 
-    def _instances(self, path: Path | None) -> NDArray[np.uint16] | None:
+    def _instances(self, index: int) -> NDArray[np.uint16] | None:
+        path = self.files.instances.get(index + self.image_shift)
         return None if path is None else read_instances(path, self._size)
 
 

@@ -3,17 +3,18 @@
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
 near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
 parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
-others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). Whatever
-seems contradicted is solved once more, alone.
+others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
+contradicted most is solved for once more, alone and from where that step leads, to state its estimate.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
@@ -69,6 +70,14 @@ class Finding:
     sigma: float
     contradicted: bool
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        return {**vars(self), "assumption": self.assumption.name}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        for name, value in {**state, "assumption": ASSUMPTIONS[state["assumption"]]}.items():
+            object.__setattr__(self, name, value)
+
     @property
     def score(self) -> float:
         """Distance of the estimate from zero in deviations."""
@@ -121,28 +130,12 @@ def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple
     try:
         linear = LinearProblem.of(problem, names)
         findings = sorted((linear.alone(name, config) for name in names), key=lambda f: -f.score)
-        return _confirmed(problem, findings, config)
+        if findings and findings[0].contradicted:
+            findings[0] = _solved_alone(problem, findings[0], linear.start_of(findings[0]), config)
+        return tuple(findings)
     except (EstimationError, np.linalg.LinAlgError) as error:
         _LOG.info("assumptions not tested: %s", error)
         return ()
-
-
-def _confirmed(
-    problem: SolvedProblem, findings: Sequence[Finding], config: AssumptionConfig
-) -> tuple[Finding, ...]:
-    """The findings, from the first one that a solution with its parameter alone confirms on.
-
-    Those before it, which were not confirmed, contradict nothing; those after it would explain the data less
-    well.
-    """
-    confirmed = list(findings)
-    for place, finding in enumerate(findings):
-        if not finding.contradicted:
-            break
-        confirmed[place] = _solved_alone(problem, finding, config)
-        if confirmed[place].contradicted:
-            return (confirmed.pop(place), *confirmed)
-    return tuple(confirmed)
 
 
 @dataclass(frozen=True)
@@ -154,12 +147,14 @@ class LinearProblem:
         unknowns: columns of the table.
         information: (n, n) of the unknowns, motion marginalised out, priors included.
         values: of the free parameters at the optimum, by name.
+        state: the optimum.
     """
 
     table: MatchTable
     unknowns: Unknowns
     information: FloatArray
     values: dict[str, float]
+    state: State
 
     @classmethod
     def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
@@ -171,13 +166,41 @@ class LinearProblem:
         unknowns = Unknowns.of(solution.state, pairs)
         table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
         information = scaled_inverse(marginal_covariance(graph, at, unknowns))
-        found = state_from(at, solution.state, pairs).nuisances
-        return cls(table, unknowns, information, {name: found[name] for name in names})
+        state = state_from(at, solution.state, pairs)
+        return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
 
     def alone(self, name: str, config: AssumptionConfig) -> Finding:
-        """Estimate of one parameter while the others of them are zero.
+        """Estimate of one parameter while the others of them are zero."""
+        step, kept, bread = self._step_to(name)
+        moved = self.table.moved(step)
+        table = _centred(replace(moved, J=moved.J[:, kept]), bread)
+        covariance = covariance_of(bread, table, fit_error_model(table))
+        column = self.unknowns.column(nuisance_key(name))
+        place = int(np.searchsorted(kept, column))
+        sigma = float(np.sqrt(covariance[place, place]))
+        sigma *= few_objects(int(table.objects.max()) + 1, config.threshold)
+        value = self.values[name] + float(step[column])
+        return Finding(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
 
-        With the others' steps d_o to zero given, the rest moves by d = -Λ_dd^-1 Λ_do d_o.
+    def start_of(self, finding: Finding) -> State:
+        """Where a solution with a finding's parameter alone is to be expected."""
+        step, _, _ = self._step_to(finding.assumption.name)
+        offsets = step[6 : 6 + len(self.state.offsets_s)]
+        return replace(
+            self.state,
+            cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
+            offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
+            nuisances={
+                name: value for name, value in self.state.nuisances.items() if name not in self.values
+            }
+            | {finding.assumption.name: finding.value},
+        )
+
+    def _step_to(self, name: str) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+        """Step (n,) of all unknowns to where the other parameters are zero, columns of those that stay
+        unknown, and the inverse of their information.
+
+        With the steps d_o of the others given, the rest moves by d = -Λ_dd^-1 Λ_do d_o.
         """
         columns = {each: self.unknowns.column(nuisance_key(each)) for each in self.values}
         fixed = np.array([column for each, column in columns.items() if each != name], dtype=np.intp)
@@ -186,14 +209,7 @@ class LinearProblem:
         step[fixed] = [-value for each, value in self.values.items() if each != name]
         bread = scaled_inverse(self.information[np.ix_(kept, kept)])
         step[kept] = -bread @ (self.information[np.ix_(kept, fixed)] @ step[fixed])
-        moved = self.table.moved(step)
-        table = _centred(replace(moved, J=moved.J[:, kept]), bread)
-        covariance = covariance_of(bread, table, fit_error_model(table))
-        place = int(np.searchsorted(kept, columns[name]))
-        sigma = float(np.sqrt(covariance[place, place]))
-        sigma *= few_objects(int(table.objects.max()) + 1, config.threshold)
-        value = self.values[name] + float(step[columns[name]])
-        return Finding(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
+        return step, kept, bread
 
 
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
@@ -202,10 +218,11 @@ def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
     return table.moved(-bread @ (table.J.T @ (table.root_weights * table.r)))
 
 
-def _solved_alone(problem: SolvedProblem, finding: Finding, config: AssumptionConfig) -> Finding:
-    """The finding by a solution with its parameter alone; as it was where there is none."""
-    name, before = finding.assumption.name, problem.solution.state
-    start = replace(before, nuisances={**before.nuisances, name: finding.value})
+def _solved_alone(
+    problem: SolvedProblem, finding: Finding, start: State, config: AssumptionConfig
+) -> Finding:
+    """The finding by a solution with its parameter alone; as it was where that ends somewhere else."""
+    name = finding.assumption.name
     try:
         solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _SETTLING)
     except EstimationError as error:
@@ -217,7 +234,9 @@ def _solved_alone(problem: SolvedProblem, finding: Finding, config: AssumptionCo
     column = robust.unknowns.column(nuisance_key(name))
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
     sigma *= few_objects(int(robust.table.objects.max()) + 1, config.threshold)
-    return replace(finding, value=value, sigma=sigma, contradicted=abs(value) > config.threshold * sigma)
+    alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
+    same = alike and abs(value) > config.threshold * sigma
+    return replace(finding, value=value, sigma=sigma) if same else finding
 
 
 def few_objects(objects: int, threshold: float) -> float:

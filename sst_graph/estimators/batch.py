@@ -109,9 +109,10 @@ def prepare_drives(
         prepare = replace(prepare, use_visual_odometry=False)
     if config.method != "joint" or config.undersides.use == "never":
         prepare = without_undersides(prepare)
+    depth = config.method in _NEED_DEPTH
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(with_sweep(source, config.sweep), config.classes, prepare, progress)
+        prepare_drive(with_sweep(source, config.sweep), config.classes, prepare, progress, depth)
         for source in sources
     ]
 
@@ -417,3 +418,5 @@ _METHODS: dict[Method, _Method] = {
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion")
 """Methods whose velocity comes from visual odometry."""
+_NEED_DEPTH = ("paper", "static")
+"""Methods that take its length from LiDAR points."""

@@ -7,6 +7,7 @@ can answer; a file that passes none of it is refused as a whole.
 from __future__ import annotations
 
 import dataclasses
+import gc
 import hashlib
 import importlib
 import io
@@ -17,6 +18,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,7 +31,7 @@ from sst_graph.estimators.incremental import Tracker
 from sst_graph.estimators.resume import Setup, check_memory, check_setup
 from sst_graph.files import atomic_write_in_steps
 from sst_graph.input_files import FileKind, parse_json, read_file
-from sst_graph.storage import Blocks, class_name, restored, stored
+from sst_graph.storage import Block, Blocks, Node, class_name, restored, stored
 from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
@@ -111,16 +113,9 @@ class Saver:
         """
         self.finish()
         tracker.consolidate(self._blocks)
-        node, rest, blocks = self._blocks.stored(tracker)
-        parts = [rest, *(block.data for block in blocks)]
-        places, start = [], len(rest)
-        for block in blocks:
-            places.append(f"[{block.number}, {start}, {len(block.data)}, {block.text}]")
-            start += len(block.data)
-        document = {"format": FORMAT, "version": VERSION, "tracker": node}
-        text = json.dumps(document, allow_nan=False)
-        head = f'{text[:-1]}, "blocks": [{", ".join(places)}]}}'.encode("ascii")
-        self._writing = atomic_write_in_steps(self._path, partial(_filling, head, parts))
+        with _uncollected():
+            node, rest, blocks = self._blocks.stored(tracker)
+        self._writing = atomic_write_in_steps(self._path, partial(_filling, node, rest, blocks))
 
     def finish(self) -> None:
         """Write all that is left to write.
@@ -153,26 +148,49 @@ def _lasting(tracker: Tracker) -> Iterator[object]:
         yield from tracker.smoother.entries.values()
 
 
-def _filling(head: bytes, parts: Sequence[bytes], stream: BinaryIO) -> Iterator[None]:
-    """Write JSON and bytes as :func:`numpy.savez` does, with their checksum, some with each step."""
-    sizes, digest = (len(head), sum(map(len, parts))), hashlib.sha256(len(head).to_bytes(8, "little"))
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without Python's search for circular garbage: so many lists at once would set it off for nothing."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _filling(node: Node, rest: bytes, blocks: Sequence[Block], stream: BinaryIO) -> Iterator[None]:
+    """Write a tracker as :func:`numpy.savez` does, with its checksum, some with each step."""
+    # 1. JSON, the blocks' as it is there already, and all bytes.
+    yield
+    head, parts = _head(node, len(rest), blocks), [rest, *(block.data for block in blocks)]
+    yield
+    # 2. The checksum of both.
+    digest = hashlib.sha256(len(head).to_bytes(8, "little"))
     for portion in _portions([head, *parts]):
         for part in portion:
             digest.update(part)
         yield
-    contents: list[tuple[int, Sequence[bytes]]] = [
-        (sizes[0], [head]),
-        (sizes[1], parts),
-        (digest.digest_size, [digest.digest()]),
-    ]
+    # 3. The file.
     with zipfile.ZipFile(stream, "w") as archive:
-        for name, (size, content) in zip(_MEMBERS, contents, strict=True):
+        for name, content in zip(_MEMBERS, ([head], parts, [digest.digest()]), strict=True):
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                array = {"descr": "|u1", "fortran_order": False, "shape": (size,)}
+                array = {"descr": "|u1", "fortran_order": False, "shape": (sum(map(len, content)),)}
                 np.lib.format.write_array_header_1_0(member, array)
                 for portion in _portions(content):
                     member.writelines(portion)
                     yield
+
+
+def _head(node: Node, start: int, blocks: Sequence[Block]) -> bytes:
+    """All JSON of a checkpoint; the blocks' bytes begin at ``start``."""
+    records = []
+    for block in blocks:
+        records.append(f"[{block.number}, {start}, {len(block.data)}, {block.text}]")
+        start += len(block.data)
+    text = json.dumps({"format": FORMAT, "version": VERSION, "tracker": node}, allow_nan=False)
+    return f'{text[:-1]}, "blocks": [{", ".join(records)}]}}'.encode("ascii")
 
 
 def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:

@@ -16,11 +16,10 @@ from numpy.typing import NDArray
 
 from factors.robust import RobustKernel
 from sst_graph.association.crowd import Outlines, Poses, Steps, Views
-from sst_graph.association.pairing import pair_by_time
+from sst_graph.association.pairing import nearest_images
 from sst_graph.association.search import rotation_matrices
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import GraphConfig, Tracks
-from sst_graph.problem.trajectory import TwistSample
 from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
 
@@ -51,7 +50,6 @@ class Field:
 
     def __init__(self, parts: Sequence[_Part], tracks: Tracks, config: GraphConfig) -> None:
         self._parts, self._tracks, self.config = parts, tracks, config
-        self._twists: dict[tuple[int, int], TwistSample | None] = {}
         self.biases = sum(len(part.outlines.classes) for part in parts)
 
     @classmethod
@@ -108,29 +106,20 @@ class Field:
 
     def _views(self, part: _Part, offsets: FloatArray) -> Views:
         """The image of each scan under each offset, and the LiDAR's motion then."""
-        drive = part.drive
-        shape = (len(offsets), len(drive.scans))
-        images, taus = np.full(shape, -1, np.intp), np.zeros(shape)
-        twists, accelerations = np.zeros((*shape, 6)), np.zeros((*shape, 6))
-        limit = self.config.max_interval_periods * drive.image_period_s
-        values, which = np.unique(offsets, return_inverse=True)
-        for number, offset_s in enumerate(values.tolist()):
-            same = np.flatnonzero(which.reshape(-1) == number)
-            for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, limit):
-                images[same, pair.scan], taus[same, pair.scan] = pair.image, pair.base_tau_s
-                sample = self._twist(part, drive.images[pair.image].stamp_ns + round(offset_s * 1e9))
-                if sample is not None:
-                    twists[same, pair.scan] = sample.twist
-                    accelerations[same, pair.scan] = sample.acceleration
-        moves = bool(twists.any())
-        return Views(images, taus, twists if moves else None, accelerations if moves else None)
-
-    def _twist(self, part: _Part, stamp_ns: int) -> TwistSample | None:
-        """The LiDAR's twist, near enough in time."""
-        key = (part.number, stamp_ns // _NEAR_NS)
-        if key not in self._twists:
-            self._twists[key] = self._tracks.at(part.number, key[1] * _NEAR_NS + _NEAR_NS // 2)
-        return self._twists[key]
+        drive, limit = part.drive, self.config.max_interval_periods * part.drive.image_period_s
+        stamps = np.array(drive.image_stamps_ns)
+        images, taus = nearest_images(drive.scan_stamps_ns, drive.image_stamps_ns, offsets, limit)
+        seen = images >= 0
+        # Twists that are near enough in time are one.
+        shifts = np.rint(1e9 * offsets).astype(np.int64)[:, None]
+        near, which = np.unique((stamps[images] + shifts)[seen] // _NEAR_NS, return_inverse=True)
+        samples = self._tracks.at_all(part.number, (near * _NEAR_NS + _NEAR_NS // 2).tolist())
+        if samples is None or not samples.twists.any():
+            return Views(images, taus, None, None)
+        twists, accelerations = np.zeros((2, *images.shape, 6))
+        twists[seen] = samples.twists[which.reshape(-1)]
+        accelerations[seen] = samples.accelerations[which.reshape(-1)]
+        return Views(images, taus, twists, accelerations)
 
 
 def hold_heat(field: Field, poses: Poses, centres: Poses, kernels_px: Sequence[float]) -> Poses:

@@ -5,29 +5,26 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from factors import residuals
 from factors.robust import RobustKernel
 from sst_graph.config import Settings, setting
 from sst_graph.errors import EstimationError
 from sst_graph.problem.drive import Drive, Progress
-from sst_graph.problem.graph import (
-    GraphConfig,
-    PairMatches,
-    Tracks,
-    associate,
-    joint_graph,
-    state_from,
-)
+from sst_graph.problem.frozen import FrozenProblem
+from sst_graph.problem.graph import GraphConfig, PairMatches, Tracks, joint_graph
+from sst_graph.problem.matching import DriveMatches, match_all, outlines_of
 from sst_graph.problem.objects import object_tracks
-from sst_graph.problem.state import EXTRINSIC, State, delay_key
+from sst_graph.problem.state import State
 from sst_graph.stepwise import Stepwise, whole
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
 
+FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 CONCENTRATION_SCALES = (1.0, 5.0)
@@ -72,7 +69,8 @@ class JointSolution:
 
     Attributes:
         state: the estimate.
-        pairs: its matches.
+        matches: its matches, drive by drive, and
+        pairs: pair by pair.
         graph, values: the last frozen graph and its optimum.
         outer_iterations: outer iterations done.
         converged: the last step was short beside the frozen problem's own uncertainty.
@@ -80,6 +78,7 @@ class JointSolution:
     """
 
     state: State
+    matches: Sequence[DriveMatches]
     pairs: list[PairMatches]
     graph: gtsam.NonlinearFactorGraph
     values: gtsam.Values
@@ -125,58 +124,70 @@ def solving_joint(
         tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
     state, converged, outer = start, False, 0
     guess = start if guess is None else guess
+    outlines = outlines_of(drives, tracks, config.graph)
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
         scale = config.kernel_px[min(outer, len(config.kernel_px) - 1)]
-        kernel = RobustKernel("geman_mcclure", scale)
-        pairs = associate(drives, tracks, state, kernel, config.graph)
-        _check_matches(pairs, config)
+        matches = match_all(outlines, state, RobustKernel("geman_mcclure", scale))
+        pairs = sum(len(own.paired) for own in matches)
+        _check_matches(sum(map(len, matches)), pairs, config)
         # 2. Inner optimisation with the matches frozen.
-        graph, values = joint_graph(pairs, state, config.graph, guess)
-        if belief is not None:
-            graph.add(belief)
-        values = _optimise(graph, values, config.inner_iterations)
+        problem = FrozenProblem(matches, state, config.graph, guess, belief)
+        optimum, system = problem.optimum(config.inner_iterations)
         # 3. Move, by less and less of the step when matches come and go in turn.
         rested = outer + 1 - len(config.kernel_px)
         share = 1.0 / (1.0 + max(0, rested - config.full_steps))
-        last, state = state, state.towards(state_from(values, state, pairs), share)
+        state = state.towards(problem.state_at(optimum), share)
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
-        yield len(pairs)
+        yield pairs
         # 4. Stop when the step is small at the last scale.
         if rested >= 0:
-            step = _step_sigmas(last, pairs, graph, values)
+            step = problem.step_sigmas(optimum, system)
             if share * step < config.step_sigmas:
                 converged = step < config.circle_sigmas
                 break
-    _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, len(pairs))
-    return JointSolution(state, pairs, graph, values, outer + 1, converged, last)
+    # 5. The last frozen problem as a graph.
+    found = [pair for own in matches for pair in own.by_pair()]
+    graph, _ = joint_graph(found, problem.state, config.graph, guess)
+    if belief is not None:
+        graph.add(belief)
+    _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
+    values = problem.values_at(optimum)
+    return JointSolution(state, matches, found, graph, values, outer + 1, converged, problem.state)
 
 
 def support(solution: JointSolution) -> float:
     """How much agrees with a solution: its matches, each counted by its robust weight."""
-    return _support(solution.pairs, solution.state)
+    return _support(solution.matches, solution.state)
 
 
-def _support(pairs: Sequence[PairMatches], state: State) -> float:
-    return sum(support_of(pairs, state).values())
+def _support(matches: Sequence[DriveMatches], state: State) -> float:
+    return sum(float(robust_weights(own, state).sum()) for own in matches)
+
+
+def robust_weights(matches: DriveMatches, state: State) -> FloatArray:
+    """(m,) robust weight of each match of a drive at a state, with the mask bias of its class."""
+    alignment, number = matches.alignment, matches.number
+    biases = [state.biases_px.get((number, c), 0.0) for c in matches.group_classes]
+    twists = matches.c_twists[matches.pair_of].T
+    bias_px = np.repeat(biases, matches.counts)
+    r, _ = residuals(alignment, state.cTl, state.offset_s(number), twists, bias_px, jacobians=False)
+    return alignment.kernel.weight(r / alignment.sigmas_px)
 
 
 def support_of(
-    pairs: Sequence[PairMatches], state: State, side: int | None = None
+    matches: Sequence[DriveMatches], state: State, side: int | None = None
 ) -> dict[SemanticClass, float]:
     """How much agrees with a state, by class: matches, of all sides or one, counted by robust weight."""
     total: dict[SemanticClass, float] = {}
-    for pair in pairs:
-        for c, matches in pair.matches.items():
-            alignment = matches.alignment
-            if side is not None:
-                alignment = alignment.take(np.flatnonzero(matches.sides == side))
-            bias = state.biases_px.get((pair.drive, c), 0.0)
-            offset_s, c_twist = state.offset_s(pair.drive), pair.motion.c_twist
-            r, _ = residuals(alignment, state.cTl, offset_s, c_twist, bias, jacobians=False)
-            weight = float(alignment.kernel.weight(r / alignment.sigmas_px).sum())
-            total[c] = total.get(c, 0.0) + weight
+    for own in matches:
+        weights = robust_weights(own, state)
+        if side is not None:
+            weights = np.where(own.found.sides == side, weights, 0.0)
+        for c, (a, b) in zip(own.group_classes, pairwise(own.found.bounds.tolist()), strict=True):
+            if b > a:
+                total[c] = total.get(c, 0.0) + float(weights[a:b].sum())
     return total
 
 
@@ -189,8 +200,8 @@ def concentration(
     was fitted to some contours leaves all distances.
     """
     kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * config.kernel_px[-1])
-    pairs = associate(drives, tracks, solution.state, kernel, config.graph)
-    return support(solution) / max(_support(pairs, solution.state), 1e-9)
+    matches = match_all(outlines_of(drives, tracks, config.graph), solution.state, kernel)
+    return support(solution) / max(_support(matches, solution.state), 1e-9)
 
 
 def explained(solution: JointSolution) -> float:
@@ -207,36 +218,12 @@ def agreement(solution: JointSolution) -> float:
 
 
 def _seen(solution: JointSolution) -> int:
-    return max(1, sum(matches.seen for pair in solution.pairs for matches in pair.matches.values()))
+    return max(1, sum(int(own.found.seen[own.counts > 0].sum()) for own in solution.matches))
 
 
-def _check_matches(pairs: Sequence[PairMatches], config: JointConfig) -> None:
-    matches = sum(len(pair) for pair in pairs)
+def _check_matches(matches: int, pairs: int, config: JointConfig) -> None:
     if matches < config.min_matches:
         raise EstimationError(
-            f"{matches} silhouette matches in {len(pairs)} pairs of scan and image, "
+            f"{matches} silhouette matches in {pairs} pairs of scan and image, "
             f"expected {config.min_matches} or more"
         )
-
-
-def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
-    params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(iterations)
-    params.setlambdaInitial(1e-6)
-    params.setRelativeErrorTol(1e-7)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-
-
-def _step_sigmas(
-    last: State, pairs: Sequence[PairMatches], graph: gtsam.NonlinearFactorGraph, values: gtsam.Values
-) -> float:
-    """Length of the step from ``last`` to the optimum, in standard deviations of the frozen problem."""
-    unknowns = Unknowns.of(last, pairs)
-    covariance = marginal_covariance(graph, values, unknowns)
-    size = 6 + len(last.offsets_s)
-    rotation_translation = gtsam.Pose3.Logmap(last.cTl.between(values.atPose3(EXTRINSIC)))
-    offsets = [
-        values.atVector(delay_key(clock))[0] - offset_s for clock, offset_s in enumerate(last.offsets_s)
-    ]
-    step = np.concatenate([rotation_translation, offsets])
-    return float(np.sqrt(step @ np.linalg.solve(covariance[:size, :size], step)))

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from factors.robust import RobustKernel
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint, support_of
+from sst_graph.estimators.joint import JointConfig, JointSolution, robust_weights, solve_joint
 from sst_graph.estimators.motion import difference
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.graph import Tracks, associate
+from sst_graph.problem.graph import Tracks
+from sst_graph.problem.matching import match_all, outlines_of
 from sst_graph.problem.objects import ObjectId, tracks_of_scans
 from sst_graph.problem.state import State
 from sst_graph.uncertainty.assumptions import AssumptionConfig, consider
@@ -116,6 +117,7 @@ class Parts:
         drive, tracks = self.drives[part.drive].part(part.scans), self.tracks.part(part.drive, part.scans)
         kernel = RobustKernel("geman_mcclure", self.kernel_px[-1])
         found = np.zeros(len(part.scans))
-        for pair in associate([drive], tracks, state, kernel, self.joint.graph):
-            found[pair.pair.scan] += sum(support_of([pair], state).values())
+        for own in match_all(outlines_of([drive], tracks, self.joint.graph), state, kernel):
+            scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]
+            found += np.bincount(scans, robust_weights(own, state), len(found))
         return found

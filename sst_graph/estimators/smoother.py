@@ -202,9 +202,7 @@ class WindowSmoother:
 
     def relinearize(self) -> None:
         """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
-        values = self.isam.calculateEstimate()
-        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
-        self._go_on_with(isam, list(isam.update(self._held(), values).getNewFactorsIndices()))
+        self._go_on_with(*self._linearized(self.isam.calculateEstimate(), self._held()))
 
     def _held(self) -> gtsam.NonlinearFactorGraph:
         """As :meth:`_whole`, the very factors that iSAM2 holds."""
@@ -229,10 +227,13 @@ class WindowSmoother:
             graph.add(self.twist_factor(self.entries[twist.scan]))
         return graph
 
-    def _linearized(self, values: gtsam.Values) -> tuple[gtsam.ISAM2, list[int]]:
-        """A fresh iSAM2 of all factors at some values, and the factors' indices."""
+    def _linearized(
+        self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
+    ) -> tuple[gtsam.ISAM2, list[int]]:
+        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
         isam = gtsam.ISAM2(_parameters(self.graph.estimate))
-        return isam, list(isam.update(self._whole(), values).getNewFactorsIndices())
+        whole = self._whole() if graph is None else graph
+        return isam, list(isam.update(whole, values).getNewFactorsIndices())
 
     def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
         """Go on with an iSAM2 of :meth:`_whole`."""

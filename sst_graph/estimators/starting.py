@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,12 +11,14 @@ import numpy as np
 
 from factors.errors import FactorError
 from sst_graph.errors import SstGraphError
+from sst_graph.estimators.epochs import Found
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.known import Known
 from sst_graph.estimators.matcher import WindowMatcher
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.estimators.tracker_start import Guess, estimating_first, prior_belief
+from sst_graph.estimators.undersides import UndersideSupport
 from sst_graph.estimators.window import Window
 from sst_graph.problem.drive import Drive
 from sst_graph.stepwise import Stepwise
@@ -97,6 +100,44 @@ class Search:
         return {**vars(self), "_run": None}
 
 
+_LOOK_WORK, _MATCH_WORK = 2, 1
+"""To look below a scan, and to match one, in units of work."""
+
+
+class Entering:
+    """A graph of some scans at a first estimate, made of their matches some with each frame.
+
+    First the edges towards the ground are looked at, then each scan is matched.
+
+    Attributes:
+        point: the estimate.
+        chosen: numbers of the scans.
+        waiting: those whose turn is still to come.
+        below: support of the edges towards the ground so far; None when it is known.
+        found: matches so far, by scan.
+    """
+
+    def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
+        self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
+        self.below = None if config.calibration.undersides.use == "never" else UndersideSupport()
+        self.found: dict[int, Found] = {}
+
+    def advance(self, matcher: WindowMatcher, work: int | None) -> bool:
+        """Some of it (None: all of this pass); whether all scans have been matched."""
+        below = self.below
+        each = _MATCH_WORK if below is None else _LOOK_WORK
+        count = len(self.waiting) if work is None else max(1, work // each)
+        some, self.waiting = self.waiting[:count], self.waiting[count:]
+        if below is None:
+            self.found |= matcher.match(self.point, some)[0]
+        else:
+            self.below = below.plus(matcher.support_below(self.point, some))
+        if self.below is not None and not self.waiting:
+            matcher.match_below(self.below)
+            self.below, self.waiting = None, self.chosen
+        return not self.waiting
+
+
 class Starting:
     """When a start is tried, and from where.
 
@@ -106,6 +147,7 @@ class Starting:
         attempts: how many have failed.
         alarmed: an alarm went before, and nothing has been found since.
         search: what is being looked for, if anything is.
+        entering: an estimate that was found, and the graph that is being made at it.
     """
 
     def __init__(self, guess: Guess, config: TrackerConfig) -> None:
@@ -113,10 +155,16 @@ class Starting:
         self.waited = self.attempts = 0
         self.alarmed = False
         self.search: Search | None = None
+        self.entering: Entering | None = None
 
     def begin(self, guess: Guess, scans: int) -> None:
         """From a guess, with some scans that are there already."""
-        self.guess, self.waited, self.search = guess, scans, None
+        self.guess, self.waited, self.search, self.entering = guess, scans, None, None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether a start is being made."""
+        return self.search is not None or self.entering is not None
 
     @property
     def needed(self) -> int:
@@ -129,12 +177,15 @@ class Starting:
         Raises:
             EstimationError: none was found; or another of :data:`EXPECTED`.
         """
-        if self.search is None:
-            if not self._due(matcher.window):
-                return None
+        if not self.under_way and self._due(matcher.window):
             self.search = self._search(matcher.window)
-        point = self.search.go_on(self.config.start_work or None)
-        return None if point is None else self._started(matcher, point)
+        if self.search is not None:
+            point = self.search.go_on(self.config.start_work or None)
+            if point is not None:
+                self._enter(matcher.window, point)
+            if self.config.start_work > 0:
+                return None
+        return None if self.entering is None else self._entered(matcher, self.config.start_work or None)
 
     def finish(self, matcher: WindowMatcher) -> Started | None:
         """All that is left to do, at the end of a drive; None where too few scans have come.
@@ -143,17 +194,19 @@ class Starting:
             EstimationError: none was found; or another of :data:`EXPECTED`.
         """
         window = matcher.window
-        if self.search is None and (len(window.scans) < self.needed or not window.images):
-            return None
-        search = self.search or self._search(window)
-        try:
-            point = search.go_on(None)
-        except EXPECTED:
-            if search.drive.scans[-1] is window.scans[-1][1]:
-                raise
-            point = self._search(window).go_on(None)
-        assert point is not None
-        return self._started(matcher, point)
+        if self.entering is None:
+            if self.search is None and (len(window.scans) < self.needed or not window.images):
+                return None
+            search = self.search or self._search(window)
+            try:
+                point = search.go_on(None)
+            except EXPECTED:
+                if search.drive.scans[-1] is window.scans[-1][1]:
+                    raise
+                point = self._search(window).go_on(None)
+            assert point is not None
+            self._enter(window, point)
+        return self._entered(matcher, None)
 
     def _due(self, window: Window) -> bool:
         """Whether a start is tried with the scan that has come."""
@@ -169,20 +222,27 @@ class Starting:
         drive = replace(drive, scans=scans, lidar_motions=motions)
         return Search(drive, self.guess, self.config)
 
-    def _started(self, matcher: WindowMatcher, point: Point) -> Started:
-        """A graph of the latest scans that goes on from an estimate."""
-        window, config = matcher.window, self.config
-        most = len(window.scans) if config.start_work == 0 else self.needed
+    def _enter(self, window: Window, point: Point) -> None:
+        """Begin with a graph of the latest scans, that goes on from an estimate."""
+        most = len(window.scans) if self.config.start_work == 0 else self.needed
         chosen = [number for number, _ in window.scans][-most:]
-        graph = config.calibration.joint.graph
-        if config.calibration.undersides.use != "never":
-            matcher.match_below(matcher.support_below(point, chosen))
+        self.search, self.entering = None, Entering(point, chosen, self.config)
+
+    def _entered(self, matcher: WindowMatcher, work: int | None) -> Started | None:
+        """Some work on the graph (None: all that is left); the graph, once it is made."""
+        entering, window, config = self.entering, matcher.window, self.config
+        assert entering is not None
+        while not entering.advance(matcher, work):
+            if work is not None:
+                return None
+        graph, point = config.calibration.joint.graph, entering.point
         prior = prior_belief(point, self.guess, matcher.classes, graph)
-        start_ns = window.stamps_ns()[chosen[0]]
+        found = {scan: one for scan, one in entering.found.items() if scan >= window.first_scan}
+        stamps = window.stamps_ns()
+        start_ns = min(stamps[scan] for scan in entering.chosen if scan in stamps)
         smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift)
-        found, _ = matcher.match(point, chosen)
         smoother.update(found, set(), window.first_scan, window.objects.live)
-        return Started(smoother, Known.of(smoother), len(chosen))
+        return Started(smoother, Known.of(smoother), len(entering.chosen))
 
     def catch_up(self) -> None:
         """Come as far with what is being looked for as one that was not stored has."""
@@ -193,11 +253,12 @@ class Starting:
     def failed(self) -> None:
         """An attempt has failed; after some, the search begins anew."""
         self.attempts += 1
-        self.search = None
+        self.search = self.entering = None
         if self.attempts >= self.config.start_attempts:
             # The last estimate leads nowhere: look all around it.
             self.guess = Guess(self.guess.cTl, self.guess.offset_s)
 
     def succeeded(self) -> None:
         """There is an estimate."""
-        self.alarmed, self.attempts, self.waited, self.search = False, 0, 0, None
+        self.alarmed, self.attempts, self.waited = False, 0, 0
+        self.search = self.entering = None

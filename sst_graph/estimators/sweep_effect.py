@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from sst_graph.estimators.joint import JointConfig, JointSolution
 from sst_graph.odometry.sweep import REMEDY, SweepTiming
 from sst_graph.problem.drive import Drive
-from sst_graph.problem.graph import PairMatches, joint_graph
-from sst_graph.problem.state import EXTRINSIC, delay_key
+from sst_graph.problem.frozen import FrozenProblem
+from sst_graph.problem.matching import DriveMatches
 
 FloatArray = NDArray[np.float64]
 
@@ -67,29 +67,23 @@ def sweep_step(
     Args:
         timings: by number of the drive; the points of all others keep their times.
     """
-    pairs = [
-        _retimed(pair, timings[pair.drive]) if pair.drive in timings else pair for pair in solution.pairs
+    retimed = [
+        _retimed(own, timings[own.number]) if own.number in timings else own for own in solution.matches
     ]
-    states = []
-    for used in (solution.pairs, pairs):
-        graph, values = joint_graph(used, solution.state, config.graph)
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(_ITERATIONS)
-        values = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-        states.append((values.atPose3(EXTRINSIC), float(values.atVector(delay_key())[0])))
-    (before, offset_s), (after, other_s) = states
-    return np.append(gtsam.Pose3.Logmap(before.between(after)), other_s - offset_s)
+    before, after = (
+        FrozenProblem(used, solution.state, config.graph).optimum(_ITERATIONS)[0]
+        for used in (solution.matches, retimed)
+    )
+    step = gtsam.Pose3.Logmap(before.cTl.between(after.cTl))
+    return np.append(step, after.scalars[0] - before.scalars[0])
 
 
 _ITERATIONS = 10
 
 
-def _retimed(pair: PairMatches, timing: SweepTiming) -> PairMatches:
+def _retimed(matches: DriveMatches, timing: SweepTiming) -> DriveMatches:
     """The matches with times by azimuth for points that shared the stamp."""
-    matches = {}
-    for c, found in pair.matches.items():
-        alignment = found.alignment
-        offsets_s = timing.offsets_s(alignment.lPs.astype(np.float32)).astype(np.float64)
-        alignment = replace(alignment, base_taus_s=alignment.base_taus_s - offsets_s)
-        matches[c] = replace(found, alignment=alignment)
-    return replace(pair, matches=matches)
+    alignment = matches.alignment
+    offsets_s = timing.offsets_s(alignment.lPs.astype(np.float32)).astype(np.float64)
+    alignment = replace(alignment, base_taus_s=alignment.base_taus_s - offsets_s)
+    return replace(matches, found=replace(matches.found, alignment=alignment))

@@ -14,7 +14,7 @@ from sst_graph.association.pairing import pair_by_time
 from sst_graph.assumptions import named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.adoption import held_out_cost
-from sst_graph.estimators.contest import choosing_start
+from sst_graph.estimators.contest import choosing_start, narrowed
 from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.joint import JointConfig, explained, solving_joint
 from sst_graph.estimators.tracker_config import TrackerConfig
@@ -56,8 +56,7 @@ class _Solved:
 
     def turned_from(self, other: _Solved) -> bool:
         """Whether the two are poses of different basins."""
-        turn = gtsam.Rot3.Logmap(self.point.cTl.between(other.point.cTl).rotation())
-        return float(np.linalg.norm(turn)) > _OTHER_BASIN_RAD
+        return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
 class _Unsettled(EstimationError):
@@ -84,10 +83,18 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
         EstimationError: too little to see, an ambiguous start, or a solution that did not settle, or did
             while one that did not explains the labels better.
     """
-    reach = config.calibration.start.search.delay_s
-    free = guess.search and reach > 0.0
-    delays = (0.0, reach) if free else (0.0,)
-    solved, failed = yield from _tried([_best(drive, guess, config, delay_s) for delay_s in delays])
+    searched = guess.search or guess.cTl is None
+    reach = config.calibration.start.search.delay_s if guess.search else 0.0
+    # 1. Candidates, with time offsets around the guess's.
+    starts = yield from _starts(drive, guess, config, reach)
+    # 2. Their poses with the guess's time offset; then as they are.
+    held = [State(start.cTl, (guess.offset_s,)) for start in _of_other_basins(starts)]
+    if searched:
+        # The contest has led them near.
+        joint = narrowed(config.calibration.joint)
+        config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, joint=joint))
+    ways = [held, starts] if reach > 0.0 else [starts]
+    solved, failed = yield from _tried([_best(drive, way, config) for way in ways])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -96,6 +103,19 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
             best = other
     _refuse_beside(best, failed, config)
     return best.point
+
+
+def _of_other_basins(starts: Sequence[State]) -> list[State]:
+    """The starts that are not in the basin of one before."""
+    chosen: list[State] = []
+    for start in starts:
+        if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
+            chosen.append(start)
+    return chosen
+
+
+def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
 def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
@@ -127,13 +147,12 @@ def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: Tra
             )
 
 
-def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[_Solved]:
-    """The best of the solutions from all candidates with offsets within ``delay_s`` of the guess's.
+def _best(drive: Drive, starts: Sequence[State], config: TrackerConfig) -> Stepwise[_Solved]:
+    """The best of the solutions from some starts.
 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    starts = yield from _starts(drive, guess, config, delay_s)
     solved, failed = yield from _tried([_solution(drive, start, config) for start in starts])
     if not solved:
         if reached := _unsettled(failed):
@@ -150,7 +169,8 @@ def _best(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> 
 
 
 def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
-    """Where the solutions begin: the winners of the batch's contest, or the guess itself.
+    """Where the solutions begin: the winners of the batch's contest, with offsets within ``delay_s`` of the
+    guess's, or the guess itself.
 
     Raises:
         EstimationError: nothing to search for, or no guess and no search.

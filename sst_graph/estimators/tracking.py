@@ -192,9 +192,8 @@ class Tracking:
             return self.answer(stamp_ns, f"no start yet: {' '.join(str(error).split())}")
         if started is not None:
             return self.begin(started, stamp_ns)
-        search = self.starting.search
-        looks = "collecting frames for a start" if search is None else "looking for a start"
-        return self.answer(stamp_ns, looks)
+        under_way = self.starting.under_way
+        return self.answer(stamp_ns, "looking for a start" if under_way else "collecting frames for a start")
 
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""

@@ -23,7 +23,8 @@ from sst_graph.estimators.joint import (
     support_of,
 )
 from sst_graph.problem.drive import Drive, PrepareConfig, Progress
-from sst_graph.problem.graph import Tracks, associate
+from sst_graph.problem.graph import Tracks
+from sst_graph.problem.matching import match_all, outlines_of
 from sst_graph.problem.state import State
 from sst_graph.types import SemanticClass
 
@@ -140,11 +141,10 @@ def underside_support(
     """Support of the undersides of some scans at a state."""
     classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
     graph = replace(joint.graph, undersides=tuple(sorted(classes)))
+    outlines = outlines_of(drives, tracks, graph)
     narrow, wide = (
         support_of(
-            associate(
-                drives, tracks, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1]), graph
-            ),
+            match_all(outlines, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1])),
             state,
             BOTTOM,
         )

@@ -28,9 +28,16 @@ def compensate_sweep(points: FloatArray, offsets_s: FloatArray, twist: FloatArra
         truncation is 2e-5 of the range.
     """
     omega, v = twist[:3], twist[3:]
-    rate = np.cross(omega, points) + v
+    rate = _turned(omega, points) + v
     t = offsets_s[:, None]
-    return np.asarray(points + t * (rate + 0.5 * t * np.cross(omega, rate)))
+    return np.asarray(points + t * (rate + 0.5 * t * _turned(omega, rate)))
+
+
+def _turned(omega: FloatArray, points: FloatArray) -> FloatArray:
+    """(n, 3) omega x points; several times faster than ``np.cross``."""
+    a, b, c = omega
+    x, y, z = points.T
+    return np.stack([b * z - c * y, c * x - a * z, a * y - b * x], axis=1)
 
 
 def usable_points(

@@ -250,9 +250,9 @@ def _line_distance(
     J[:, :3] = _cross(fb, line_b)
     J[:, 3:] = _cross(gb, fa) @ basis
     # The length of the line's normal turns with the motion, too.
-    line_H_motion = np.concatenate([skew(line_b), aRb.T @ skew(fa) @ basis], axis=2)
-    normal = np.column_stack([line_b[:, 0] / camera.fx**2, line_b[:, 1] / camera.fy**2])
-    J -= (error / length**2)[:, None] * np.einsum("ni,nij->nj", normal, line_H_motion[:, :2])
+    normal = line_b * [camera.fx**-2, camera.fy**-2, 0.0]
+    turn = np.column_stack([_cross(normal, line_b), _cross(normal @ aRb.T, fa) @ basis])
+    J -= (error / length**2)[:, None] * turn
     return error / length, J / length[:, None]
 
 

@@ -24,6 +24,7 @@ from sst_graph.odometry.sweep import SweepDecision, SweptSource
 from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
 from sst_graph.problem.survey import Survey, Surveyor
 from sst_graph.problem.trajectory import GrowingTrack, TwistTrack
+from sst_graph.shelf import Shelf, shelvable
 from sst_graph.storage import PackedArray
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_image, checked_scan
@@ -56,6 +57,7 @@ class PrepareConfig(Settings):
     sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
 
 
+@shelvable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
 @dataclass(frozen=True)
 class ScanFeatures:
     """What is kept of a scan.
@@ -82,7 +84,19 @@ class ScanFeatures:
     depth_offsets_s: NDArray[np.float32]
     undersides: dict[SemanticClass, Boundaries] = field(default_factory=dict)
 
+    def on(self, shelf: Shelf) -> ScanFeatures:
+        """The same with its points on a shelf, in the precision of the scan's."""
+        return replace(
+            self,
+            lPs=shelf.put(self.lPs.astype(np.float32), np.float64),
+            classes=shelf.put(self.classes),
+            offsets_s=shelf.put(self.offsets_s.astype(np.float32), np.float64),
+            depth_lPs=shelf.put(self.depth_lPs),
+            depth_offsets_s=shelf.put(self.depth_offsets_s),
+        )
 
+
+@shelvable("mask")
 @dataclass(frozen=True)
 class ImageFeatures:
     """What is kept of an image: its mask and the signed distance to each class's contour.
@@ -96,6 +110,11 @@ class ImageFeatures:
     stamp_ns: int
     mask: NDArray[np.uint8]
     contours: dict[SemanticClass, ContourMap]
+
+    def on(self, shelf: Shelf) -> ImageFeatures:
+        """The same with mask and distances on a shelf."""
+        contours = {c: contour.on(shelf) for c, contour in self.contours.items()}
+        return replace(self, mask=shelf.put(self.mask), contours=contours)
 
     def __getstate__(self) -> dict[str, Any]:
         """The mask, packed, and the picture's edges, not the distances that follow from them."""
@@ -188,7 +207,7 @@ class Drive:
     def image_stamps_ns(self) -> list[int]:
         return [image.stamp_ns for image in self.images]
 
-    @property
+    @cached_property
     def image_period_s(self) -> float:
         """Median interval between images [s]; 0.1 for a single one."""
         stamps = self.image_stamps_ns
@@ -198,7 +217,7 @@ class Drive:
         """The drive with some of its scans only, by position, rising; all images and motions stay."""
         return replace(self, scans=tuple(self.scans[position] for position in scans))
 
-    @property
+    @cached_property
     def scan_period_s(self) -> float:
         """Median interval between scans [s]; 0.1 for a single one."""
         stamps = self.scan_stamps_ns
@@ -218,8 +237,12 @@ def prepare_drive(
     classes: Sequence[SemanticClass],
     config: PrepareConfig | None = None,
     progress: Progress | None = None,
+    depth: bool = True,
 ) -> Drive:
-    """Read every frame of a source once and keep what calibration needs.
+    """Read every frame of a source once and keep what calibration needs, most of it on a shelf.
+
+    Args:
+        depth: keep points for the depth of image features, where these are tracked.
 
     Raises:
         DataError: the source has no scan or no image, its stamps do not rise, or the arrays of one are not
@@ -230,7 +253,7 @@ def prepare_drive(
     tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor = LeftOut(), Surveyor(total)
+    left_out, surveyor, shelf = LeftOut(), Surveyor(total), Shelf()
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
@@ -239,14 +262,14 @@ def prepare_drive(
             motion = odometry.add(frame.scan)
             if motion is not None:
                 motions.append(motion)
-            scans.append(scan_features(frame.index, frame.scan, classes, config))
+            scans.append(scan_features(frame.index, frame.scan, classes, config, depth).on(shelf))
         if frame.image is not None:
             if config.use_visual_odometry:
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
                     pairs.append(ImagePair(tracks, direction))
-            images.append(image_features(frame.index, frame.image, classes, config.picture))
+            images.append(image_features(frame.index, frame.image, classes, config.picture).on(shelf))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
@@ -276,15 +299,15 @@ def _checked(frame: Frame, camera: PinholeCamera, place: str) -> Frame:
 
 
 def scan_features(
-    index: int, scan: Scan, classes: Sequence[SemanticClass], config: PrepareConfig
+    index: int, scan: Scan, classes: Sequence[SemanticClass], config: PrepareConfig, depth: bool = True
 ) -> ScanFeatures:
     """Boundaries of a scan and a sample of its points."""
     offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
     chosen = _sample(scan, config.sample_points)
-    depth = np.zeros(0, dtype=np.intp)
-    if config.use_visual_odometry:
+    deep = np.zeros(0, dtype=np.intp)
+    if depth and config.use_visual_odometry:
         near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
-        depth = near[:: max(1, len(scan.points) // 30_000)]
+        deep = near[:: max(1, len(scan.points) // 30_000)]
     boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary))
     return ScanFeatures(
         index,
@@ -293,8 +316,8 @@ def scan_features(
         scan.points[chosen].astype(np.float64),
         scan.classes[chosen],
         offsets[chosen].astype(np.float64),
-        scan.points[depth],
-        offsets[depth],
+        scan.points[deep],
+        offsets[deep],
         undersides,
     )
 

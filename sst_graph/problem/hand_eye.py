@@ -7,13 +7,14 @@ the very extrinsic that is sought.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from factors import delay_prior, hand_eye_factor, rotation_hand_eye
+from factors.custom import recipe_of
 from factors.robust import RobustKernel
 from sst_graph.config import Settings, setting
 from sst_graph.odometry.relative import DirectionMotion
@@ -149,7 +150,8 @@ def hand_eye_terms(
     The factors' noise is scaled so; robust weights are frozen at the state.
     """
     values = state_values(state)
-    turns, swerves = np.array([_sizes(_term(pair, state, NoiseScales()), values) for pair in pairs]).T
+    terms = [_term(pair, state) for pair in pairs]
+    turns, swerves = np.array([_sizes(term, values) for term in terms]).T
     directed = swerves[np.isfinite(swerves)]
     scales = NoiseScales(
         max(_scale(turns, 3), least_scale), max(_scale(directed, 2), least_scale) if len(directed) else 1.0
@@ -157,7 +159,7 @@ def hand_eye_terms(
     turn_weights = kernel.weight(turns / (scales.rotation * np.sqrt(3.0)))
     swerve_weights = kernel.weight(np.nan_to_num(swerves) / (scales.direction * np.sqrt(2.0)))
     weights = np.maximum(np.stack([turn_weights, swerve_weights], axis=1), 1e-6)
-    return [_term(pair, state, scales, w) for pair, w in zip(pairs, weights, strict=True)], scales
+    return [_scaled(term, scales, w) for term, w in zip(terms, weights, strict=True)], scales
 
 
 def _scale(sizes: FloatArray, freedom: int) -> float:
@@ -189,26 +191,19 @@ def state_values(state: State) -> gtsam.Values:
     return values
 
 
-def _term(
-    pair: MotionPair, state: State, scales: NoiseScales, weights: FloatArray | None = None
-) -> HandEyeTerm:
-    """The factor of a pair, its sigmas multiplied by the scales; weights (2,) of rotation and direction."""
+def _term(pair: MotionPair, state: State) -> HandEyeTerm:
+    """The factor of a pair, with the noise that the odometry claims."""
     step, motion = pair.lidar, pair.camera.motion
     predicted = state.cTl * step.aTb * state.cTl.inverse()
     length = float(np.linalg.norm(predicted.translation()))
     directed = motion.ok and length >= MIN_LENGTH_M
-    rows = 6 if directed else 3
     # 1. The noise of both motions as that of a pose of the predicted length.
     basis = np.asarray(gtsam.Unit3(motion.direction).basis())
     across = np.zeros((6, 5))
     across[:3, :3] = np.eye(3)
     across[3:, 3:] = length * pair.camera.rotation.matrix().T @ basis
     Ad = np.asarray(state.cTl.AdjointMap())
-    spread = np.repeat([scales.rotation, scales.direction], 3)
-    widened = spread if weights is None else spread / np.repeat(np.sqrt(weights), 3)
-    covariance = np.outer(widened, widened) * (
-        Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
-    )
+    covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     # 2. The factor.
     offset_0, turn = state.offsets_s[0], pair.camera.rotation
     if directed:
@@ -226,14 +221,25 @@ def _term(
     transfer = np.eye(6)
     d = motion.direction
     transfer[3:, 3:] = (np.eye(3) - np.outer(d, d)) / max(length, MIN_LENGTH_M) @ turn.matrix()
-    carried = (spread[:, None] * transfer @ Ad)[:rows]
-    return HandEyeTerm(
-        pair,
-        factor,
-        own,
-        0.5 * float(np.trace(np.linalg.solve(own, carried @ step.covariance_rate @ carried.T))),
-        carried,
-    )
+    carried = (transfer @ Ad)[: len(own)]
+    return HandEyeTerm(pair, factor, own, _noise_pull(own, carried, step), carried)
+
+
+def _scaled(term: HandEyeTerm, scales: NoiseScales, weights: FloatArray) -> HandEyeTerm:
+    """A term with its sigmas multiplied by the scales; weights (2,) of rotation and direction."""
+    spread = np.repeat([scales.rotation, scales.direction], 3)[: len(term.covariance)]
+    widened = spread / np.repeat(np.sqrt(weights), 3)[: len(spread)]
+    own, carried = np.outer(widened, widened) * term.covariance, spread[:, None] * term.rows_H_step
+    recipe = recipe_of(term.factor)
+    assert recipe is not None
+    factor = replace(recipe, noise=gtsam.noiseModel.Gaussian.Covariance(own)).build()
+    return HandEyeTerm(term.pair, factor, own, _noise_pull(own, carried, term.pair.lidar), carried)
+
+
+def _noise_pull(covariance: FloatArray, rows_H_step: FloatArray, step: PathStep) -> float:
+    """``noise_pull`` of a :class:`HandEyeTerm`."""
+    rate = rows_H_step @ step.covariance_rate @ rows_H_step.T
+    return 0.5 * float(np.trace(np.linalg.solve(covariance, rate)))
 
 
 def _sizes(term: HandEyeTerm, values: gtsam.Values) -> tuple[float, float]:

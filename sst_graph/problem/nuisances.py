@@ -13,9 +13,10 @@ from factors.alignment import Alignment, residuals
 from factors.motion import move_points
 from sst_graph.assumptions import ASSUMPTIONS, Effect, combined
 from sst_graph.assumptions.model import Scene
-from sst_graph.problem.trajectory import TwistSample
+from sst_graph.problem.trajectory import TwistSamples
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,15 @@ class Deviation:
         view = self.scene.view(lPs, offsets_s, uvs)
         return combined([(theta, ASSUMPTIONS[name].effect(view)) for name, theta in self.values.items()])
 
+    def take(self, index: IntArray) -> Deviation:
+        """Of some of the points, by position."""
+        return replace(self, scene=taken(self.scene, index))
+
+
+def taken(scene: Scene, index: IntArray) -> Scene:
+    """The scene of some of the points, by position."""
+    return scene if np.ndim(scene.image_s) == 0 else replace(scene, image_s=np.asarray(scene.image_s)[index])
+
 
 def deviation_of(nuisances: Mapping[str, float], scene: Scene) -> Deviation | None:
     """The deviation at these parameters; None where all are 0."""
@@ -42,21 +52,23 @@ def deviation_of(nuisances: Mapping[str, float], scene: Scene) -> Deviation | No
     return Deviation(values, scene) if values else None
 
 
-def moved_twist(
-    sample: TwistSample | None, nuisances: Mapping[str, float], scene: Scene
-) -> TwistSample | None:
-    """The LiDAR's twist as it is under the parameters, from the measured one."""
+def moved_twists(samples: TwistSamples, nuisances: Mapping[str, float], scene: Scene) -> TwistSamples:
+    """The LiDAR's twists as they are under the parameters, from the measured ones.
+
+    Args:
+        scene: with a row of ``l_twist`` for each.
+    """
     deviation = deviation_of(nuisances, scene)
-    if sample is None or deviation is None:
-        return sample
+    if deviation is None:
+        return samples
     shift = deviation.effect(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2))).twist_shift
-    return sample if shift is None else replace(sample, twist=sample.twist + shift)
+    return samples if shift is None else replace(samples, twists=samples.twists + shift)
 
 
 def residual_columns(
     alignment: Alignment,
     scene: Scene,
-    base_tau_s: float,
+    base_tau_s: float | FloatArray,
     pose: tuple[gtsam.Pose3, float, FloatArray],
     names: Iterable[str],
 ) -> dict[str, FloatArray]:
@@ -64,9 +76,9 @@ def residual_columns(
 
     Args:
         alignment: the matches.
-        scene: of their scan and image.
-        base_tau_s: stamp of the image minus that of the scan [s].
-        pose: the extrinsic, the time offset [s], and the camera's twist (6,) [rad/s, m/s].
+        scene: of their scan and image; of several with a row for each match.
+        base_tau_s: stamp of the image minus that of the scan, one for all or (n,) [s].
+        pose: the extrinsic, the time offset [s], and the camera's twist (6,) or (6, n) [rad/s, m/s].
         names: of the assumptions.
     """
     names = list(names)
@@ -79,7 +91,7 @@ def columns_beside(
     J: FloatArray,
     alignment: Alignment,
     scene: Scene,
-    base_tau_s: float,
+    base_tau_s: float | FloatArray,
     pose: tuple[gtsam.Pose3, float, FloatArray],
     names: Sequence[str],
 ) -> FloatArray:
@@ -110,7 +122,7 @@ def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effec
         assert alignment.normals is not None
         total += J[:, 13] * np.einsum("ij,ij->i", alignment.normals, effect.pixel_shift)
     if effect.twist_shift is not None:
-        total += J[:, 7:13] @ np.asarray(cTl.AdjointMap()) @ effect.twist_shift
+        total += (J[:, 7:13] @ np.asarray(cTl.AdjointMap()) * effect.twist_shift).sum(axis=1)
     return total
 
 
@@ -120,7 +132,6 @@ def _pixels(alignment: Alignment, cTl: gtsam.Pose3, offset_s: float, c_twist: Fl
     velocities = alignment.velocity_columns
     taus = alignment.taus_s(offset_s)
     moved = move_points(
-        cTl, lPs, taus, c_twist, alignment.c_acceleration, alignment.motion_model, velocities
+        cTl, lPs, taus, c_twist, alignment.c_acceleration.T, alignment.motion_model, velocities
     )
     return alignment.camera.project(moved.cPs.T)
-

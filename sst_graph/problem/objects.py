@@ -226,8 +226,13 @@ def standing_share(unknown_mps: float, tau_s: float, reach_m: float) -> float:
     Half where it comes as far as ``reach_m``; 0 far beyond it. Were it all or nothing, objects would come and
     go with the time offset's last millisecond, and the estimate with them.
     """
-    share = 1.0 / (1.0 + (unknown_mps * np.hypot(tau_s, _SHORTEST_S) / reach_m) ** 2)
-    return float(share) if share >= _LEAST_SHARE else 0.0
+    return float(standing_shares(np.array([unknown_mps]), np.array([tau_s]), reach_m)[0])
+
+
+def standing_shares(unknown_mps: FloatArray, taus_s: FloatArray, reach_m: float) -> FloatArray:
+    """(n,) the same of objects (n,) within intervals (n,)."""
+    shares = 1.0 / (1.0 + (unknown_mps * np.hypot(taus_s, _SHORTEST_S) / reach_m) ** 2)
+    return np.where(shares >= _LEAST_SHARE, shares, 0.0)
 
 
 def speed_of(times: FloatArray, centres: FloatArray, config: MovingConfig) -> float:

@@ -31,6 +31,26 @@ class TwistSample:
     covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class TwistSamples:
+    """Twists of a sensor at k instants.
+
+    Attributes:
+        twists, accelerations: (k, 6) [rad/s, m/s], and their rates of change.
+        covariances: (k, 6, 6) of the twists.
+    """
+
+    twists: FloatArray
+    accelerations: FloatArray
+    covariances: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.twists)
+
+    def __getitem__(self, number: int) -> TwistSample:
+        return TwistSample(self.twists[number], self.accelerations[number], self.covariances[number])
+
+
 class TwistTrack:
     """Twists over time: linear between the middles of the measured intervals,
     carried on for half an interval beyond the ends, constant from there.
@@ -48,22 +68,33 @@ class TwistTrack:
 
     def at(self, stamp_ns: int) -> TwistSample:
         """Twist and acceleration at a stamp of the sensor's clock."""
-        t = (stamp_ns - self._epoch) * 1e-9
-        n = len(self._middles)
+        return self.at_all([stamp_ns])[0]
+
+    def at_all(self, stamps_ns: Sequence[int]) -> TwistSamples:
+        """Twists and accelerations at several stamps of the sensor's clock."""
+        t = np.array([stamp - self._epoch for stamp in stamps_ns], np.float64) * 1e-9
+        k, n = len(t), len(self._middles)
         if n == 1:
-            return TwistSample(self._motions[0].mean_twist, np.zeros(6), _covariance(self._motions[0]))
-        i = int(np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2))
-        span = self._middles[i + 1] - self._middles[i]
-        before, after = self._motions[i : i + 2]
-        slope = (after.mean_twist - before.mean_twist) / span
-        fraction = float(np.clip((t - self._middles[i]) / span, -0.5, 1.5))
-        a, b = 1.0 - fraction, fraction
+            twist, covariance = self._motions[0].mean_twist, _covariance(self._motions[0])
+            return TwistSamples(np.tile(twist, (k, 1)), np.zeros((k, 6)), np.tile(covariance, (k, 1, 1)))
+        i = np.clip(np.searchsorted(self._middles, t) - 1, 0, n - 2)
+        used, place = np.unique(np.concatenate([i, i + 1]), return_inverse=True)
+        place = place.reshape(2, k)
+        known = [self._motions[number] for number in used.tolist()]
+        before, after = np.array([motion.mean_twist for motion in known]).reshape(-1, 6)[place]
+        spans = self._middles[i + 1] - self._middles[i]
+        slopes = (after - before) / spans[:, None]
+        fractions = np.minimum(np.maximum((t - self._middles[i]) / spans, -0.5), 1.5)
         # As if both erred together, which smoothed motions nearly do.
-        covariance = abs(a) * _covariance(before) + abs(b) * _covariance(after)
-        if not 0.0 <= fraction <= 1.0:
-            overshoot = span * (max(-fraction, fraction - 1.0))
-            covariance = covariance + np.diag((slope * overshoot) ** 2)
-        return TwistSample(before.mean_twist + fraction * span * slope, slope, covariance)
+        weights = np.abs([1.0 - fractions, fractions])[:, :, None, None]
+        covariances = np.array([_covariance(motion) for motion in known])[place]
+        total = weights[0] * covariances[0] + weights[1] * covariances[1]
+        beyond = np.maximum(np.maximum(-fractions, fractions - 1.0), 0.0)
+        total[:, _AXES, _AXES] += (slopes * (spans * beyond)[:, None]) ** 2
+        return TwistSamples(before + (fractions * spans)[:, None] * slopes, slopes, total)
+
+
+_AXES = np.arange(6)
 
 
 class GrowingTrack:
@@ -87,5 +118,12 @@ def _covariance(motion: RelativeMotion) -> FloatArray:
 def camera_twist(sample: TwistSample, cTl: gtsam.Pose3) -> TwistSample:
     """The camera's twist from the LiDAR's: c_twist = Ad(cTl) l_twist (rigidly joined sensors)."""
     Ad = np.asarray(cTl.AdjointMap())
-    covariance = Ad @ sample.covariance @ Ad.T
-    return TwistSample(Ad @ sample.twist, Ad @ sample.acceleration, 0.5 * (covariance + covariance.T))
+    covariance = camera_covariances(sample.covariance, cTl)
+    return TwistSample(Ad @ sample.twist, Ad @ sample.acceleration, covariance)
+
+
+def camera_covariances(l_covariances: FloatArray, cTl: gtsam.Pose3) -> FloatArray:
+    """(..., 6, 6) of the camera's twists, from those of the LiDAR's."""
+    Ad = np.asarray(cTl.AdjointMap())
+    covariances = Ad @ l_covariances @ Ad.T
+    return np.asarray(0.5 * (covariances + np.swapaxes(covariances, -1, -2)))

@@ -20,12 +20,15 @@ see :mod:`sst_graph.uncertainty.object_spread`.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csr_array
 
 from factors.alignment import weighted_residuals
 from factors.robust import RobustKernel
@@ -56,7 +59,7 @@ class MatchTable:
 
     Attributes:
         J: (m, n) rows multiplied by sqrt(robust weight) / sigma, motion marginalised out: the bread times a
-            row is how the answer follows the residual.
+            row is how the answer follows the residual. Sparse: a frame sees few of a long drive's objects.
         root_weights: (m,) sqrt(robust weight).
         curvatures: (m,) second derivative of the robust loss (its slope over the residual is the weight).
         r: (m,) whitened residuals, unweighted.
@@ -66,7 +69,7 @@ class MatchTable:
         views: from how many different places a side was seen: effective number, harmonic mean over the sides.
     """
 
-    J: FloatArray
+    J: csr_array
     root_weights: FloatArray
     curvatures: FloatArray
     r: FloatArray
@@ -117,7 +120,7 @@ def match_table(
     for number, pair in enumerate(pairs):
         for c, matches in pair.matches.items():
             block, root, r = _rows(pair, c, state, unknowns, motion)
-            blocks.append(block)
+            blocks.append(csr_array(block))
             weights.append(root)
             residuals.append(r)
             kernel = matches.alignment.kernel
@@ -130,7 +133,7 @@ def match_table(
             moving.append(np.full(len(side), pair.moved))
     side_of, frame_of = _numbered(np.concatenate(sides)), _numbered(np.concatenate(frames))
     return MatchTable(
-        np.concatenate(blocks),
+        sparse.vstack(blocks, format="csr"),
         np.concatenate(weights),
         np.concatenate(curvatures),
         np.concatenate(residuals),
@@ -163,28 +166,24 @@ def _rows(
     V_key = twist_key(pair.drive, pair.pair.image)
     c_twist, response = motion.values.atVector(V_key), motion.responses[V_key]
     alignment = pair.matches[c].alignment
-    block = np.zeros((len(alignment), unknowns.size))
-    roots, residuals = np.zeros(len(alignment)), np.zeros(len(alignment))
-    clock = unknowns.column(delay_key(state.clock(pair.drive)))
-    for key, some in bias_groups(pair, c):
-        index = np.arange(len(alignment)) if some is None else some
-        bias = state.biases_px.get((pair.drive, c), 0.0)
+    groups = bias_groups(pair, c)
+    of_class = state.biases_px.get((pair.drive, c), 0.0)
+    biases_px, columns = np.full(len(alignment), of_class), np.zeros(len(alignment), np.intp)
+    for key, some in groups:
+        own: slice | IntArray = slice(None) if some is None else some
+        columns[own] = unknowns.column(key)
         if some is not None:
-            bias = state.object_bias_px(pair.drive, int(pair.tracks[c][index[0]]), c)
-        r, J, _ = weighted_residuals(
-            alignment.take(index), state.cTl, state.offset_s(pair.drive), c_twist, bias
-        )
-        root = np.abs(J[:, 13]) * alignment.sigmas_px[index]
-        block[index] = J[:, 7:13] @ response
-        block[index, :6] += J[:, :6]
-        block[index, clock] += J[:, 6]
-        block[index, unknowns.column(key)] += J[:, 13]
-        for name, column in pair.terms.get(c, {}).items():
-            block[index, unknowns.column(nuisance_key(name))] += column[index] * J[:, 13]
-            r = r + column[index] * J[:, 13] * motion.nuisances.get(name, 0.0)
-        roots[index] = root
-        residuals[index] = unweighted(r, root)
-    return block, roots, residuals
+            biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
+    r, J, _ = weighted_residuals(alignment, state.cTl, state.offset_s(pair.drive), c_twist, biases_px)
+    roots = np.abs(J[:, 13]) * alignment.sigmas_px
+    block = J[:, 7:13] @ response
+    block[:, :6] += J[:, :6]
+    block[:, unknowns.column(delay_key(state.clock(pair.drive)))] += J[:, 6]
+    block[np.arange(len(alignment)), columns] += J[:, 13]
+    for name, column in pair.terms.get(c, {}).items():
+        block[:, unknowns.column(nuisance_key(name))] += column * J[:, 13]
+        r = r + column * J[:, 13] * motion.nuisances.get(name, 0.0)
+    return block, roots, unweighted(r, roots)
 
 
 def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
@@ -296,12 +295,27 @@ def spread_beyond(
 def score_variance(table: MatchTable, model: ErrorModel) -> FloatArray:
     """(n, n) variance of J^T (root_weights r) under the error model."""
     J, z = table.J, table.root_weights
-    meat = model.match * (J.T @ J)
+    meat = model.match * gram(J)
     for variance, groups in ((model.side_frame, table.side_frames), (model.side, table.sides)):
         if variance > 0.0:
-            sums = np.stack([np.bincount(groups, z * column) for column in J.T], axis=1)
-            meat += variance * (sums.T @ sums)
+            members = csr_array((z, groups, np.arange(len(z) + 1)))
+            meat += variance * gram(members.T @ J)
     return np.asarray(meat)
+
+
+def gram(J: csr_array) -> FloatArray:
+    """(n, n) J^T J of sparse rows (m, n)."""
+    m, n = J.shape
+    some, total = max(1, _DENSE // max(n, 1)), np.zeros((n, n))
+    # Rows are multiplied much faster when they are dense, and some at a time take little memory.
+    for start in range(0, m, some):
+        rows = J[start : start + some].toarray()
+        total += rows.T @ rows
+    return total
+
+
+_DENSE = 500_000
+"""Numbers of a dense part of the rows."""
 
 
 @dataclass(frozen=True)
@@ -340,7 +354,7 @@ def robust_covariance(
 
 def covariance_of(bread: FloatArray, table: MatchTable, model: ErrorModel) -> FloatArray:
     """(n, n) covariance under an error model of the matches; ``bread``: if all of them were independent."""
-    surplus = score_variance(table, model) - table.J.T @ table.J
+    surplus = score_variance(table, model) - gram(table.J)
     covariance = bread + bread @ surplus @ bread
     steps = steps_without_objects(table, bread)
     weights = np.asarray(np.bincount(table.objects, table.root_weights**2), np.float64)
@@ -350,10 +364,12 @@ def covariance_of(bread: FloatArray, table: MatchTable, model: ErrorModel) -> Fl
 
 def steps_without_objects(table: MatchTable, bread: FloatArray) -> FloatArray:
     """(objects, n) how far the linearized estimate moves when one object after the other is left out."""
-    J, r = table.J, table.root_weights * table.r
     order = np.argsort(table.objects, kind="stable")
+    J, r = table.J[order], (table.root_weights * table.r)[order]
     bounds = np.flatnonzero(np.diff(table.objects[order])) + 1
     root = np.asarray(np.linalg.cholesky(bread), dtype=np.float64)
-    return np.stack(
-        [step_without(root, J[own].T @ J[own], J[own].T @ r[own]) for own in np.split(order, bounds)]
-    )
+    steps = []
+    for start, end in itertools.pairwise([0, *bounds.tolist(), len(order)]):
+        own = J[start:end].toarray()
+        steps.append(step_without(root, own.T @ own, own.T @ r[start:end]))
+    return np.stack(steps)

@@ -226,7 +226,7 @@ def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> FrameTerm
 
 
 def _part(table: MatchTable, rows: IntArray, term: FrameTerm, model: ErrorModel) -> FramePart:
-    J, z = table.J[np.ix_(rows, term.columns)], table.root_weights[rows]
+    J, z = table.J[rows][:, term.columns].toarray(), table.root_weights[rows]
     sides, of_side = np.unique(table.sides[rows], return_inverse=True)
     scores = np.stack([np.bincount(of_side, z * column, len(sides)) for column in J.T], axis=1)
     in_frame = np.unique(table.side_frames[rows], return_inverse=True)[1]

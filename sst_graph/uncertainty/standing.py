@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.problem.graph import PairMatches
-from sst_graph.uncertainty.covariance import RobustCovariance, covariance_of
+from sst_graph.uncertainty.covariance import RobustCovariance, covariance_of, gram
 
 FloatArray = NDArray[np.float64]
 
@@ -33,9 +33,9 @@ def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) 
         return robust.matrix
     if moves.all():
         return np.asarray(robust.matrix / (1.0 - _ALL))
-    J = robust.table.J[moves]
+    J = robust.table.J[np.flatnonzero(moves)]
     root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
-    shares, axes = np.linalg.eigh(root.T @ (J.T @ J) @ root)
+    shares, axes = np.linalg.eigh(root.T @ gram(J) @ root)
     wider = root @ (axes / np.sqrt(1.0 - np.minimum(shares, _ALL)))
     return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
 

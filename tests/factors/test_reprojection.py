@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from factors import (
     PinholeCamera,
     RobustKernel,
     alignment_cost,
+    frame_factor,
     residuals,
     weighted_residuals,
 )
@@ -142,3 +145,55 @@ def test_no_match_at_all():
 def test_points_have_no_bias():
     with pytest.raises(FactorError, match="only silhouettes"):
         residuals(match([1.0, 0.0, 10.0], [50.0, 40.0]), gtsam.Pose3(), 0.0, STILL, bias_px=0.0)
+
+
+@pytest.mark.parametrize("normals", [False, True])
+@pytest.mark.parametrize("per_point", [False, True])
+@pytest.mark.parametrize("model", ["se3", "translation"])
+def test_many_images_at_once_are_each_by_itself(make_scene, normals, per_point, model):
+    """Residuals and derivatives of three images' matches in one alignment, a twist for each match."""
+    options = {"normals": normals, "per_point": per_point, "motion_model": model}
+    parts = [make_scene(seed, 30 + 10 * seed, **options) for seed in range(3)]
+    _, cTl, offset_s, _ = parts[0]
+    counts = [len(alignment) for alignment, *_ in parts]
+
+    def column(name):
+        values = [getattr(alignment, name) for alignment, *_ in parts]
+        return None if values[0] is None else np.concatenate(values)
+
+    accelerations = np.repeat([alignment.c_acceleration for alignment, *_ in parts], counts, axis=0)
+    names = ("lPs", "base_taus_s", "pixels", "sigmas_px", "normals", "weights")
+    together = Alignment(
+        parts[0][0].camera,
+        **{name: column(name) for name in names},
+        c_acceleration=accelerations,
+        motion_model=model,
+    )
+    twists = np.repeat([twist for *_, twist in parts], counts, axis=0).T
+    bias = np.linspace(-1.0, 1.0, len(together)) if normals else None
+    r, J = residuals(together, cTl, offset_s, twists, bias)
+    rows = together.rows_per_match
+    r, J = r.reshape(rows, -1), J.reshape(rows, len(together), -1)
+    start = 0
+    for (alignment, _, _, twist), count in zip(parts, counts, strict=True):
+        own = slice(start, start + count)
+        expected, H = residuals(alignment, cTl, offset_s, twist, None if bias is None else bias[own])
+        np.testing.assert_allclose(r[:, own], expected.reshape(rows, -1), atol=1e-10)
+        scale = np.maximum(np.abs(H).max(axis=0), 1.0)
+        np.testing.assert_allclose(J[:, own] / scale, H.reshape(rows, count, -1) / scale, atol=1e-12)
+        # And apart again.
+        back = together.of_one_image(own, alignment.c_acceleration)
+        np.testing.assert_array_equal(
+            residuals(back, cTl, offset_s, twist)[0], residuals(alignment, cTl, offset_s, twist)[0]
+        )
+        start += count
+    assert together.take(np.arange(5)).c_acceleration.shape == (5, 6)
+
+
+def test_a_factor_has_the_matches_of_one_image(make_scene):
+    alignment, *_ = make_scene(0, 5)
+    several = dataclasses.replace(alignment, c_acceleration=np.zeros((5, 6)))
+    with pytest.raises(FactorError, match=r"found shape \(5, 6\), expected shape \(6,\)"):
+        frame_factor([several], gtsam.symbol("E", 0), gtsam.symbol("D", 0))
+    with pytest.raises(FactorError, match=r"c_acceleration of an alignment.*expected shape \(5, 6\)"):
+        dataclasses.replace(alignment, c_acceleration=np.zeros((4, 6)))

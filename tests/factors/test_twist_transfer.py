@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import gtsam
 import numpy as np
 import pytest
 
 from factors import FactorError, check_jacobians, twist_transfer_factor
+from factors.twist_transfer import transferred
 
 V, E, D = gtsam.symbol("V", 0), gtsam.symbol("E", 0), gtsam.symbol("D", 0)
 
@@ -89,3 +92,25 @@ def test_whitened_by_the_covariance() -> None:
 def test_bad_arguments(twist: np.ndarray, rate: np.ndarray, covariance: np.ndarray) -> None:
     with pytest.raises(FactorError):
         twist_transfer_factor(V, E, D, twist, rate, 0.0, covariance)
+
+
+def test_many_images_at_once_are_each_by_itself() -> None:
+    rng = np.random.default_rng(5)
+    l_twists, rates, c_twists = rng.normal(0.0, 3.0, (3, 7, 6))
+    cTl, offset_s = random_pose(rng), 0.13
+    found = transferred(l_twists, rates, np.full((7, 1), offset_s - 0.1), c_twists, cTl, True)
+    for k, (error, by_cTl, by_offset) in enumerate(zip(*found, strict=True)):
+        factor = twist_transfer_factor(V, E, D, l_twists[k], rates[k], 0.1, np.eye(6))
+        values = values_at(c_twists[k], cTl, offset_s)
+        np.testing.assert_allclose(error, factor.unwhitenedError(values), atol=1e-12)
+        linear = factor.linearize(values)
+        A, _ = linear.jacobian()
+        columns = {key: A[:, place] for key, place in zip(linear.keys(), _places(linear), strict=True)}
+        np.testing.assert_allclose(by_cTl, columns[E], atol=1e-12)
+        np.testing.assert_allclose(by_offset[:, None], columns[D], atol=1e-12)
+
+
+def _places(linear: gtsam.JacobianFactor) -> list[slice]:
+    """Columns of each key."""
+    ends = np.cumsum([0, *({V: 6, E: 6, D: 1}[key] for key in linear.keys())])  # noqa: SIM118
+    return [slice(a, b) for a, b in pairwise(ends)]

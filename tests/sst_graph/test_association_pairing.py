@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.association.pairing import Pair, pair_by_time
+from sst_graph.association.pairing import Pair, nearest_images, pair_by_time
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -52,3 +52,20 @@ def test_brute_force(seed: int) -> None:
     found = pair_by_time(scans, images, offset, limit)
     assert [(p.scan, p.image) for p in found] == [(k, j) for k, j, _ in expected]
     assert [p.base_tau_s for p in found] == pytest.approx([tau for _, _, tau in expected], abs=1e-12)
+
+
+def test_many_offsets_at_once_are_each_by_itself() -> None:
+    rng = np.random.default_rng(7)
+    scans, images = stamps(*np.sort(rng.uniform(0.0, 2.0, 20))), stamps(*np.sort(rng.uniform(0.2, 1.8, 15)))
+    offsets_s = rng.uniform(-0.5, 0.5, 40)
+    found, base_taus_s = nearest_images(scans, images, offsets_s, 0.1)
+    assert found.shape == base_taus_s.shape == (40, 20)
+    for own, taus, offset_s in zip(found, base_taus_s, offsets_s.tolist(), strict=True):
+        pairs = pair_by_time(scans, images, offset_s, 0.1)
+        assert [(p.scan, p.image, p.base_tau_s) for p in pairs] == [
+            (k, own[k], taus[k]) for k in np.flatnonzero(own >= 0)
+        ]
+        # The nearest of all, and only where it is near.
+        for k, stamp in enumerate(scans):
+            apart = [abs(1e-9 * (image - stamp) + offset_s) for image in images]
+            assert own[k] == (int(np.argmin(apart)) if min(apart) <= 0.1 else -1)

@@ -18,7 +18,8 @@ import pytest
 from sst_graph import Tracker
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import CheckpointError
-from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.estimators.checkpoint import Saver, load_checkpoint, save_checkpoint
+from sst_graph.storage import stored
 
 SMALL = SimulationConfig(seed=5, frames=3, width=160, height=48, azimuth_step_deg=1.0, motion="no_stop")
 
@@ -64,6 +65,47 @@ def test_what_was_saved_is_read(tmp_path: Path, good: bytes) -> None:
     assert tracker.window.next_scan == 3 and not tracker.started
     path.write_bytes(forged(*parts_of(good)))
     assert load_checkpoint(path).window.next_scan == 3
+
+
+def test_a_save_is_written_with_the_frames_that_follow(tmp_path: Path) -> None:
+    """The former file stands until the new one is whole; what is broken off leaves it, and nothing else."""
+    street, path = simulate(SMALL), tmp_path / "tracker.npz"
+    tracker = Tracker(street.camera, None, street.nominal)
+    tracker.add(street[0])
+    save_checkpoint(tracker, path)
+    former = path.read_bytes()
+    with pytest.raises(KeyboardInterrupt), Saver(path) as saver:
+        tracker.add(street[1])
+        saver.save(tracker)
+        saver.follow(tracker)
+        raise KeyboardInterrupt
+    assert path.read_bytes() == former and list(tmp_path.iterdir()) == [path]
+    with Saver(path) as saver:
+        saver.save(tracker)
+        tracker.add(street[2])
+        saver.follow(tracker)
+        assert path.read_bytes() == former
+        saver.finish()
+        assert load_checkpoint(path).window.next_scan == 2
+        saver.save(tracker)
+    assert load_checkpoint(path).window.next_scan == 3 and list(tmp_path.iterdir()) == [path]
+
+
+def test_what_is_saved_does_not_depend_on_when_it_was_stored(tmp_path: Path) -> None:
+    """The same tracker, whether much or nothing was stored with earlier frames."""
+    street, paths = simulate(SMALL), [tmp_path / name for name in ("followed", "at_once")]
+    for path in paths:
+        tracker = Tracker(street.camera, None, street.nominal)
+        with Saver(path) as saver:
+            for k in range(len(street)):
+                tracker.add(street[k])
+                if path.name == "followed":
+                    saver.follow(tracker)
+            saver.save(tracker)
+    documents = [parts_of(path.read_bytes())[0] for path in paths]
+    trackers = [load_checkpoint(path) for path in paths]
+    assert [len(document["blocks"]) for document in documents] == [len(documents[0]["blocks"])] * 2
+    assert stored(trackers[0]) == stored(trackers[1])
 
 
 @pytest.mark.parametrize("at", [0.01, 0.3, 0.5, 0.7, 0.9, 0.99])
@@ -190,6 +232,24 @@ def test_a_forged_tracker_is_refused(tmp_path: Path, good: bytes, change: Callab
 )
 def test_another_head_is_refused(tmp_path: Path, head: str, message: str) -> None:
     refused(tmp_path, forged(head, b""), message)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda blocks: blocks.clear(),
+        lambda blocks: blocks.append(blocks[0]),
+        lambda blocks: blocks[0].__setitem__(1, 2**40),
+        lambda blocks: blocks[0].__setitem__(2, -1),
+        lambda blocks: blocks[-1].__setitem__(3, ["block", blocks[-1][0]]),
+        lambda blocks: blocks[0].__setitem__(3, blocks[-1][3]),
+        lambda blocks: blocks[0].pop(),
+    ],
+)
+def test_forged_blocks_are_refused(tmp_path: Path, good: bytes, change: Callable[[Any], Any]) -> None:
+    document, data = parts_of(good)
+    change(document["blocks"])
+    refused(tmp_path, forged(document, data), "an incomplete checkpoint|a tracker that does not answer")
 
 
 def test_another_thing_than_a_tracker_is_refused(tmp_path: Path, good: bytes) -> None:

@@ -9,7 +9,9 @@ import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import pytest
 
@@ -20,6 +22,7 @@ from sst_graph.files import (
     OutputKind,
     atomic_directory,
     atomic_write_bytes,
+    atomic_write_in_steps,
     atomic_write_text,
     check_file_target,
     check_folder_target,
@@ -96,6 +99,42 @@ def test_file_is_written_and_replaced(tmp_path: Path) -> None:
     atomic_write_text(path, "eins ä")
     atomic_write_bytes(path, b"two\n")
     assert tree(tmp_path) == {"deep/er/a.json": "two\n"}
+
+
+def _in_two(stream: BinaryIO) -> Iterator[None]:
+    for part in (b"ne", b"w"):
+        stream.write(part)
+        yield
+
+
+def test_a_file_written_in_steps_appears_with_the_last(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_text("old")
+    steps = atomic_write_in_steps(path, _in_two)
+    for _ in range(3):
+        next(steps)
+        assert path.read_text() == "old"
+    assert sum(1 for _ in steps) <= 50
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_whose_steps_are_broken_off_leaves_the_old_one(tmp_path: Path) -> None:
+    def failing(stream: BinaryIO) -> Iterator[None]:
+        yield from _in_two(stream)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    path = tmp_path / "a"
+    path.write_text("old")
+    for done in range(4):
+        steps = atomic_write_in_steps(path, _in_two)
+        for _ in range(done):
+            next(steps)
+        steps.close()
+        assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        list(atomic_write_in_steps(path, failing))
+    assert caught.value.filename == str(path)
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_permissions_follow_the_umask(tmp_path: Path) -> None:

@@ -61,6 +61,23 @@ def test_covariance_between_two_measured_intervals() -> None:
     np.testing.assert_allclose(track.at(EPOCH_NS + 100_000_000).covariance, rate, rtol=1e-5)
 
 
+@pytest.mark.parametrize("count", [1, 5])
+def test_many_stamps_at_once_are_each_by_itself(count: int) -> None:
+    track = TwistTrack(motions([0.0, 0.1, 0.22, 0.3, 0.41, 0.5][: count + 1], lambda t: way(t) + t**3))
+    stamps = [EPOCH_NS + round(t * 1e9) for t in (-1.0, 0.31, 0.02, 0.16, 0.31, 0.47, 3.0)]
+    found = track.at_all(stamps)
+    assert len(found) == len(stamps)
+    for k, stamp in enumerate(stamps):
+        one = track.at(stamp)
+        np.testing.assert_allclose(found.twists[k], one.twist, rtol=1e-12)
+        np.testing.assert_allclose(found.accelerations[k], one.acceleration, rtol=1e-12)
+        np.testing.assert_allclose(found.covariances[k], one.covariance, rtol=1e-12)
+    # Linear between the middles of two intervals.
+    if count > 1:
+        early, late = (track.at(EPOCH_NS + round(t * 1e9)).twist for t in (0.05, 0.16))
+        np.testing.assert_allclose(track.at(EPOCH_NS + 105_000_000).twist, 0.5 * (early + late), rtol=1e-9)
+
+
 def test_a_single_motion_is_held() -> None:
     track = TwistTrack(motions([0.0, 0.1]))
     for t in (-1.0, 0.05, 3.0):

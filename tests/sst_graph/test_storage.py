@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from factors.robust import RobustKernel
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.estimators.assumption_tests import Finding
 from sst_graph.estimators.checkpoint import checkpoint_classes
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.tracker_config import TrackerConfig
 from sst_graph.odometry import LidarOdometry
 from sst_graph.odometry.smoothing import MotionSmoother
 from sst_graph.problem.drive import image_features
-from sst_graph.storage import PackedArray, lay_out, restored, stored
+from sst_graph.storage import Block, Blocks, PackedArray, lay_out, restored, stored
 from sst_graph.typed import wrong_fields
 from sst_graph.types import CameraImage, RelativeMotion, SemanticClass
 
@@ -53,6 +55,55 @@ def test_what_is_laid_out_is_laid_out_as_what_is_read_back() -> None:
     assert value["list"][0] is value["pair"][0] and not np.shares_memory(value["list"][0], root)  # type: ignore[index]
     assert list(value["set"]) == list(found["set"])
     assert motion.covariance.flags.f_contiguous
+
+
+def _motion(k: int) -> RelativeMotion:
+    return RelativeMotion(k, k + 1, gtsam.Pose3(), np.random.default_rng(k).normal(size=(6, 6)))
+
+
+def _whole(blocks: Blocks, value: object) -> tuple[list[Any], bytes, Any, list[Block]]:
+    """Records of blocks, all bytes, and the node of a value, as a file has them."""
+    node, data, used = blocks.stored(value)
+    records, places = [], len(data)
+    for block in used:
+        records.append([block.number, places, len(block.data), json.loads(block.text)])
+        places += len(block.data)
+    return records, data + b"".join(block.data for block in used), node, used
+
+
+def test_what_never_changes_is_stored_once() -> None:
+    blocks, motions = Blocks(CLASSES), [_motion(k) for k in range(3)]
+    records, data, node, first = _whole(blocks, {"all": motions, "again": (motions[1],)})
+    found = restored(node, data, CLASSES, records)
+    assert len(first) == 3 and found["all"][1] is found["again"][0]
+    for live, read in zip(motions, found["all"], strict=True):
+        assert read == live and read.covariance.flags.writeable
+    # The next time only what is new, in the same order of numbers; what is gone is forgotten.
+    motions = [*motions[1:], _motion(7)]
+    records, data, node, second = _whole(blocks, motions)
+    assert second[:2] == first[1:] and second[0] is first[1] and second[2].number == 3
+    assert restored(node, data, CLASSES, records) == motions
+    assert id(motions[0]) in blocks and id(first[0].value) not in blocks
+
+
+def test_forged_blocks_are_refused() -> None:
+    records, data, node, _ = _whole(Blocks(CLASSES), [_motion(1), _motion(2)])
+    for forged in (
+        records[:1],
+        records[::-1][:1],
+        [records[0], records[0]],
+        [[True, *records[0][1:]], records[1]],
+        [[0, len(data), 8, records[0][3]], records[1]],
+        [[0, 0, 8, records[0][3]], records[1]],
+        [[0, 0, 0, ["block", 0]], records[1]],
+        [[0, 0, 0, ["block", [1]]], records[1]],
+        [[0]],
+        [7],
+        7,
+        None,
+    ):
+        with pytest.raises(ValueError):
+            restored(node, data, CLASSES, forged)  # type: ignore[arg-type]
 
 
 def test_packed_arrays_come_back_and_count() -> None:
@@ -110,6 +161,17 @@ def test_objects_of_the_package() -> None:
     assert found["config"] == TrackerConfig(window=17) and found["kernel"] == RobustKernel("huber", 2.0)
     assert isinstance(found["a"], Point) and found["a"].offset_s == 0.1
     assert isinstance(_again(MotionSmoother(3)), MotionSmoother)
+
+
+def test_a_finding_holds_its_assumption_by_name() -> None:
+    finding = Finding(ASSUMPTIONS["k1"], 0.1, 0.02, np.arange(7.0), True)
+    found = _again(finding)
+    assert found.assumption is ASSUMPTIONS["k1"] and found.sentence == finding.sentence
+    assert np.array_equal(found.step, finding.step)
+    node, data = stored(finding)
+    text = json.dumps(node).replace('"k1"', '"k9"')
+    with pytest.raises(ValueError, match="k9"):
+        restored(json.loads(text), data, CLASSES)
 
 
 def test_trees_and_images_are_made_anew() -> None:

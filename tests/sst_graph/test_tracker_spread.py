@@ -52,7 +52,7 @@ def test_stored_and_taken_back_on_the_way(
         assert stored(other) == state
         kept.add(frame)
         other.add(frame)
-        if other.starting.search is not None:
+        if other.starting.under_way:
             for tracker in (kept, other):
                 save_checkpoint(tracker, path)
             other, saved = load_checkpoint(path), saved + 1
@@ -82,6 +82,19 @@ def test_each_step_of_a_start_is_small(street: SimulatedDrive, frames: list[Fram
     drive, _ = tracker.window.drive()
     steps = list(estimating_first(drive, Guess(street.nominal, 0.0), tracker.config))
     assert max(steps) <= 12 and len(steps) > 100
+
+
+def test_the_graph_of_a_start_is_made_some_scans_a_frame(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """No frame matches all scans of the start, and what a save in between holds is the same."""
+    tracker, most, seen = tracker_from_truth(street, dataclasses.replace(SPREAD, start_work=6)), 0, set()
+    for frame in frames[:34]:
+        before = None if tracker.starting.entering is None else len(tracker.starting.entering.waiting)
+        tracker.add(frame)
+        entering = tracker.starting.entering
+        if before is not None and entering is not None:
+            phase = entering.below is None
+            most, seen = max(most, before - len(entering.waiting)), seen | {phase}
+    assert tracker.started and seen == {False, True} and most <= 6
 
 
 def test_the_answer_is_told_when_the_work_was_asked_for() -> None:

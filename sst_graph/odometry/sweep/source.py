@@ -10,9 +10,10 @@ import gtsam
 
 from factors.camera import PinholeCamera
 from sst_graph.errors import ConfigError
+from sst_graph.frame_parts import AheadReader, image_at, number_at, scan_at
 from sst_graph.odometry.sweep.decision import SweepConfig, SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import Frame, GroundTruth, Scan, Source
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
 
 SWEEP_KEY = "sweep"
 """Where a result's diagnostics keep what was decided of the sweeps, by name of the drive."""
@@ -24,12 +25,10 @@ class SweptSource:
     Scans that bring times of their own keep them.
     """
 
-    def __init__(
-        self, source: Source, decision: SweepDecision, frames: dict[int, Frame] | None = None
-    ) -> None:
-        """frames: read already, by position; each is let go when it is next asked for."""
+    def __init__(self, source: Source, decision: SweepDecision, ahead: AheadReader | None = None) -> None:
+        """ahead: the source, of which some scans have been looked at."""
         self.source, self.sweep_decision = source, decision
-        self._read = {} if frames is None else frames
+        self._ahead = AheadReader(source) if ahead is None else ahead
 
     @property
     def name(self) -> str:
@@ -61,19 +60,29 @@ class SweptSource:
 
     def __getitem__(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
-        frame = self._read.pop(position, None)
-        frame = self.source[position] if frame is None else frame
-        timing = self.sweep_decision.timing
-        if frame.scan is None or frame.scan.offsets_s is not None or timing.instant:
-            return frame
-        return replace(frame, scan=timed(frame.scan, timing))
+        frame = self._ahead.frame(position)
+        return replace(frame, scan=self._timed(frame.scan))
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[position] for position in range(len(self)))
 
+    def frame_number(self, position: int) -> int:
+        """Index of the frame at a position."""
+        return number_at(self.source, position)
 
-_KEPT = 24
-"""Most frames that are kept from the decision until they are asked for again."""
+    def read_scan(self, position: int) -> Scan | None:
+        """Scan of the frame at a position."""
+        return self._timed(scan_at(self.source, position))
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """Image of the frame at a position."""
+        return image_at(self.source, position)
+
+    def _timed(self, scan: Scan | None) -> Scan | None:
+        timing = self.sweep_decision.timing
+        if scan is None or scan.offsets_s is not None or timing.instant:
+            return scan
+        return timed(scan, timing)
 
 
 def timed(scan: Scan, timing: SweepTiming) -> Scan:
@@ -82,7 +91,7 @@ def timed(scan: Scan, timing: SweepTiming) -> Scan:
 
 
 def with_sweep(source: Source, config: SweepConfig | None = None) -> SweptSource:
-    """The source with times for its points, as its scans tell them; few frames are read twice for that.
+    """The source with times for its points, as its scans tell them; those read for that are not read again.
 
     Nothing is decided, and the source stays as it is, where its scans bring times, or where it was opened
     with a word on its sweep (its attribute ``sweep`` is other than "auto").
@@ -96,22 +105,14 @@ def with_sweep(source: Source, config: SweepConfig | None = None) -> SweptSource
     given = SweepDecision("given", SweepTiming(0.0, 0.0, 0.1))
     if not config.decide or getattr(source, "sweep", "auto") != "auto":
         return SweptSource(source, given)
-    read: dict[int, Frame] = {}
-
-    def frame(position: int) -> Frame:
-        if position not in read:
-            if len(read) >= _KEPT:
-                read.pop(next(iter(read)))
-            read[position] = source[position]
-        return read[position]
-
+    ahead = AheadReader(source)
     for position in range(len(source)):
-        if (scan := frame(position).scan) is not None:
+        if (scan := ahead.look(position)) is not None:
             if scan.offsets_s is not None:
-                return SweptSource(source, given, read)
+                return SweptSource(source, given, ahead)
             break
     stamp: SweepStamp = getattr(source, "sweep_stamp", "forward")
-    return SweptSource(source, decide_sweep(lambda k: frame(k).scan, len(source), config, stamp), read)
+    return SweptSource(source, decide_sweep(ahead.look, len(source), config, stamp), ahead)
 
 
 def with_sweep_of(source: Source, diagnostics: Mapping[str, Any]) -> SweptSource:

@@ -1,0 +1,112 @@
+"""Scans and images of a drive, read apart where its source can do that: none is read for the other's sake."""
+
+from __future__ import annotations
+
+from functools import lru_cache, partial
+from typing import Protocol, runtime_checkable
+
+from sst_graph.types import CameraImage, Frame, Scan, Source
+
+
+@runtime_checkable
+class SeparateReader(Protocol):
+    """What a source may offer beside whole frames. Positions, and errors, are those of its frames."""
+
+    def frame_number(self, position: int) -> int:
+        """Index of the frame; nothing is read."""
+        ...
+
+    def read_scan(self, position: int) -> Scan | None:
+        """The frame's scan."""
+        ...
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """The frame's image; instances may be left out."""
+        ...
+
+
+def number_at(source: Source, position: int) -> int:
+    """Index of the frame at a position."""
+    return source.frame_number(position) if isinstance(source, SeparateReader) else source[position].index
+
+
+def scan_at(source: Source, position: int) -> Scan | None:
+    """Scan of the frame at a position."""
+    return source.read_scan(position) if isinstance(source, SeparateReader) else source[position].scan
+
+
+def image_at(source: Source, position: int) -> CameraImage | None:
+    """Image of the frame at a position."""
+    return source.read_image(position) if isinstance(source, SeparateReader) else source[position].image
+
+
+_FRAMES, _SCANS = 24, 48
+"""Most frames, or scans where these are read apart, that are kept until they are asked for again: 100 MB of
+an HDL-64E's. A sweep is decided by 48 scans at most."""
+
+
+class AheadReader:
+    """A drive some of whose scans are looked at before the frames are read in turn; no file is read twice.
+
+    What was looked at is kept until its frame is read.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self._frames: dict[int, Frame] = {}
+        self._scans: dict[int, Scan | None] = {}
+
+    def look(self, position: int) -> Scan | None:
+        """Scan of the frame at a position."""
+        source = self.source
+        if isinstance(source, SeparateReader):
+            if position not in self._scans:
+                _make_room(self._scans, _SCANS)
+                self._scans[position] = source.read_scan(position)
+            return self._scans[position]
+        if position not in self._frames:
+            _make_room(self._frames, _FRAMES)
+            self._frames[position] = source[position]
+        return self._frames[position].scan
+
+    def frame(self, position: int) -> Frame:
+        """Frame at a position; IndexError as the source's own."""
+        if position in self._frames:
+            return self._frames.pop(position)
+        source = self.source
+        if not isinstance(source, SeparateReader):
+            return source[position]
+        seen = position in self._scans
+        scan = self._scans.pop(position) if seen else source.read_scan(position)
+        return Frame(source.frame_number(position), scan, source.read_image(position))
+
+
+_RECENT = 12
+"""Scans, and images, that are kept of those read last: the four candidates for a picture, and what is around
+the one that is drawn."""
+
+
+class RecentReader:
+    """Scans and images of a drive by position; those read last are not read again."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+        self.scan = lru_cache(_RECENT)(partial(scan_at, source))
+        self.image = lru_cache(_RECENT)(partial(image_at, source))
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def number(self, position: int) -> int:
+        """Index of the frame at a position."""
+        return number_at(self.source, position)
+
+    def frame(self, position: int) -> Frame:
+        """Frame at a position."""
+        return Frame(self.number(position), self.scan(position), self.image(position))
+
+
+def _make_room(kept: dict[int, Frame] | dict[int, Scan | None], most: int) -> None:
+    """Let the oldest go where there are so many."""
+    if len(kept) >= most:
+        kept.pop(next(iter(kept)))

@@ -1,0 +1,158 @@
+"""Arrays that are seldom asked for, kept out of memory: beyond a share of it, in an unnamed temporary file.
+
+A drive of any length then takes little more memory than a short one. What is read back is what was put there,
+bit by bit. The file has no name, so that nothing is left of it however the process ends; it lies where
+:mod:`tempfile` puts such files (``TMPDIR``). Where none can be written, everything stays in memory.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import FileIO
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+_LOG = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+IN_MEMORY_BYTES = 32 * 1024 * 1024
+"""Bytes of arrays that a shelf keeps in memory: the fields and samples of some forty frames of KITTI's size
+take less time so, and those of a long drive do not add up."""
+
+
+class Shelf:
+    """Where arrays are kept."""
+
+    def __init__(self, in_memory_bytes: int | None = None) -> None:
+        """in_memory_bytes: of the first arrays, which stay in memory; by default :data:`IN_MEMORY_BYTES`."""
+        self._left = IN_MEMORY_BYTES if in_memory_bytes is None else in_memory_bytes
+        self._file: FileIO | None = None
+        self._end = 0
+        self._writable = True
+
+    def __del__(self) -> None:
+        if (file := getattr(self, "_file", None)) is not None:
+            file.close()
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes that lie in the file."""
+        return self._end
+
+    def put(self, array: NDArray[Any], dtype: Any = None) -> Any:
+        """Keep an array -> a :class:`Shelved`, which a field that is :func:`shelvable` takes for it.
+
+        Args:
+            dtype: that it comes back with; by default its own.
+        """
+        wanted = array.dtype if dtype is None else np.dtype(dtype)
+        array = np.ascontiguousarray(array)
+        if array.nbytes <= max(self._left, 0) or not self._write(array):
+            self._left -= array.nbytes
+            return Shelved(array, wanted)
+        return Shelved(_Place(self, self._end - array.nbytes, array.dtype, array.shape), wanted)
+
+    def _write(self, array: NDArray[Any]) -> bool:
+        """Append to the file; False where that does not go."""
+        if not self._writable:
+            return False
+        data = array.reshape(-1).view(np.uint8).data
+        try:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="sst-graph-", buffering=0)  # noqa: SIM115
+            written = 0
+            while written < len(data):
+                written += os.pwrite(self._file.fileno(), data[written:], self._end + written)
+        except OSError as error:
+            self._writable = False
+            _LOG.warning(
+                "%s: %s: what is kept of the frames stays in memory", tempfile.gettempdir(), error.strerror
+            )
+            return False
+        self._end += len(data)
+        return True
+
+    def read(self, start: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        """An array that lies in the file.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        assert self._file is not None
+        flat = np.empty(math.prod(shape), dtype)
+        view, got = flat.view(np.uint8).data, 0
+        while got < len(view):
+            if not (count := _read_at(self._file.fileno(), view[got:], start + got)):
+                raise OSError(f"the temporary file of a drive ends {len(view) - got} bytes early")
+            got += count
+        return flat.reshape(shape)
+
+
+def _read_at(descriptor: int, view: memoryview, start: int) -> int:
+    """Read into a view; number of bytes. The file's own position stays, for forked processes share it."""
+    if hasattr(os, "preadv"):
+        return os.preadv(descriptor, [view], start)
+    data = os.pread(descriptor, len(view), start)  # macOS
+    view[: len(data)] = data
+    return len(data)
+
+
+class Shelved:
+    """An array on a shelf."""
+
+    def __init__(self, kept: NDArray[Any] | _Place, dtype: np.dtype[Any]) -> None:
+        self._kept, self._dtype = kept, dtype
+
+    def get(self) -> NDArray[Any]:
+        """The array; read anew each time where it lies in the file."""
+        kept = self._kept
+        array = kept.shelf.read(kept.start, kept.dtype, kept.shape) if isinstance(kept, _Place) else kept
+        return array.astype(self._dtype, copy=False)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Elsewhere there is no such file: the array itself goes there."""
+        return Shelved, (self.get(), self._dtype)
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where in its file an array lies."""
+
+    shelf: Shelf
+    start: int
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+
+class _Field:
+    """Attribute that is given an array, or one on a shelf, and answers the array."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        if instance is None:
+            return self
+        value = instance.__dict__[self._name]
+        return value.get() if isinstance(value, Shelved) else value
+
+    def __set__(self, instance: object, value: object) -> None:
+        instance.__dict__[self._name] = value
+
+
+def shelvable(*names: str) -> Callable[[type[_T]], type[_T]]:
+    """Let fields of a dataclass take arrays on a shelf as well, and answer the arrays; written above it."""
+
+    def declared(cls: type[_T]) -> type[_T]:
+        for name in names:
+            setattr(cls, name, _Field(name))
+        return cls
+
+    return declared
