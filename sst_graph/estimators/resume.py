@@ -84,7 +84,7 @@ def check_memory(tracker: Tracker) -> None:
     setup, newest = tracker.setup, tracker.newest_ns
     whole = isinstance(setup, Setup) and isinstance(tracker.first_frames, FirstFrames)
     whole = whole and (newest is None or isinstance(newest, int))
-    if not whole or (setup.camera, setup.config) != (tracker.camera, tracker.config):
+    if not whole or (setup.camera, setup.config.estimating) != (tracker.camera, tracker.config):
         raise ValueError("a memory of another tracker")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sst_graph.config import Settings, setting
 from sst_graph.estimators.config import CalibrationConfig
@@ -155,6 +155,11 @@ class TrackerConfig(Settings):
     def searched_scans(self) -> int:
         """Latest scans of the window that a start may be made of: half of it, or twice what a start needs."""
         return max(2 * self.start_scans, 2 * self.restart_scans, self.window // 2)
+
+    @property
+    def estimating(self) -> TrackerConfig:
+        """The same with a variable in the graph for each assumption that is to be estimated."""
+        return replace(self, calibration=self.calibration.estimating)
 
     def __post_init__(self) -> None:
         scans = max(self.start_scans, self.restart_scans)

@@ -53,7 +53,7 @@ class Tracking:
 
     def __init__(self, camera: PinholeCamera, config: TrackerConfig, guess: Guess) -> None:
         self.camera = camera
-        self.config = config = dataclasses.replace(config, calibration=config.calibration.estimating)
+        self.config = config = config.estimating
         calibration = self.config.calibration
         self.classes = calibration.classes
         self.window = Window(camera, config.window, config.searched_scans)
