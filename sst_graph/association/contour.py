@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.association.sampling import sampled
-from sst_graph.shelf import Shelf, shelvable
+from sst_graph.shelf import Shelf, shape_of, shelvable
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -106,6 +106,12 @@ class ContourMap:
             unknown |= unseen
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
 
+    @property
+    def box(self) -> tuple[int, int]:
+        """Columns and rows of the box."""
+        rows, columns = shape_of(self, "distance")
+        return columns, rows
+
     def on(self, shelf: Shelf) -> ContourMap:
         """The same with its fields on a shelf."""
         return replace(self, distance=shelf.put(self.distance), unknown=shelf.put(self.unknown))
@@ -161,7 +167,7 @@ def are_unknown(
     """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
     :func:`nearest_contours`."""
     counts = [b - a for a, b in spans]
-    columns, rows = np.repeat([contour.unknown.shape[::-1] for contour in contours], counts, axis=0).T
+    columns, rows = np.repeat([contour.box for contour in contours], counts, axis=0).T
     column, row = np.rint(places).astype(np.intp)
     at = np.minimum(np.maximum(row, 0), rows - 1) * columns
     at += np.minimum(np.maximum(column, 0), columns - 1)

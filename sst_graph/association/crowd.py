@@ -340,7 +340,7 @@ def _feet(
     Args:
         counts: pixels of each contour, one contour's after the other's.
     """
-    boxes = [(c.left, c.top, c.distance.shape[1], c.distance.shape[0], c.width, c.height) for c in contours]
+    boxes = [(c.left, c.top, *c.box, c.width, c.height) for c in contours]
     left, top, columns, rows, width, height = np.repeat(boxes, counts, axis=0).T
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
