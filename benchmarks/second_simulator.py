@@ -1,6 +1,7 @@
-"""The joint method on a second simulator (benchmarks/second_street.py). Prints a table.
+"""The joint method on streets of other simulators (second_street.py, third_street.py). Prints a table.
 
     OMP_NUM_THREADS=1 python benchmarks/second_simulator.py --streets 6
+    OMP_NUM_THREADS=1 python benchmarks/second_simulator.py --streets 6 --simulator third
 
 Starts are uniform within 12 deg by axis and 10 cm; ``--init none`` gives none.
 """
@@ -8,7 +9,8 @@ Starts are uniform within 12 deg by axis and 10 cm; ``--init none`` gives none.
 from __future__ import annotations
 
 import argparse
-import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import cv2
 import gtsam
@@ -16,22 +18,28 @@ import numpy as np
 
 # Streets are built here, as the directory of a script is on its path.
 from second_street import SecondStreet, StreetConfig
+from third_street import ThirdConfig, ThirdStreet
 
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.types import SemanticClass
 
-SCENARIOS: dict[str, StreetConfig] = {
-    "stop, 100 ms": StreetConfig(),
-    "stop, -300 ms": StreetConfig(time_offset_s=-0.3),
-    "stop, exact labels": StreetConfig(label_noise=0.0),
-    "stop, labels twice as bad": StreetConfig(label_noise=2.0),
-    "stop, 32 lasers": StreetConfig(lasers="32"),
-    "stop, 128 lasers": StreetConfig(lasers="128"),
-    "stop, wide 640x480 camera": StreetConfig(width=640, height=480, focal_px=420.0),
-    "stop, half of the vehicles moving": StreetConfig(moving_fraction=0.5),
-    "varied speed, 100 ms": StreetConfig(motion="vary"),
-    "constant speed, 100 ms": StreetConfig(motion="constant"),
-    "standing, 3 frames": StreetConfig(motion="standing", frames=3, time_offset_s=0.0, density=0.2),
+Street = SecondStreet | ThirdStreet
+SIMULATORS: dict[str, Callable[..., Street]] = {
+    "second": lambda **options: SecondStreet(StreetConfig(**options)),
+    "third": lambda **options: ThirdStreet(ThirdConfig(**options)),
+}
+SCENARIOS: dict[str, Mapping[str, Any]] = {
+    "stop, 100 ms": {},
+    "stop, -300 ms": {"time_offset_s": -0.3},
+    "stop, exact labels": {"label_noise": 0.0},
+    "stop, labels twice as bad": {"label_noise": 2.0},
+    "stop, 32 lasers": {"lasers": "32"},
+    "stop, 128 lasers": {"lasers": "128"},
+    "stop, wide 640x480 camera": {"width": 640, "height": 480, "focal_px": 420.0},
+    "stop, half of the vehicles moving": {"moving_fraction": 0.5},
+    "varied speed, 100 ms": {"motion": "vary"},
+    "constant speed, 100 ms": {"motion": "constant"},
+    "standing, 3 frames": {"motion": "standing", "frames": 3, "time_offset_s": 0.0, "density": 0.2},
 }
 CLASSES = {
     "vehicle": (SemanticClass.VEHICLE,),
@@ -39,10 +47,9 @@ CLASSES = {
 }
 
 
-def run(config: StreetConfig, classes: tuple[SemanticClass, ...], guess: bool) -> tuple[list[float], str]:
+def run(street: Street, classes: tuple[SemanticClass, ...], guess: bool) -> tuple[list[float], str]:
     """[rotation deg, ATD cm, delay ms, NEES rotation, translation, delay (each over its dimension), all]."""
-    street = SecondStreet(config)
-    truth = street.truth
+    config, truth = street.config, street.truth
     rng = np.random.default_rng([config.seed, 99])
     away = np.concatenate([np.radians(rng.uniform(-12.0, 12.0, 3)), rng.uniform(-0.1, 0.1, 3)])
     result = calibrate(street, truth.cTl.retract(away) if guess else None, CalibrationConfig(classes=classes))
@@ -60,6 +67,7 @@ def run(config: StreetConfig, classes: tuple[SemanticClass, ...], guess: bool) -
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--simulator", choices=sorted(SIMULATORS), default="second")
     parser.add_argument("--streets", type=int, default=6)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--classes", choices=sorted(CLASSES), default="vehicle")
@@ -77,8 +85,8 @@ def main() -> None:
     for name in args.scenario or SCENARIOS:
         figures, statuses = [], []
         for seed in range(args.seed, args.seed + args.streets):
-            config = dataclasses.replace(SCENARIOS[name], seed=seed)
-            figure, status = run(config, CLASSES[args.classes], args.init == "near")
+            street = SIMULATORS[args.simulator](seed=seed, **SCENARIOS[name])
+            figure, status = run(street, CLASSES[args.classes], args.init == "near")
             figures.append(figure)
             statuses.append(status)
         table = np.array(figures)

@@ -1,6 +1,7 @@
 """Every setting of ``calibrate`` and ``track`` at its lowest and its highest value, on a tiny street.
 
     OMP_NUM_THREADS=1 python -m benchmarks.settings_walk [--only joint.] [--seconds 60] [--memory-gb 4]
+    OMP_NUM_THREADS=1 python -m benchmarks.settings_walk --part 3/4
 
 Each case must end in a result or in a typed error (:class:`sst_graph.errors.SstGraphError`) within the time
 and the memory; the others are printed, and the exit code is 1 if there are any. Cases run in a process of
@@ -216,10 +217,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", default="", help="settings whose name holds this text")
     parser.add_argument("--seconds", type=float, default=60.0, help="most time of a case")
     parser.add_argument("--memory-gb", type=float, default=4.0, help="most address space of a case")
+    parser.add_argument("--part", default="1/1", metavar="K/N", help="the K-th of N parts (default: all)")
     parser.add_argument("--verbose", action="store_true", help="print every case")
     args = parser.parse_args(argv)
     worker, ends, failures = Worker(args.seconds, args.memory_gb), Counter[str](), 0
     chosen = [case for case in cases() if args.only in case.settings[-1].split("=")[0]]
+    part, parts = map(int, args.part.split("/"))
+    chosen = chosen[len(chosen) * (part - 1) // parts : len(chosen) * part // parts]
     for number, case in enumerate(chosen, 1):
         began = time.perf_counter()
         well, end = worker.run(case)

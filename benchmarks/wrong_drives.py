@@ -139,6 +139,12 @@ def _later_images(drive: KeptDrive, frames: int) -> KeptDrive:
     return replace(drive, frames=(*kept, *(_with(f, image=None) for f in drive.frames[len(kept) :])))
 
 
+def _one_clock(drive: KeptDrive, scans: float = 1.0, images: float = 1.0) -> KeptDrive:
+    """The stamps of one sensor multiplied."""
+    later = drive.with_scans(lambda s: replace(s, stamp_ns=round(s.stamp_ns * scans)))
+    return later.with_images(lambda i: replace(i, stamp_ns=round(i.stamp_ns * images)))
+
+
 def _shuffled(drive: KeptDrive) -> KeptDrive:
     order = np.random.default_rng(5).permutation(len(drive))
     return with_images_of(drive, [drive.frames[i] for i in order], pictures=False)
@@ -185,6 +191,11 @@ LIES: dict[str, Lie] = {
     "labels permuted": lambda d, o: _permuted(d),
     "stamps a tenth": lambda d, o: with_stamps(d, 1, 10),
     "stamps tenfold": lambda d, o: with_stamps(d, 10),
+    "stamps doubled": lambda d, o: with_stamps(d, 2),
+    "image stamps doubled": lambda d, o: _one_clock(d, images=2.0),
+    "image stamps tenfold": lambda d, o: _one_clock(d, images=10.0),
+    "scan stamps halved": lambda d, o: _one_clock(d, scans=0.5),
+    "scan stamps a tenth": lambda d, o: _one_clock(d, scans=0.1),
     "scans repeated": lambda d, o: _repeated(d, scans=True),
     "images repeated": lambda d, o: _repeated(d, scans=False),
     "half the focal length": lambda d, o: with_camera(d, 0.5),
@@ -225,6 +236,10 @@ NAMED: dict[str, str] = {
     "images mirrored": "mirrored",
     "labels permuted": "the class numbers of the points are mixed up",
     "stamps a tenth": "the stamps run too slowly",
+    "image stamps doubled": "the images' stamps run 2 times as fast",
+    "image stamps tenfold": "the images' stamps run 10 times as fast",
+    "scan stamps halved": "the images' stamps run 2 times as fast",
+    "scan stamps a tenth": "the stamps run too slowly",
     "scans repeated": "one scan is repeated",
     "images repeated": "one picture is repeated",
     "half the focal length": "the focal length is half",
@@ -235,4 +250,4 @@ NAMED: dict[str, str] = {
     "masks shifted 6 px": "the masks are shifted right",
     "right camera": "the pictures are those of another camera",
 }
-"""Words of the sentence that names each lie rightly. That stamps are tenfold no data tell."""
+"""Words of the sentence that names each lie rightly. That all stamps are doubled or tenfold no data tell."""

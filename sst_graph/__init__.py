@@ -13,9 +13,10 @@ if TYPE_CHECKING:
     from sst_graph.problem.align import align_frame
     from sst_graph.problem.alignment_keys import AlignmentKeys, Trajectory
     from sst_graph.problem.alignment_term import AlignmentTerm
-    from sst_graph.problem.incremental_terms import IncrementalTerms
-    from sst_graph.problem.rematching import solve_with_terms
     from sst_graph.result import CalibrationResult
+    from sst_graph.slam.covariance import calibration_covariance
+    from sst_graph.slam.incremental_terms import IncrementalTerms
+    from sst_graph.slam.rematching import solve_with_terms
     from sst_graph.uncertainty.inspection import inspect_result
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "Trajectory",
     "align_frame",
     "calibrate",
+    "calibration_covariance",
     "inspect_result",
     "open_source",
     "solve_with_terms",
@@ -38,9 +40,9 @@ __all__ = [
 _HOMES = {
     "AlignmentKeys": "sst_graph.problem.alignment_keys",
     "AlignmentTerm": "sst_graph.problem.alignment_term",
-    "IncrementalTerms": "sst_graph.problem.incremental_terms",
+    "IncrementalTerms": "sst_graph.slam.incremental_terms",
     "Trajectory": "sst_graph.problem.alignment_keys",
-    "solve_with_terms": "sst_graph.problem.rematching",
+    "solve_with_terms": "sst_graph.slam.rematching",
     "CalibrationConfig": "sst_graph.estimators",
     "CalibrationResult": "sst_graph.result",
     "TrackUpdate": "sst_graph.estimators",
@@ -48,6 +50,7 @@ _HOMES = {
     "TrackerConfig": "sst_graph.estimators",
     "align_frame": "sst_graph.problem.align",
     "calibrate": "sst_graph.estimators",
+    "calibration_covariance": "sst_graph.slam.covariance",
     "inspect_result": "sst_graph.uncertainty.inspection",
     "open_source": "sst_graph.data",
 }

@@ -99,8 +99,14 @@ class Boundaries:
 
     def take(self, index: IntArray) -> Boundaries:
         """Some of the points, by position."""
-        parts = {field.name: getattr(self, field.name)[index] for field in fields(self)}
-        return Boundaries(**parts)
+        return Boundaries(
+            self.lPs[index],
+            self.outward[index],
+            self.half_gaps_m[index],
+            self.offsets_s[index],
+            self.edges[index],
+            self.objects[index],
+        )
 
 
 def joined(parts: Sequence[Boundaries]) -> Boundaries:

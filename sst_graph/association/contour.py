@@ -166,14 +166,14 @@ def are_unknown(
 ) -> NDArray[np.bool_]:
     """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
     :func:`nearest_contours`."""
-    counts = [b - a for a, b in spans]
-    columns, rows = np.repeat([contour.box for contour in contours], counts, axis=0).T
-    column, row = np.rint(places).astype(np.intp)
-    at = np.minimum(np.maximum(row, 0), rows - 1) * columns
-    at += np.minimum(np.maximum(column, 0), columns - 1)
+    column, row = np.maximum(np.rint(places).astype(np.intp), 0)
     found = np.empty(places.shape[1], np.uint8)
     for contour, (a, b) in zip(contours, spans, strict=True):
-        found[a:b] = contour.unknown.reshape(-1)[at[a:b]]
+        if b > a:
+            unknown = contour.unknown
+            rows, columns = unknown.shape
+            at = np.minimum(row[a:b], rows - 1) * columns + np.minimum(column[a:b], columns - 1)
+            found[a:b] = unknown.reshape(-1)[at]
     return found > 0
 
 

@@ -260,16 +260,26 @@ def _within(states: States, guess: gtsam.Pose3 | None, reach_rad: float) -> IntA
     return inside if len(inside) else np.arange(len(states))
 
 
+_PEAKS_AT_ONCE = 512
+
+
 def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> tuple[States, FloatArray]:
     """The best ``count`` states, no two closer in rotation than ``apart_rad``, and their scores."""
     chosen: list[int] = []
-    remaining = np.argsort(-scores, kind="stable")
+    order = np.argsort(-scores, kind="stable")
     flat = states.rotations.reshape(len(scores), 9)
     largest_trace = 1.0 + 2.0 * np.cos(apart_rad)
-    while len(remaining) and len(chosen) < count:
-        best = remaining[0]
-        chosen.append(int(best))
-        remaining = remaining[flat[remaining] @ flat[best] < largest_trace]
+    # Some at a time, for the best are mostly enough.
+    for start in range(0, len(order), _PEAKS_AT_ONCE):
+        remaining = order[start : start + _PEAKS_AT_ONCE]
+        near = flat[remaining] @ flat[chosen].T >= largest_trace
+        remaining = remaining[~near.any(axis=1)]
+        while len(remaining) and len(chosen) < count:
+            best = remaining[0]
+            chosen.append(int(best))
+            remaining = remaining[flat[remaining] @ flat[best] < largest_trace]
+        if len(chosen) == count:
+            break
     index = np.array(chosen, dtype=np.intp)
     return states.take(index), scores[index]
 

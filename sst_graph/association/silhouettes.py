@@ -136,13 +136,16 @@ class Facing:
 
     def take(self, index: IntArray) -> Facing:
         """Some of the points, by position, rising; no group is lost."""
-        return replace(
-            self,
-            points=self.points.take(index),
-            owners=self.owners[index],
-            bounds=np.searchsorted(index, self.bounds),
-            base_taus_s=self.base_taus_s[index],
-            velocities=None if self.velocities is None else self.velocities[index],
+        return Facing(
+            self.camera,
+            self.points.take(index),
+            self.owners[index],
+            np.searchsorted(index, self.bounds),
+            self.contours,
+            self.motions,
+            self.base_taus_s[index],
+            self.biases_px,
+            None if self.velocities is None else self.velocities[index],
         )
 
     def repeated(self, of_groups: ArrayLike) -> NDArray[Any]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import gtsam
 
-from sst_graph.diagnosis import cameras, labels, repeats, units
+from sst_graph.diagnosis import cameras, clocks, labels, repeats, units
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
 from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored
@@ -32,7 +32,8 @@ def _preflight(
 ) -> Iterator[Finding]:
     found = [units.start_unit(guess)]
     for drive in drives:
-        found += [cameras.image_size(drive.camera), units.stamps(drive), repeats.repeats(drive)]
+        found += [cameras.image_size(drive.camera), clocks.stamps(drive), clocks.two_clocks(drive)]
+        found.append(repeats.repeats(drive))
         if classes:
             found += [labels.ground_points(drive), labels.mask_rows(drive), units.clouds(drive)]
     if classes:
@@ -66,11 +67,16 @@ def likely_causes(
 
 
 def mirror(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, answer: Fit
 ) -> tuple[Finding, ...]:
-    """Whether mirrored data would agree better, for a result that nothing else speaks against."""
+    """Whether mirrored data would agree better, for a result that nothing else speaks against.
+
+    Args:
+        answer: how well the labels agree in the result.
+    """
     drive = max(drives, key=lambda one: len(one.scans))
-    cause = mirrored(drive, guess, offset_s, fit, fit(drive, guess, offset_s))
+    around = answer.cTl if guess is None else guess
+    cause = mirrored(drive, around, offset_s, fit, answer, sideways=guess is not None)
     return () if cause is None else (cause,)
 
 

@@ -1,4 +1,4 @@
-"""Units and axes of stamps, clouds and the start."""
+"""Units and axes of clouds and the start."""
 
 from __future__ import annotations
 
@@ -14,13 +14,6 @@ from sst_graph.problem.survey import Ground, Survey
 
 FloatArray = NDArray[np.float64]
 
-_LONGEST_PERIOD_S, _SHORTEST_PERIOD_S = 5.0, 1.0 / 60.0
-"""Scans come 5 to 30 times a second, subsampled ones every few seconds [s]."""
-_USUAL_PERIODS_S = (0.008, 2.0)
-"""Where a period in the right unit lies [s]."""
-_TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
-_FASTEST_MPS = 70.0
-"""Faster than any road vehicle that records for calibration [m/s]."""
 _CAR_HEIGHT_M, _HIGHEST_VEHICLE_M = 1.5, 3.6
 """Most vehicles are cars; the median of a drive among trucks and buses stays below their 4 m."""
 _LOWEST_VEHICLE_M = 0.5
@@ -33,39 +26,6 @@ _UPRIGHT = 0.7
 """Cosine between two directions that are the same one, roughly."""
 _FARTHEST_START_M = 10.0
 """LiDAR and camera on one vehicle, a truck's length apart [m]."""
-
-
-def stamps(drive: Drive) -> Finding | None:
-    """Stamps in another unit than seconds, or at a rate that the motion contradicts."""
-    if len(drive.scans) < 3:
-        return None
-    steps = np.diff(drive.scan_stamps_ns) * 1e-9
-    period = float(np.median(steps))
-    if period > _LONGEST_PERIOD_S:
-        fitting = [f for f in _TIME_UNITS if _USUAL_PERIODS_S[0] <= period / f <= _USUAL_PERIODS_S[1]]
-        regular = float(np.median(np.abs(steps - period))) < 0.1 * period
-        if not fitting or not regular:
-            return None
-        return Finding(
-            f"the stamps are in {_TIME_UNITS[fitting[0]]}, not seconds",
-            f"{period:.4g} s from scan to scan; in that unit it is {period / fitting[0]:.2g} s",
-            "write times in seconds",
-        )
-    speeds = [np.linalg.norm(m.aTb.translation()) / m.seconds for m in drive.lidar_motions if m.ok]
-    speed = float(np.quantile(speeds, 0.8)) if len(speeds) >= 3 else 0.0
-    sweep = max((scan.sweep_s for scan in drive.survey.scans), default=0.0) if drive.survey else 0.0
-    if period > _SHORTEST_PERIOD_S and speed < _FASTEST_MPS and sweep < 2.0 * period:
-        return None
-    found = [f"{1e3 * period:.3g} ms from scan to scan"]
-    if speed >= _FASTEST_MPS:
-        found.append(f"a speed of {speed:.0f} m/s")
-    if sweep >= 2.0 * period:
-        found.append(f"points of one scan spread over {1e3 * sweep:.0f} ms")
-    return Finding(
-        "the stamps run too slowly (wrong frame rate or unit)",
-        ", ".join(found),
-        "compare the stamps' intervals with the scanner's rate, 5 to 20 turns a second for most",
-    )
 
 
 def clouds(drive: Drive) -> Finding | None:

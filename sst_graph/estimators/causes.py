@@ -50,9 +50,10 @@ def _suspected(
     fit = fit_labels(config)
     if not result.frames_used or result.status == "not_converged":
         return likely_causes(drives, guess.cTl, guess.offset_s, fit)
-    if result.diagnostics["explained"] * result.diagnostics["concentration"] < _AGREED:
-        around = result.T_camera_lidar if guess.cTl is None else guess.cTl
-        return mirror(drives, around, guess.offset_s, fit)
+    explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
+    if explained * concentration < _AGREED:
+        answer = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
+        return mirror(drives, guess.cTl, guess.offset_s, fit, answer)
     return ()
 
 

@@ -59,7 +59,7 @@ class ScoreSums:
     def empty(cls, n: int, held: int = 0) -> ScoreSums:
         """n: unknowns; held: further parameters."""
         nothing = np.zeros((n + held, n + held))
-        return cls(nothing, nothing, nothing, objects=ObjectSums.empty(n, held), held=held)
+        return cls(nothing, nothing, nothing, objects=ObjectSums.empty(n), held=held)
 
     def add(
         self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
@@ -99,7 +99,7 @@ class ScoreSums:
     def transform(self, T: FloatArray) -> None:
         """Follow the belief: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
         self.JJ, self.frames, self.closed = (T @ M @ T.T for M in (self.JJ, self.frames, self.closed))
-        self.objects.transform(T)
+        self.objects.transform(T[: len(T) - self.held, : T.shape[1] - self.held])
         self.live = {side: (T @ row, last) for side, (row, last) in self.live.items()}
 
     def copy(self) -> ScoreSums:

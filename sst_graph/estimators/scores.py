@@ -160,7 +160,7 @@ def score_pair(
         sides.scores.T @ sides.scores,
         len(pair),
         places,
-        ObjectBeliefs.of(J, r, roots, track, point) if by_object else None,
+        ObjectBeliefs.of(J[:, :n], r, roots, track, point) if by_object else None,
         weight,
         bend,
         _by_standing(pair, point, A[:, known], motion[np.ix_(known, known)]),

@@ -19,7 +19,6 @@ from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
-from sst_graph.estimators.object_sums import ObjectBeliefs
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
@@ -34,7 +33,7 @@ from sst_graph.problem.state import (
 )
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
-from sst_graph.uncertainty.object_spread import ObjectSpread, composed
+from sst_graph.uncertainty.object_spread import composed
 
 FloatArray = NDArray[np.float64]
 
@@ -325,28 +324,10 @@ class WindowSmoother:
         robust = naive + naive @ self.surplus() @ naive
         spread = None
         if not self.drift.enabled:
-            point_now = self.past.at(self._point).point
-            spread = self.sums.objects.spread(self._objects(), naive, point_now)
+            found = [e.score.objects for e in self.entries.values() if e.score.objects is not None]
+            spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
         robust = composed(robust, spread, self.flatness)
         return 0.5 * (robust + robust.T), naive
-
-    def _objects(self) -> list[ObjectBeliefs]:
-        """What each object says in each scan of the window."""
-        scores = [entry.score for entry in self.entries.values()]
-        return [score.objects for score in scores if score.objects is not None]
-
-    def score_spread(
-        self, directions: FloatArray, information: FloatArray, values: FloatArray
-    ) -> tuple[ObjectSpread | None, ...]:
-        """How estimates of held parameters vary with the objects; None where objects are not kept (drift).
-
-        Args:
-            directions, information, values: as of :meth:`ObjectSums.score_spread`.
-        """
-        if self.drift.enabled:
-            return (None,) * len(information)
-        point = self.past.at(self._point).point
-        return self.sums.objects.score_spread(self._objects(), point, directions, information, values)
 
     def surplus(self, with_held: bool = False) -> FloatArray:
         """(n, n) variance of the score of past and window beyond that of independent matches.

@@ -49,8 +49,8 @@ class TrackUpdate(ByValue):
         weak_directions: what is known worse than the limits.
         covariance_reason: why there is no covariance; empty where there is.
         settled: the window was solved as a whole after this frame (:meth:`Tracker.settle`).
-        contradictions: what the data contradict of all that is taken for granted, with estimate, deviation
-            and remedy.
+        contradictions: what the data contradict of what is taken for granted, with estimate, deviation and
+            remedy.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
     """

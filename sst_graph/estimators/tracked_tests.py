@@ -8,16 +8,14 @@ and
 
     theta = a'g / (a'H a / f + s^-2)
 
-is one Newton step: f is the mean robust weight over the mean curvature, s the parameter's span. Its deviation
-is made of the error model and of the steps without one object after the other as the covariance is
-(:mod:`sst_graph.uncertainty.object_spread`). The threshold, and what few objects make of it, are the batch's
-(:mod:`sst_graph.estimators.assumption_tests`).
+is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
+threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.estimators.assumption_tests`).
+Objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.errors import EstimationError
@@ -25,9 +23,7 @@ from sst_graph.estimators.assumption_tests import Finding, few_objects
 from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.uncertainty.assumptions import AssumptionConfig
-from sst_graph.uncertainty.object_spread import believed_flatness, composed
-
-FloatArray = NDArray[np.float64]
+from sst_graph.uncertainty.object_spread import believed_flatness
 
 EVERY = 10
 """Scans between two tests: they cost about as much as the covariance, which each frame has."""
@@ -48,19 +44,16 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
     surplus = np.einsum("nk,nm,mk->k", A, smoother.surplus(with_held=True), A)
     before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
-    frozen = np.maximum(information, 0.0) + before
     curvature = np.maximum(information, 0.0) / believed_flatness(smoother.flatness) + before
-    spreads = smoother.score_spread(A, frozen, score / frozen)
-    wider = few_objects(smoother.objects, config.threshold)
+    values = score / curvature
+    sigmas = np.sqrt(np.maximum(information + surplus, 0.0) + before) / curvature
+    sigmas *= few_objects(smoother.objects, config.threshold)
     found = []
     for place, name in enumerate(smoother.held_names):
         assumption = ASSUMPTIONS[name]
         if not assumption.by_matches:
             continue
-        modelled = (max(information[place] + surplus[place], 0.0) + before[place]) / frozen[place] ** 2
-        variance = float(composed(np.array([[modelled]]), spreads[place], 1.0)[0, 0])
-        value = float(score[place] / curvature[place])
-        sigma = float(np.sqrt(variance) * frozen[place] / curvature[place]) * wider
+        value, sigma = float(values[place]), float(sigmas[place])
         contradicted = abs(value) > config.threshold * sigma
         found.append(Finding(assumption, value, sigma, contradicted))
     return tuple(sorted(found, key=lambda finding: -finding.score))

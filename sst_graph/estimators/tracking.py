@@ -15,7 +15,7 @@ from factors.camera import PinholeCamera
 from sst_graph.estimators.admission import StampOrder, check_lateness
 from sst_graph.estimators.adoption import Adoption
 from sst_graph.estimators.arrivals import Arrivals
-from sst_graph.estimators.assumption_tests import contradiction_of
+from sst_graph.estimators.assumption_tests import contradiction_of, told_by
 from sst_graph.estimators.gaussian import Point
 from sst_graph.estimators.history import History
 from sst_graph.estimators.known import Known
@@ -113,7 +113,8 @@ class Tracking:
 
     def considered(self) -> Considered:
         """How the present estimate follows the assumptions that are not estimated beside it."""
-        return considered(self.known.steps, self.config.calibration.assumptions)
+        beside = considered(self.known.steps, self.config.calibration.assumptions)
+        return told_by(beside, self.tests.findings)
 
     @property
     def estimated_names(self) -> tuple[str, ...]:

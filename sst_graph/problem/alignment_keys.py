@@ -15,6 +15,15 @@ from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
+_CLASSES = tuple(SemanticClass)
+COLUMNS = 7 + len(_CLASSES)
+"""What all terms share, in order: extrinsic (6), time offset, the mask bias of each class."""
+
+
+def bias_column(semantic_class: SemanticClass) -> int:
+    """Place of a class's mask bias among :data:`COLUMNS`."""
+    return 7 + _CLASSES.index(semantic_class)
+
 
 class Trajectory:
     """Keys and stamps of a body's poses wTb, in the order of time; poses may be added at the end."""
@@ -133,19 +142,25 @@ class AlignmentKeys:
     @property
     def lasting(self) -> tuple[int, ...]:
         """Keys of all that no pose marginalizes: extrinsic, time offset and mask biases."""
-        return self.variables + tuple(key for key in self.biases_px.values() if isinstance(key, int))
-
-    @property
-    def size(self) -> int:
-        """Dimension of the variables among extrinsic and time offset."""
-        return 6 * isinstance(self.cTl, int) + isinstance(self.offset_s, int)
+        biases = (key for key in self.biases_px.values() if isinstance(key, int))
+        return tuple(dict.fromkeys((*self.variables, *biases)))
 
     def placed(self, covariance: FloatArray) -> FloatArray:
-        """(7, 7) from the covariance of :attr:`variables`; zeros for what is constant."""
-        of = [*range(6)] * isinstance(self.cTl, int) + [6] * isinstance(self.offset_s, int)
-        whole = np.zeros((7, 7))
-        whole[np.ix_(of, of)] = covariance
-        return whole
+        """(n, n) over :data:`COLUMNS` from the covariance of :attr:`lasting`; zeros for what is constant."""
+        A = np.zeros((len(covariance), COLUMNS))
+        rows = dict(zip(self.lasting, self._first_rows(), strict=True))
+        if isinstance(self.cTl, int):
+            A[rows[self.cTl] : rows[self.cTl] + 6, :6] = np.eye(6)
+        if isinstance(self.offset_s, int):
+            A[rows[self.offset_s], 6] = 1.0
+        for c, key in self.biases_px.items():
+            if isinstance(key, int):
+                A[rows[key], bias_column(c)] = 1.0
+        return np.asarray(A.T @ covariance @ A)
+
+    def _first_rows(self) -> list[int]:
+        sizes = [6 if key == self.cTl else 1 for key in self.lasting]
+        return [sum(sizes[:k]) for k in range(len(sizes))]
 
     def keeps_double(self, values: gtsam.Values) -> bool:
         """Whether the time offset is kept as a ``double``."""

@@ -4,7 +4,7 @@ A term knows its data, and where extrinsic, time offset and the trajectory stand
 it finds the two poses between which the image was taken in true time, stamp + offset, matches scan and
 image there, and makes its factor (:func:`factors.pose_alignment_factor`). Matches are frozen in a factor:
 what it says holds near the values at which it was made, and :class:`TermMatches` tells how near they still
-are. :mod:`sst_graph.problem.rematching` swaps the factors of many terms in a solver.
+are. :mod:`sst_graph.slam.rematching` swaps the factors of many terms in a solver.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sst_graph.association.silhouettes import MatchConfig
 from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.problem.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
-from sst_graph.problem.alignment_keys import AlignmentKeys
+from sst_graph.problem.alignment_keys import COLUMNS, AlignmentKeys, bias_column
 from sst_graph.problem.drive import ImageFeatures, ScanFeatures
 from sst_graph.problem.object_sides import ObjectSides
 from sst_graph.problem.persistence import ObjectName
@@ -87,6 +87,44 @@ class TermPlace:
 
 
 @dataclass(frozen=True)
+class TermRows:
+    """Matches of one term, linearized, over the columns :data:`~sst_graph.problem.alignment_keys.COLUMNS`.
+
+    Attributes:
+        J: (m, n) derivatives of the residuals, the trajectory held [px per unit].
+        r: (m,) residuals, mask bias included [px].
+        weights: (m,) robust weight times the match's own.
+        sigmas_px: (m,) that the factor gives the residuals [px].
+        sides: (m,) number of the side of an object that each match lies on, the same in every image.
+    """
+
+    J: FloatArray
+    r: FloatArray
+    weights: FloatArray
+    sigmas_px: FloatArray
+    sides: NDArray[np.intp]
+
+    @classmethod
+    def none(cls) -> TermRows:
+        return cls(np.zeros((0, COLUMNS)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.intp))
+
+    @classmethod
+    def joined(cls, parts: Sequence[TermRows]) -> TermRows:
+        """One after the other."""
+        parts = [cls.none(), *parts]
+        return cls(
+            np.concatenate([part.J for part in parts]),
+            np.concatenate([part.r for part in parts]),
+            np.concatenate([part.weights for part in parts]),
+            np.concatenate([part.sigmas_px for part in parts]),
+            np.concatenate([part.sides for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+
+@dataclass(frozen=True)
 class TermMatches:
     """A term at some values: its factor, or why there is none.
 
@@ -97,6 +135,7 @@ class TermMatches:
         place: poses around the image; None outside of the trajectory.
         found: the matches.
         factor: of them; None where the state is not ``MATCHED``.
+        information: what the image counts in the factor, over what its matches would by themselves.
     """
 
     state: TermState
@@ -105,6 +144,7 @@ class TermMatches:
     place: TermPlace | None = None
     found: FrameAlignments = field(default_factory=lambda: FrameAlignments((), (), ()))
     factor: gtsam.CustomFactor | None = None
+    information: float = 1.0
     term: AlignmentTerm | None = field(default=None, repr=False)
     made_at: tuple[FloatArray, ...] = field(default=(), repr=False)
 
@@ -235,27 +275,29 @@ class AlignmentTerm:
         if len(found) < self.config.min_matches:
             return TermMatches(TermState.FEW_MATCHES, kernel_px, place=place, found=found)
         factor = self._factor(place, found, information)
-        matches = TermMatches(TermState.MATCHED, kernel_px, 0.0, place, found, factor, self)
+        matches = TermMatches(TermState.MATCHED, kernel_px, 0.0, place, found, factor, information, self)
         return replace(matches, made_at=tuple(r for r, _ in self.residuals_of(matches, values)))
 
-    def side_scores(
-        self, matches: TermMatches, sides: ObjectSides, values: gtsam.Values
-    ) -> list[tuple[NDArray[np.intp], FloatArray]]:
-        """Of each alignment, (n,) number of the side that each match lies on, and (n, 7) the score on
-        extrinsic and offset for an error of 1 px of the match."""
+    def rows(self, matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> TermRows:
+        """The matches as rows of the linear problem at the values, with the sides that they lie on."""
         place = matches.place
         if matches.factor is None or place is None:
-            return []
+            return TermRows.none()
         scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.X_scan)
-        numbers = sides.of(scan_ns, matches.found, wTl)
-        scores = []
-        for c, alignment, (r, J) in zip(
-            matches.found.classes, matches.found.alignments, self.residuals_of(matches, values), strict=True
+        found, parts = matches.found, []
+        for c, alignment, numbers, (r, J) in zip(
+            found.classes,
+            found.alignments,
+            sides.of(scan_ns, found, wTl),
+            self.residuals_of(matches, values),
+            strict=True,
         ):
-            x = (r + self.keys.bias(values, c)) / alignment.sigmas_px
-            weights = alignment.weights * alignment.kernel.weight(x) / alignment.sigmas_px**2
-            scores.append(J * weights[:, None])
-        return list(zip(numbers, scores, strict=True))
+            r = r + self.keys.bias(values, c)
+            weights = alignment.weights * alignment.kernel.weight(r / alignment.sigmas_px)
+            columns = np.zeros((len(r), COLUMNS))
+            columns[:, :7], columns[:, bias_column(c)] = J, 1.0
+            parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers))
+        return TermRows.joined(parts)
 
     def _wTl(self, values: gtsam.Values, X: int) -> gtsam.Pose3:
         wTb = values.atPose3(X)

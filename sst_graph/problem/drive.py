@@ -207,7 +207,7 @@ class Drive:
     def image_stamps_ns(self) -> list[int]:
         return [image.stamp_ns for image in self.images]
 
-    @property
+    @cached_property
     def image_period_s(self) -> float:
         """Median interval between images [s]; 0.1 for a single one."""
         stamps = self.image_stamps_ns
@@ -217,7 +217,7 @@ class Drive:
         """The drive with some of its scans only, by position, rising; all images and motions stay."""
         return replace(self, scans=tuple(self.scans[position] for position in scans))
 
-    @property
+    @cached_property
     def scan_period_s(self) -> float:
         """Median interval between scans [s]; 0.1 for a single one."""
         stamps = self.scan_stamps_ns

@@ -13,9 +13,10 @@ import numpy as np
 from factors import PinholeCamera, delay_prior
 from sst_graph import AlignmentKeys, AlignmentTerm, IncrementalTerms, Trajectory
 from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.data.simulator.config import Motion
 from sst_graph.problem.align import features_of
 from sst_graph.problem.drive import ImageFeatures, ScanFeatures
-from sst_graph.problem.incremental_terms import IncrementalUpdate, Solver
+from sst_graph.slam.incremental_terms import IncrementalUpdate, Solver
 from sst_graph.types import RelativeMotion, SemanticClass
 
 E, D = gtsam.symbol("E", 0), gtsam.symbol("D", 0)
@@ -129,12 +130,13 @@ def isam2_params() -> gtsam.ISAM2Params:
 
 
 @cache
-def simulated_street(seed: int = 4, frames: int = 24) -> Street:
-    """A drive with a stop, parked vehicles only, odometry with the noise of a good LiDAR."""
+def simulated_street(seed: int = 4, frames: int = 24, motion: Motion = "mixed") -> Street:
+    """A drive with parked vehicles only, odometry with the noise of a good LiDAR."""
     drive = simulate(
         SimulationConfig(
             seed=seed,
             frames=frames,
+            motion=motion,
             width=621,
             height=188,
             azimuth_limit_deg=55.0,

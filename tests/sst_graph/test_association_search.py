@@ -10,7 +10,7 @@ import pytest
 from streets import standing_street
 
 from factors import PinholeCamera
-from sst_graph.association.search import Candidate, SearchConfig, rotation_matrices, search_start
+from sst_graph.association.search import Candidate, SearchConfig, _peaks, rotation_matrices, search_start
 from sst_graph.association.votes import Judge, SearchFrame, States, Votes
 from sst_graph.data.simulator import SimulatedDrive
 from sst_graph.errors import EstimationError
@@ -148,3 +148,20 @@ def test_nothing_to_search_with() -> None:
     source, frames = drive()
     with pytest.raises(EstimationError, match="no labelled point"):
         search_start(frames, source.camera, [SemanticClass.TWO_WHEELER], None)
+
+
+@pytest.mark.parametrize("count", [3, 60, 5000])
+def test_peaks_are_the_best_that_lie_apart(count: int) -> None:
+    rng = np.random.default_rng(count)
+    rotations = rotation_matrices(rng.normal(0.0, 0.3, (1500, 3)))
+    states = States(rotations, rng.normal(size=(1500, 3)), rng.normal(size=1500))
+    scores = np.round(rng.normal(size=1500), 2)  # some alike: the first of them comes first
+    chosen: list[int] = []
+    for i in np.argsort(-scores, kind="stable").tolist():
+        traces = (rotations[chosen] * rotations[i]).sum(axis=(1, 2))
+        if len(chosen) < count and (traces < 1.0 + 2.0 * np.cos(0.1)).all():
+            chosen.append(i)
+    found, best = _peaks(states, scores, count, 0.1)
+    np.testing.assert_array_equal(found.offsets, states.offsets[chosen])
+    np.testing.assert_array_equal(best, scores[chosen])
+    assert len(chosen) == count or count > 1000

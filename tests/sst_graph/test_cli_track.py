@@ -78,6 +78,18 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "calibration.json"
+    main(["track", str(street), *OPTIONS, "--estimate", "focal=0.01", "--out", str(out)])
+    lines, result = _lines(capsys.readouterr().out), read_result(out)
+    assert lines[0]["estimated"] == {} and lines[-1]["estimated"] == result.diagnostics["estimated"]
+    focal = lines[-1]["estimated"]["focal"]
+    assert 0.0 < focal["sigma"] < 0.01 and abs(focal["value"]) < 4.0 * focal["sigma"]
+    assert "focal" not in result.diagnostics["assumptions"] and "k1" in result.diagnostics["assumptions"]
+    assert main(["track", str(street), "--estimate", "k3"]) == 2
+    assert "'k3'" in capsys.readouterr().err
+
+
 def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """SIGKILL at some frame after a checkpoint; what is resumed does what an unbroken run does."""
     whole, rest, checkpoint = tmp_path / "whole.json", tmp_path / "rest.json", tmp_path / "tracker.npz"
@@ -104,7 +116,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     for line, own in zip(unbroken[-len(resumed) :], resumed, strict=True):
         assert own.keys() == line.keys()
         for name, value in line.items():
-            if isinstance(value, float | list) and name not in ("weak", "refused"):
+            if isinstance(value, float | list) and name not in ("weak", "refused", "contradictions"):
                 np.testing.assert_allclose(own[name], value, rtol=1e-4, atol=1e-7)
             elif name != "weak":
                 assert own[name] == value

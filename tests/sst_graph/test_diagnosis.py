@@ -19,9 +19,13 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size
+from sst_graph.diagnosis.clocks import stamps, two_clocks
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.errors import DataError
 from sst_graph.estimators.batch import prepare_drives
+from sst_graph.odometry.sweep import SweepDecision
+from sst_graph.problem.drive import Drive
+from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import SemanticClass
 
 CLASSES = (SemanticClass.VEHICLE,)
@@ -36,6 +40,10 @@ BY_THEMSELVES = (
     "Tr in mm",
     "labels permuted",
     "stamps a tenth",
+    "image stamps doubled",
+    "image stamps tenfold",
+    "scan stamps halved",
+    "scan stamps a tenth",
     "scans repeated",
     "images repeated",
     "only background",
@@ -84,6 +92,62 @@ def test_right_data_are_left_alone() -> None:
 def test_a_lie_is_named_before_anything_is_solved(lie: str) -> None:
     found = causes(LIES[lie](drive(), other()))
     assert any(NAMED[lie] in sentence for sentence in found), found
+
+
+@cache
+def prepared() -> Drive:
+    (one,) = prepare_drives([drive()], CalibrationConfig())
+    return one
+
+
+@pytest.mark.parametrize(("turn_s", "told"), [(0.1, False), (0.2, False), (1.0, True)])
+def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, told: bool) -> None:
+    """Stamps ten times too far apart: what was measured in a tenth of a second seems to take a whole one."""
+    for sense, fraction in (("clockwise", -1.0), ("counterclockwise", 1.0)):
+        decision = SweepDecision(sense, SweepTiming(fraction, np.pi, turn_s))  # type: ignore[arg-type]
+        found = stamps(replace(prepared(), sweep=decision))
+        assert (found is not None and "run too fast" in found.cause) == told
+    # Compensated clouds of a drive of which every tenth scan was kept.
+    sparse = replace(prepared(), sweep=SweepDecision("compensated", SweepTiming(0.0, np.pi, turn_s)))
+    assert stamps(sparse) is None
+
+
+@pytest.mark.parametrize(
+    ("speeds", "words"),
+    [
+        (np.full(20, 15.0), None),
+        (np.linspace(20.0, 5.0, 20), None),  # 8 m/s^2: hard braking
+        (np.linspace(28.0, 0.5, 20), "accelerations of 15 m/s2"),
+        (np.full(20, 65.0), "a speed of 65 m/s"),
+        (np.where(np.arange(20) == 7, 90.0, 15.0), None),  # one failed registration
+    ],
+)
+def test_no_vehicle_drives_like_that(speeds: np.ndarray, words: str | None) -> None:
+    motions = tuple(
+        replace(
+            prepared().lidar_motions[0],
+            from_ns=k * 100_000_000,
+            to_ns=(k + 1) * 100_000_000,
+            aTb=gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * speed, 0.0, 0.0])),
+            ok=True,
+        )
+        for k, speed in enumerate(speeds)
+    )
+    found = stamps(replace(prepared(), lidar_motions=motions))
+    if words is None:
+        assert found is None
+    else:
+        assert found is not None and words in found.evidence and "run too slowly" in found.cause
+
+
+def test_single_stamps_that_are_off_are_no_second_clock() -> None:
+    """A lost image with the numbering going on, a late frame now and then: the intervals agree otherwise."""
+    late = [0, 0, 0, 80, 0, 100, 100, 100, 100, 100]
+    images = tuple(
+        replace(image, stamp_ns=image.stamp_ns + 1_000_000 * ms)
+        for image, ms in zip(prepared().images, late, strict=True)
+    )
+    assert two_clocks(replace(prepared(), images=images)) is None
 
 
 def test_masks_of_another_size_are_refused() -> None:

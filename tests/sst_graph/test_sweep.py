@@ -24,6 +24,8 @@ from sst_graph.odometry.sweep import (
     with_sweep,
     with_sweep_of,
 )
+from sst_graph.odometry.sweep.estimate import CANDIDATES, Evidence, estimate
+from sst_graph.odometry.sweep.window import SECTORS, SweepWindowConfig, Window
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Scan
 
@@ -196,12 +198,73 @@ def test_the_sweep_of_a_hall_is_told(
         assert abs((turned + 180.0) % 360.0 - 180.0) <= 10.0
 
 
+def test_the_start_of_a_fast_turn_is_found() -> None:
+    """2 m in a turn: points between a wrong start and the right one are off by as much, and match nothing."""
+    found = decide_sweep(_hall(20.0, 1.0, -100.0), 14)
+    assert found.kind == "counterclockwise", found.sentence
+    turned = np.degrees(found.timing.start_rad) + 100.0
+    assert abs((turned + 180.0) % 360.0 - 180.0) <= 10.0
+
+
+@pytest.mark.parametrize("fraction", [0.0, -1.0])
+def test_what_drives_along_does_not_decide(fraction: float) -> None:
+    """A truck beside the vehicle that no label tells from the static scene."""
+    hall = _hall(6.0, fraction, 180.0)
+    along, up = np.meshgrid(np.arange(-3.0, 5.0, 0.15), np.arange(-1.2, 2.0, 0.2))
+    side = np.column_stack([along.ravel(), np.full(along.size, -3.5), up.ravel()])
+
+    def scan(k: int) -> Scan:
+        seen = hall(k)
+        noise = np.random.default_rng([9, k]).normal(0.0, 0.01, side.shape)
+        creeping = side + noise + [0.03 * k, 0.0, 0.0]
+        points = np.concatenate([seen.points, creeping.astype(np.float32)])
+        return Scan(seen.stamp_ns, points, np.full(len(points), 3, np.uint8))
+
+    found = decide_sweep(scan, 14)
+    assert found.kind in ("undecided", "compensated" if fraction == 0.0 else "clockwise"), found.sentence
+
+
+def test_one_thing_alone_excludes_no_hypothesis() -> None:
+    """Groups of matches add up; one that speaks ever so loudly adds no more than its share of being wrong."""
+    quiet, loud = np.full((20, SECTORS), -1.0), np.zeros((20, SECTORS))
+    loud[3] = -1e6
+    flat = np.full((20, SECTORS), 1e-3)
+    unit, curvature = np.ones(SECTORS), np.ones(SECTORS)
+    both = Evidence(unit, curvature, ((quiet, flat), (quiet, flat)))
+    np.testing.assert_allclose(both.log_ratio(1.0), 20.0 - 20.0 * 0.5e-3)
+    np.testing.assert_allclose(both.log_ratio(-1.0), -20.0 - 20.0 * 0.5e-3)
+    alone = Evidence(unit, curvature, ((quiet, flat), (loud, flat)))
+    assert 2.9 < float(alone.log_ratio(1.0).max()) < 3.1
+    against = Evidence(unit, curvature, ((quiet, flat), (-quiet, flat)))
+    np.testing.assert_array_equal(against.log_ratio(1.0), 0.0)
+
+
+def test_groups_of_matches_add_up_to_the_registration() -> None:
+    """By cell or by direction, with the poses following: the sums are the eliminated normal equations."""
+    hall = _hall(6.0, -1.0, 180.0)
+    window = Window([hall(k) for k in range(6)], 0.1, SweepWindowConfig())
+    found = estimate([window])
+    present = found.linearized_at[0] * CANDIDATES[found.linearized_at[1]]
+    sums = window.surface_sums(CANDIDATES.T, found.normals[0], present)
+    told = found.evidence([window])
+    for by in sums:
+        np.testing.assert_allclose(by.information.sum(axis=0), found.quadratic.curvature, rtol=1e-3)
+        slope = found.quadratic.slope
+        np.testing.assert_allclose(by.origin.sum(axis=0), -slope, atol=2e-3 * np.abs(slope).max())
+    assert abs(found.fraction + 1.0) < 5.0 * told.sigma[found.sector] < 0.5
+    # Noise of 10 mm at both ends of a match.
+    assert 0.008 < np.sqrt(window.errors.own) < 0.03 and np.sqrt(window.errors.shared) < 0.01
+
+
 def test_nothing_is_decided_where_nothing_tells() -> None:
     standing = decide_sweep(_hall(0.0, -1.0, 180.0), 14)
     assert standing.kind == "standing" and standing.timing.instant
     crawling = decide_sweep(_hall(0.5, -1.0, 180.0), 14)
     assert crawling.kind == "undecided" and crawling.timing.instant
     assert {timing.fraction for timing in crawling.others} == {-1.0, 1.0}
+    certain = SweepConfig(error_rate=1e-12)
+    hall = _hall(2.0, -1.0, 180.0, limit_deg=60.0)
+    assert decide_sweep(hall, 14, certain).kind == "undecided"
     single = decide_sweep(_hall(6.0, -1.0, 180.0), 1)
     assert single.kind == "undecided"
 

@@ -36,7 +36,7 @@ class SweepConfig(Settings):
         decide: whether it is; False takes such points as compensated.
         window: how scans are registered to one another.
         places: pairs of consecutive scans, spread over the drive, whose speed is looked at first.
-        windows: most stretches that are registered, the fastest first.
+        windows: most stretches that are registered, the fastest first, as long as they may decide it.
         scans: of a stretch.
         step_m, step_rad: motion from one scan of a stretch to the next that is aimed at, where the vehicle is
             slow by leaving scans out [m, rad].
@@ -44,7 +44,8 @@ class SweepConfig(Settings):
         rest_mps, rest_radps: a vehicle that is nowhere faster stands [m/s, rad/s].
         travel_m, travel_rad: a stretch tells nothing where the vehicle moves less from its first scan to its
             last: surfaces are then seen from one side only, with the same errors in every scan [m, rad].
-        sigmas: by how many standard deviations the other hypotheses must be worse.
+        error_rate: a hypothesis is excluded where another is 1 / error_rate times as likely: so much against
+            the right one is found in this share of drives at most, where the error model holds.
         tolerance: the estimated share may differ so much from 0 or 1 beside three of its sigmas.
         long_sweep_m: where the vehicle moves farther in a turn, matches made under a wrong hypothesis hold
             themselves up, and all are tried from the start [m].
@@ -53,7 +54,7 @@ class SweepConfig(Settings):
     decide: bool = True
     window: SweepWindowConfig = field(default_factory=SweepWindowConfig)
     places: int = setting(6, at_least=1, at_most=1000)
-    windows: int = setting(3, at_least=1, at_most=100)
+    windows: int = setting(6, at_least=1, at_most=100)
     scans: int = setting(12, at_least=2, at_most=200)
     step_m: float = setting(0.8, at_least=0.001, at_most=100.0)
     step_rad: float = setting(0.15, at_least=0.001, at_most=7.0)
@@ -62,7 +63,7 @@ class SweepConfig(Settings):
     rest_radps: float = setting(0.02, at_least=0.0, at_most=10.0)
     travel_m: float = setting(3.0, at_least=0.0, at_most=1000.0)
     travel_rad: float = setting(0.25, at_least=0.0, at_most=100.0)
-    sigmas: float = setting(3.5, at_least=0.0, at_most=1000.0)
+    error_rate: float = setting(0.001, at_least=1e-12, at_most=0.5)
     tolerance: float = setting(0.2, at_least=0.0, at_most=2.0)
     long_sweep_m: float = setting(1.0, at_least=0.0, at_most=1000.0)
 
@@ -192,6 +193,10 @@ def decide_sweep(
         _LOG.info("sweep: %s", decision.sentence)
         if decision.kind != "undecided" or len(windows) == config.windows:
             break
+        # As many windows again as are left would tell so much if they were all like these.
+        expected = 0.5 / decision.sigma**2 * config.windows / len(windows)
+        if expected < _HOPE * -np.log(config.error_rate):
+            break
     return decision
 
 
@@ -241,7 +246,7 @@ def _decided(windows: Sequence[Window], timing: SweepTiming, config: SweepConfig
     fraction, sector = 0.0, 0
     far = speed * timing.period_s > config.long_sweep_m
     if far:
-        fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS), _TRIED, SECTORS // 8)
+        fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
     found = estimate(windows, fraction, sector)
     return replace(_judged(windows, found, timing, config), speed_mps=speed)
 
@@ -250,33 +255,44 @@ def _judged(
     windows: Sequence[Window], found: Estimate, timing: SweepTiming, config: SweepConfig
 ) -> SweepDecision:
     """The three hypotheses by their evidence, that of compensated points being 1."""
-    quadratic = found.quadratic
-    units = found.units(windows, config.window.surface_m)
-    costs: dict[str, FloatArray] = {name: quadratic.cost(f) / units for name, f in FRACTIONS.items()}
-    evidence = {name: _log_mean(-cost) for name, cost in costs.items()}
+    told = found.evidence(windows)
+    ratios: dict[str, FloatArray] = {name: told.log_ratio(f) for name, f in FRACTIONS.items()}
+    evidence = {name: _log_mean(ratio) for name, ratio in ratios.items()}
     best = max(evidence, key=lambda name: evidence[name])
-    worse = {name: float(np.sqrt(2.0 * (evidence[best] - evidence[name]))) for name in evidence}
-    excluded = {name for name in worse if worse[name] > config.sigmas}
-    starts = {name: _start(costs[name]) for name in worse}
-    sector, told = starts[best] if best != "compensated" else (found.sector, False)
-    share = float(quadratic.free()[sector])
-    sigma = float(np.sqrt(units[sector] / max(quadratic.curvature[sector], 1e-12)))
+    behind = {name: evidence[best] - evidence[name] for name in evidence}
+    needed = -np.log(config.error_rate)
+    excluded = {name for name in behind if behind[name] > needed}
+    starts = {name: _start(-ratio) for name, ratio in ratios.items()}
+    # Against compensated points stands the turn that comes nearest to them.
+    raw = best if best != "compensated" else min(_RAW, key=lambda name: behind[name])
+    sector, start_told = starts[raw]
+    share, sigma = float(found.quadratic.free()[sector]), float(told.sigma[sector])
     agrees = abs(share - FRACTIONS[best]) < config.tolerance + 3.0 * sigma
-    decided = len(excluded) == 2 and agrees
+    # Where only a step at the start of the turn shows, one side of the scene against the other, whatever else
+    # sets the sides apart looks like it: every start must be told, also one where no points are.
+    informed = 0.5 / float(told.sigma.max()) ** 2 > needed
+    decided = len(excluded) == 2 and agrees and informed
     timings = {
-        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0])) for name in worse
+        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0]))
+        for name in evidence
     }
     kind = cast(SweepKind, best if decided else "undecided")
-    others = [timings[name] for name in worse if name not in excluded or not agrees]
+    settled = agrees and informed
+    others = [timings[name] for name in evidence if name not in excluded or not settled]
     return SweepDecision(
         kind,
         timings[best] if decided and best != "compensated" else timing,
         share,
         sigma,
-        worse,
-        told,
+        {name: float(np.sqrt(2.0 * value)) for name, value in behind.items()},
+        start_told and best != "compensated",
         others=() if decided else tuple(other for other in others if not other.instant),
     )
+
+
+_RAW = ("clockwise", "counterclockwise")
+_HOPE = 0.5
+"""Share of the evidence needed below which no more stretches are looked at."""
 
 
 def _log_mean(values: FloatArray) -> float:
@@ -304,18 +320,29 @@ def _start(costs: FloatArray) -> tuple[int, bool]:
     return widest[len(widest) // 2] % SECTORS, bool(alike.sum() <= SECTORS // 6)
 
 
-def _best_start(window: Window, fractions: Sequence[float], every: int) -> tuple[float, int]:
-    """The share, and the start of a turn at every so many sectors, under which scans meet best."""
-    best, least = (0.0, 0), np.inf
-    for fraction in fractions:
-        for sector in range(0, SECTORS, every) if fraction else (0,):
-            tried = window.copy()
-            misfit = at_hypothesis([tried], fraction, sector, _TRIED_PASSES).misfit
-            if misfit < least:
-                best, least = (fraction, sector), misfit
-    return best
+def _best_start(window: Window) -> tuple[float, int]:
+    """The share of the sweep, and the sector at whose border a turn begins, under which scans meet best.
+
+    Points between the right start and another are off by a whole turn and meet nothing, so that no derivative
+    shows the way: starts are tried, coarsely all around and then ever nearer to the best.
+    """
+
+    def misfit(fraction: float, sector: int) -> float:
+        return at_hypothesis([window.copy()], fraction, sector % SECTORS, _TRIED_PASSES).misfit
+
+    coarse = [(f, sector) for f in _TRIED for sector in (range(0, SECTORS, _COARSE) if f else (0,))]
+    least, (fraction, sector) = min((misfit(*tried), tried) for tried in coarse)
+    step = _COARSE // 2 if fraction else 0
+    while step:
+        least, sector = min(
+            (least, sector), *((misfit(fraction, s), s) for s in (sector - step, sector + step))
+        )
+        step //= 2
+    return fraction, sector % SECTORS
 
 
+_COARSE = 8
+"""Sectors between the starts that are tried first."""
 _TRIED = (0.0, -1.0, 1.0)
 _FEW_SCANS, _FEW_POINTS, _TRIED_PASSES = 6, 60, 4
 __all__ = ["CANDIDATES", "SweepConfig", "SweepDecision", "decide_sweep"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.odometry.sweep.window import SECTORS, Normal, Window
+from sst_graph.odometry.sweep.window import SECTORS, Normal, SurfaceSums, Window
 
 FloatArray = NDArray[np.float64]
 
@@ -66,6 +66,7 @@ class Estimate:
         fraction, sector: least cost of all.
         quadratic: the cost around it.
         normals: of the windows, at the last matches.
+        linearized_at: share and start under which those were made.
         misfit: mean robust misfit of the matches at the end, 0 to 1.
     """
 
@@ -73,27 +74,80 @@ class Estimate:
     sector: int
     quadratic: Quadratic
     normals: tuple[Normal, ...]
+    linearized_at: tuple[float, int]
     misfit: float
 
-    def units(self, windows: Sequence[Window], surface_m: float) -> FloatArray:
-        """(SECTORS,) what a cost of 1/2 sigma^2 is, for turns that begin at each sector's border [m^2].
-
-        Cluster-robust over the cells of the ground plan, with ``surface_m`` of error of its own for each; at
-        least what the residuals themselves say.
-        """
-        total = np.zeros(SECTORS)
+    def evidence(self, windows: Sequence[Window]) -> Evidence:
+        """What the windows say of every start of a turn, at the last matches."""
+        present = self.linearized_at[0] * CANDIDATES[self.linearized_at[1]]
+        groupings: tuple[list[SurfaceSums], list[SurfaceSums]] = ([], [])
+        modelled = np.zeros(SECTORS)
         for window, normal in zip(windows, self.normals, strict=True):
-            score, lever = window.scores(CANDIDATES.T, normal)
-            total += (score**2).sum(axis=0) + surface_m**2 * (lever**2).sum(axis=0)
-        squares, weights = np.sum([window.squares for window in windows], axis=0)
-        least = squares / max(weights, 1e-9)
-        return np.maximum(total / np.maximum(self.quadratic.curvature, 1e-12), max(least, 1e-12))
+            by_cell, by_direction = window.surface_sums(CANDIDATES.T, normal, present)
+            errors = window.errors
+            modelled += errors.own * by_cell.information.sum(axis=0)
+            modelled += errors.shared * (by_cell.lever**2).sum(axis=0)
+            groupings[0].append(by_cell)
+            groupings[1].append(by_direction)
+        # A cluster-robust variance by each grouping (Cameron, Gelbach and Miller, 2011), the larger one.
+        seen = [sum((one.score**2).sum(axis=0) for one in sums) for sums in groupings]
+        curvature = np.maximum(self.quadratic.curvature, 1e-12)
+        return Evidence(
+            np.maximum.reduce([*seen, modelled]) / curvature,
+            curvature,
+            tuple(
+                (
+                    np.concatenate([one.origin for one in sums]),
+                    np.concatenate([one.information for one in sums]),
+                )
+                for sums in groupings
+            ),
+        )
+
+
+_SURFACE_SAYS = 3.0
+"""Most that one group of matches adds to the logarithm of a likelihood ratio: one in twenty is not what it
+seems (a thing that moves, wrong matches), whatever its residuals say."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What registration says of turns, by the sector at whose border they begin.
+
+    Attributes:
+        unit: (SECTORS,) variance of a residual as far as its errors reach a share [m^2]: what the groups'
+            scores say (cluster-robust), at least what the errors of matches and surfaces make.
+        curvature: (SECTORS,) of the cost [m^2].
+        groupings: of the matches, each (slopes, curvatures), both (groups, SECTORS): derivatives of each
+            group's cost, for points that share one instant [m^2].
+    """
+
+    unit: FloatArray
+    curvature: FloatArray
+    groupings: tuple[tuple[FloatArray, FloatArray], ...]
+
+    @property
+    def sigma(self) -> FloatArray:
+        """(SECTORS,) standard deviation of the share."""
+        return np.asarray(np.sqrt(self.unit / self.curvature))
+
+    def log_ratio(self, fraction: float) -> FloatArray:
+        """(SECTORS,) log likelihood of a share of the sweep against that of points that share one instant: by
+        the grouping that says less, nothing where they contradict each other.
+        """
+        sums = []
+        for slopes, curvatures in self.groupings:
+            gain = -(fraction * slopes + 0.5 * fraction**2 * curvatures) / self.unit
+            sums.append(np.clip(gain, -_SURFACE_SAYS, _SURFACE_SAYS).sum(axis=0))
+        least, most = np.min(sums, axis=0), np.max(sums, axis=0)
+        return np.asarray(np.maximum(least, 0.0) + np.minimum(most, 0.0))
 
 
 def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> Estimate:
     """Share and start of least cost, from those given, with the poses of the windows; matches made anew."""
     config = windows[0].config
     for number in range(config.passes):
+        present = fraction, sector
         quadratic, normals = _matched(windows, fraction, sector, number)
         shares = quadratic.free()
         best = int(np.argmin(quadratic.cost(shares)))
@@ -104,7 +158,7 @@ def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) 
         sector = best
         if done:
             break
-    return Estimate(fraction, sector, quadratic, normals, _misfit(windows))
+    return Estimate(fraction, sector, quadratic, normals, present, _misfit(windows))
 
 
 def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, passes: int) -> Estimate:
@@ -114,7 +168,7 @@ def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, passe
         _move(windows, normals, np.zeros(1 + SECTORS))
     shares = quadratic.free()
     best = int(np.argmin(quadratic.cost(shares)))
-    return Estimate(float(shares[best]), best, quadratic, normals, _misfit(windows))
+    return Estimate(float(shares[best]), best, quadratic, normals, (fraction, sector), _misfit(windows))
 
 
 def _matched(

@@ -50,8 +50,6 @@ class SweepWindowConfig(Settings):
         scales_m: scale of the robust kernel, pass by pass; the last one stays [m].
         cell_m: edge of the cells of the ground plan; level surfaces of one cell share an error, and so do all
             its others; errors are independent from cell to cell [m].
-        surface_m: that error: what vegetation, edges, sparse rings and the LiDAR's own calibration leave,
-            whatever the number of points [m].
         movers: which objects of movable classes stand.
         passes: most times that matches are made anew.
     """
@@ -72,7 +70,6 @@ class SweepWindowConfig(Settings):
         (0.4, 0.3, 0.2, 0.12, 0.08), at_least=0.001, at_most=100.0, length=(1, 50)
     )
     cell_m: float = setting(3.0, at_least=0.1, at_most=1000.0)
-    surface_m: float = setting(0.005, at_least=1e-5, at_most=1.0)
     movers: MoverConfig = field(default_factory=lambda: MoverConfig(slack_m=0.3))
     passes: int = setting(12, at_least=1, at_most=100)
 
@@ -107,7 +104,8 @@ class Normal:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Matches of two scans: residuals (m,), weights (m,), Jacobians, and the cell (m,) that each lies in."""
+    """Matches of two scans: residuals (m,), weights (m,), Jacobians, and for each the cell of the ground plan
+    (m,) and the direction from the LiDAR (m,) in which it lies."""
 
     scans: tuple[int, int]
     residuals: FloatArray
@@ -115,6 +113,40 @@ class _Rows:
     of_poses: FloatArray
     of_times: FloatArray
     cells: IndexArray
+    directions: IndexArray
+
+
+@dataclass(frozen=True)
+class SurfaceSums:
+    """Sums over the matches of each group (groups, k), for k directions of the times.
+
+    Attributes:
+        score: derivative of half the squared residuals at the best fit, the poses following [m^2].
+        origin: the same for points that share one instant [m^2].
+        lever: what an error of 1 m that all of a group's matches share adds to it [m].
+        information: second derivative [m^2].
+    """
+
+    score: FloatArray
+    origin: FloatArray
+    lever: FloatArray
+    information: FloatArray
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Variances of residuals at the last matches [m^2], from the residuals themselves.
+
+    Attributes:
+        own: of one match around what its cell's matches share.
+        shared: of that: what vegetation, edges, sparse rings and the LiDAR's own calibration leave, however
+            many points there are.
+        weight: of the matches.
+    """
+
+    own: float
+    shared: float
+    weight: float
 
 
 class Window:
@@ -214,33 +246,57 @@ class Window:
             for pose, step in zip(self._poses, steps, strict=True)
         ]
 
-    def scores(self, columns: FloatArray, normal: Normal) -> tuple[FloatArray, FloatArray]:
-        """(cells, k) each: by cell of the ground plan the score of directions (1 + SECTORS, k) of the times,
-        the poses eliminated, and what an error of 1 m of the cell's surfaces adds to it.
+    def surface_sums(
+        self, columns: FloatArray, normal: Normal, present: FloatArray
+    ) -> tuple[SurfaceSums, SurfaceSums]:
+        """By cell of the ground plan and by direction from the LiDAR, for directions (1 + SECTORS, k) of the
+        times: a surface stays in its cell, and what moves along with the vehicle in its direction.
+
+        present: (1 + SECTORS,) times at which the matches were made.
         """
-        step = normal.back[0] @ columns
-        levers = []
+        steps = normal.back[0] @ np.column_stack([columns, present])
+        levers, squares, scores, origins = [], [], [], []
         for rows in self._rows:
             a, b = rows.scans
-            own = rows.of_times @ columns
-            own += rows.of_poses[:, :6] @ step[6 * a : 6 * a + 6]
-            own += rows.of_poses[:, 6:] @ step[6 * b : 6 * b + 6]
-            levers.append(rows.weights[:, None] * own)
-        lever = np.concatenate(levers)
-        residual = np.concatenate([rows.residuals for rows in self._rows])
-        cells = np.concatenate([rows.cells for rows in self._rows])
-        order = np.argsort(cells, kind="stable")
-        ordered = cells[order]
-        first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
-        lever = lever[order]
-        score = np.add.reduceat(lever * residual[order][:, None], first, axis=0)
-        return score, np.add.reduceat(lever, first, axis=0)
+            at = np.concatenate([np.arange(6 * a, 6 * a + 6), np.arange(6 * b, 6 * b + 6)])
+            own = rows.of_times @ columns + rows.of_poses @ steps[at, :-1]
+            residuals = rows.residuals + rows.of_poses @ normal.back[1][at]
+            origin = residuals - rows.of_times @ present - rows.of_poses @ steps[at, -1]
+            lever = rows.weights[:, None] * own
+            levers.append(lever)
+            squares.append(lever * own)
+            scores.append(lever * residuals[:, None])
+            origins.append(lever * origin[:, None])
+        stacked = [np.concatenate(parts) for parts in (scores, origins, levers, squares)]
+
+        def grouped(groups: IndexArray) -> SurfaceSums:
+            order, first = _groups(groups)
+            return SurfaceSums(*(np.add.reduceat(values[order], first, axis=0) for values in stacked))
+
+        directions = np.concatenate([rows.directions for rows in self._rows])
+        return grouped(self._stacked()[0]), grouped(directions)
 
     @property
-    def squares(self) -> tuple[float, float]:
-        """Weighted sum of squared residuals [m^2], and of weights."""
-        total = sum(float((rows.weights * rows.residuals**2).sum()) for rows in self._rows)
-        return total, sum(float(rows.weights.sum()) for rows in self._rows)
+    def errors(self) -> Errors:
+        """How large residuals are, and what those of one cell share: a median, for some cells are wrong."""
+        cells, weights, residuals = self._stacked()
+        order, first = _groups(cells)
+        weights, residuals = weights[order], residuals[order]
+        amount = np.maximum(np.add.reduceat(weights, first), 1e-9)
+        shared = np.add.reduceat(weights * residuals, first) / amount
+        around = float((weights * residuals**2).sum() - (amount * shared**2).sum())
+        many = amount > _MANY
+        spread = 1.4826 * float(np.median(np.abs(shared[many]))) if many.any() else 0.0
+        total = float(amount.sum())
+        return Errors(max(around / total, 1e-12), spread**2, total)
+
+    def _stacked(self) -> tuple[IndexArray, FloatArray, FloatArray]:
+        """Cells, weights and residuals of all matches."""
+        return (
+            np.concatenate([rows.cells for rows in self._rows]),
+            np.concatenate([rows.weights for rows in self._rows]),
+            np.concatenate([rows.residuals for rows in self._rows]),
+        )
 
     def misfit(self, scale: float) -> float:
         """Mean robust misfit of the points asked about, 0 (all on a surface) to 1 (none near one)."""
@@ -285,7 +341,8 @@ class Window:
         level = np.abs(normals[:, 2]) > _LEVEL
         cells = np.floor(wAs[:, :2] / self.config.cell_m).astype(np.int64) + 2**20
         number = 2 * (cells[:, 0] * 2**22 + cells[:, 1]) + level
-        return _Rows((a, b), residuals, weights, of_poses, of_times, number)
+        directions = self._surfaces[b].sectors[kept] // _DIRECTION
+        return _Rows((a, b), residuals, weights, of_poses, of_times, number, directions)
 
     def _eliminated(self) -> Normal:
         """Normal equations of all rows with the poses, of which the first stays, eliminated."""
@@ -311,6 +368,10 @@ class Window:
         return Normal(Huu - Hpu.T @ toward[:, :-1], gu - Hpu.T @ toward[:, -1], back, count)
 
 
+_DIRECTION = 3
+"""Sectors of a direction: what a vehicle in front fills."""
+_MANY = 10.0
+"""Matches from which on a cell's mean residual tells its error rather than theirs."""
 _DAMPING = 1e-3
 """Keeps poses where nothing is matched; a match counts about 1."""
 
@@ -328,6 +389,8 @@ def _surfaces(points: FloatArray, config: SweepWindowConfig) -> _Surfaces:
     width = np.sqrt(np.maximum(values, 1e-12))
     flat = (width[:, 0] < config.flatness * width[:, 1]) & (width[:, 1] > config.breadth * width[:, 2])
     points, normals = points[flat], vectors[flat][:, :, 0]
+    # All towards the sensor: what matches of one surface share is to have one sign.
+    normals = normals * -np.sign(np.einsum("ij,ij->i", normals, points))[:, None]
     azimuths = np.arctan2(points[:, 1], points[:, 0])
     sectors = np.minimum((turned(azimuths, -np.pi) * SECTORS).astype(np.intp), SECTORS - 1)
     return _Surfaces(points, normals, azimuths, sectors, _varied(normals, config.points_a_way))
@@ -350,6 +413,13 @@ def _spread(chosen: NDArray[np.bool_], most: int) -> IndexArray:
     """At most so many of the places where an array is True, evenly spread."""
     found = np.flatnonzero(chosen)
     return found if len(found) <= most else found[np.linspace(0, len(found) - 1, most).astype(np.intp)]
+
+
+def _groups(cells: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """The order that puts equal cells together, and where in it each cell begins."""
+    order = np.argsort(cells, kind="stable")
+    ordered = cells[order]
+    return order, np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
 
 
 def _odometry(scans: Sequence[Scan]) -> tuple[bool, list[FloatArray]]:

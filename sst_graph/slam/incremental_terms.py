@@ -3,7 +3,7 @@
 At every update the user's factors go in first. Then the terms whose matches have become stale (points moved,
 stamp + offset in another interval, another kernel) are matched again at the new estimate, and their factors
 take the place of the old ones. Kernel, proximal prior and the scale of the information are those of
-:mod:`sst_graph.problem.rematching`.
+:mod:`sst_graph.slam.rematching`.
 """
 
 from __future__ import annotations
@@ -20,17 +20,20 @@ from sst_graph.config import Settings, setting
 from sst_graph.problem.alignment_keys import AlignmentKeys
 from sst_graph.problem.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.problem.object_sides import ObjectSides
-from sst_graph.problem.rematching import (
-    RematchConfig,
-    TermWarning,
+from sst_graph.slam.config import RematchConfig
+from sst_graph.slam.covariance import (
+    Robust,
+    TermSums,
+    fit_errors,
     inflation,
-    last_warnings,
-    moved_px,
-    proximal,
+    least_errors,
     robust_covariance,
-    side_totals,
-    wide_uncertainty,
+    rows_of,
+    told,
+    total,
 )
+from sst_graph.slam.rematching import moved_px, proximal
+from sst_graph.slam.term_warnings import TermWarning, last_warnings, wide_uncertainty
 
 FloatArray = NDArray[np.float64]
 
@@ -63,8 +66,8 @@ class IncrementalUpdate:
 
     Attributes:
         values: the estimate.
-        covariance: (7, 7) of extrinsic and offset, robust to sides of objects that err in all images, once
-            the kernel has its last scale; until then the solver's marginal, proximal prior included.
+        covariance: (7, 7) cluster-robust, of extrinsic and offset, once the kernel has its last scale; until
+            then the solver's marginal, proximal prior included.
         kernel_px: scale of the kernel [px].
         settled: the kernel has its last scale, the proximal prior is gone, and the matches are fresh.
         rematched: how many factors were swapped.
@@ -94,8 +97,7 @@ class IncrementalTerms:
         self._kernel_px = self._config.rematch.first_px
         self._held, self._information = True, 1.0
         self._sides = ObjectSides()
-        self._gone: dict[int, FloatArray] = {}
-        self._gone_matches = [0.0, 0.0]
+        self._gone = TermSums()
 
     def update(
         self,
@@ -126,8 +128,8 @@ class IncrementalTerms:
     def _renew(self, rounds: int) -> IncrementalUpdate:
         rematched, settled, estimate = 0, False, self._solver.calculateEstimate()
         first_warnings: list[TermWarning] = []
-        alone = None if self._matches() else self._marginal()
-        covariance = np.zeros((7, 7))
+        alone = None if self._matches() else self._marginal()[:7, :7]
+        covariance, found = np.zeros((7, 7)), None
         for _ in range(rounds):
             self._retire(estimate)
             swapped = self._swap(estimate)
@@ -138,13 +140,16 @@ class IncrementalTerms:
             if alone is not None:
                 first_warnings = wide_uncertainty(self._matches(), before, alone, self._config.rematch)
                 alone = None
-            covariance, settled = self._anneal(estimate)
+            covariance, found, settled = self._anneal(estimate)
             if settled:
                 break
         warnings = first_warnings
         matches = self._matches()
         if matches and self._kernel_px == self._config.rematch.last_px:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config.rematch)
+            if found is not None:
+                P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
+                warnings = warnings + told(P, found, cTl, self._config.rematch)
         return IncrementalUpdate(
             estimate,
             covariance,
@@ -155,40 +160,43 @@ class IncrementalTerms:
             tuple(dict.fromkeys(warnings)),
         )
 
-    def _anneal(self, estimate: gtsam.Values) -> tuple[FloatArray, bool]:
-        """The next kernel; covariance, and whether all has settled."""
+    def _anneal(self, estimate: gtsam.Values) -> tuple[FloatArray, Robust | None, bool]:
+        """The next kernel; covariance (7, 7), robust at the last kernel, and whether all has settled."""
         config = self._config.rematch
         P, matches = self._marginal(), self._matches()
-        sigma_px = wide_uncertainty(matches, estimate, P, config, 0.0)
+        sigma_px = wide_uncertainty(matches, estimate, P[:7, :7], config, 0.0)
         known = bool(sigma_px) and sigma_px[0].value < self._config.known * self._kernel_px
         calm = moved_px(matches, estimate) < config.settled * self._kernel_px
         if self._kernel_px > config.last_px:
             if calm and known:
                 self._kernel_px = config.narrower(self._kernel_px)
-            return P, False
+            return P[:7, :7], None, False
         if self._held:
             self._held = not (calm and known)
-            return P, False
-        C, own = self._robust(P, estimate)
-        wanted = 1.0 / inflation(own, C)
+            return P[:7, :7], None, False
+        found, least = self._robust(P, estimate)
+        # The scale is that of what is known beforehand: it must not change with the residuals of the moment,
+        # for factors that have been marginalized keep theirs.
+        wanted = 1.0 / inflation(least.independent, least.clustered)
         if abs(wanted / self._information - 1.0) > self._config.rescale:
             self._information = wanted
-            return C, False
+            return found.covariance, found, False
         fresh = not any(self._is_stale(p, estimate) for p in self._terms if p.slots)
-        return C, fresh
+        return found.covariance, found, fresh
 
-    def _robust(self, P: FloatArray, estimate: gtsam.Values) -> tuple[FloatArray, FloatArray]:
-        """The robust covariance, and the part of it that no two images share.
+    def _robust(self, P: FloatArray, estimate: gtsam.Values) -> tuple[Robust, Robust]:
+        """The robust covariance by the errors that the present frames show, and by the least ones.
 
-        Under a factor scaled by q, what the matches err by alone is q P, and a side's score q s.
+        Frames that have left count by their sums.
         """
-        totals = self._information * side_totals(self._matches(), self._sides, estimate)
-        for side, score in self._gone.items():
-            totals[side] += score
-        count = sum(len(each) for each in self._matches())
-        q = (count * self._information + self._gone_matches[1]) / max(count + self._gone_matches[0], 1)
-        own = q * P
-        return robust_covariance(own, P, totals, self._config.rematch.side_sigma_px), own
+        matches = self._matches()
+        rows = [rows_of(each, self._sides, estimate) for each in matches]
+        sums = total(TermSums.of(each, m.information) for each, m in zip(rows, matches, strict=True))
+        sums.add(self._gone)
+        config = self._config.rematch
+        errors = fit_errors(rows, config), least_errors(config)
+        found, least = (robust_covariance(P, sums, each, self._keys) for each in errors)
+        return found, least
 
     def _swap(self, estimate: gtsam.Values) -> int:
         """Match stale terms anew; new factors in, old ones and the old proximal prior out, in one update."""
@@ -197,7 +205,7 @@ class IncrementalTerms:
         for placed in stale:
             removed += self._slots_of(placed.slots)
             matches = placed.term.matched(estimate, self._kernel_px, self._information)
-            placed.set(matches, self._information, self._scores(matches, estimate))
+            placed.set(matches, self._sums(matches, estimate))
             if matches.factor is not None:
                 graph.add(matches.factor)
                 owners.append(placed)
@@ -215,14 +223,8 @@ class IncrementalTerms:
                 held[slot] = self._graph().at(slot)
         return len(stale)
 
-    def _scores(self, matches: TermMatches, estimate: gtsam.Values) -> dict[int, FloatArray]:
-        """(7,) score of each side that a term's matches lie on."""
-        found: dict[int, FloatArray] = {}
-        if matches.term is not None:
-            for numbers, scores in matches.term.side_scores(matches, self._sides, estimate):
-                for side in np.unique(numbers):
-                    found[int(side)] = found.get(int(side), np.zeros(7)) + scores[numbers == side].sum(axis=0)
-        return found
+    def _sums(self, matches: TermMatches, estimate: gtsam.Values) -> TermSums:
+        return TermSums.of(rows_of(matches, self._sides, estimate), matches.information)
 
     def _is_stale(self, placed: _Placed, estimate: gtsam.Values) -> bool:
         matches = placed.matches
@@ -230,7 +232,7 @@ class IncrementalTerms:
             return True
         return (
             matches.kernel_px != self._kernel_px
-            or placed.information != self._information
+            or matches.information != self._information
             or matches.left_interval_s(estimate) > 0.0
             or matches.moved_px(estimate) > self._config.stale_px
         )
@@ -238,14 +240,11 @@ class IncrementalTerms:
     def _retire(self, estimate: gtsam.Values) -> None:
         """Terms on poses that the smoother has marginalized stay as they are in its marginal.
 
-        Their sides' scores are kept from when their poses were last there.
+        Their sums are kept from when their poses were last there.
         """
         for placed in self._terms:
             if placed.is_gone(estimate):
-                for side, score in placed.scores.items():
-                    self._gone[side] = self._gone.get(side, np.zeros(7)) + placed.information * score
-                self._gone_matches[0] += placed.count
-                self._gone_matches[1] += placed.count * placed.information
+                self._gone.add(placed.sums)
         self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
 
     def _matches(self) -> list[TermMatches]:
@@ -281,9 +280,9 @@ class IncrementalTerms:
         return [slot for slot, factor in held.items() if slot < graph.size() and graph.at(slot) is factor]
 
     def _marginal(self) -> FloatArray:
-        """(7, 7) of extrinsic and offset by the solver."""
+        """(n, n) by the solver, over the columns that all terms share."""
         isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
-        joint = isam.jointMarginalCovariance(list(self._keys.variables))
+        joint = isam.jointMarginalCovariance(list(self._keys.lasting))
         return self._keys.placed(np.asarray(joint.fullMatrix()))
 
     def _stamped(self, stamps: Mapping[int, float] | None) -> dict[int, float]:
@@ -308,7 +307,7 @@ class IncrementalTerms:
             place = None if placed.matches is None else placed.matches.place
             if place is not None and leaving & {place.X_a, place.X_b, place.X_scan}:
                 slots += self._slots_of(placed.slots)
-                placed.slots, placed.scores = {}, {}
+                placed.slots, placed.sums = {}, TermSums()
         return slots
 
 
@@ -319,16 +318,10 @@ class _Placed:
         self.term = term
         self.matches: TermMatches | None = None
         self.slots: dict[int, gtsam.NonlinearFactor] = {}
-        self.information = 1.0
-        self.scores: dict[int, FloatArray] = {}
+        self.sums = TermSums()
 
-    @property
-    def count(self) -> int:
-        """Matches that count in the solver."""
-        return len(self.matches) if self.matches is not None and self.slots else 0
-
-    def set(self, matches: TermMatches, information: float, scores: dict[int, FloatArray]) -> None:
-        self.matches, self.information, self.scores, self.slots = matches, information, scores, {}
+    def set(self, matches: TermMatches, sums: TermSums) -> None:
+        self.matches, self.sums, self.slots = matches, sums, {}
 
     def is_gone(self, estimate: gtsam.Values) -> bool:
         """Whether a pose of its factor, or every pose it could be on, has left the solver."""

@@ -1,0 +1,92 @@
+"""What may be wrong with alignment terms in a graph, each with the figure behind it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.problem.alignment_term import TermMatches
+from sst_graph.slam.config import RematchConfig
+
+FloatArray = NDArray[np.float64]
+
+
+class WarningKind(Enum):
+    """What may be wrong with a solution."""
+
+    WIDE_UNCERTAINTY = "the calibration is less certain than the matches reach"
+    LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
+    NO_MATCHES = "terms without a factor"
+    NOT_SETTLED = "matching again still moves the matched points"
+    WEAK_DIRECTION = "a combination of extrinsic and time offset that the graph hardly tells"
+    OVERCONFIDENT_MARGINAL = "the graph's own marginal is surer than the matches allow; take the covariance"
+    MASK_BIAS = "outlines that lie beside the edges, and no mask bias in the graph (AlignmentKeys.biases_px)"
+
+
+@dataclass(frozen=True)
+class TermWarning:
+    """One thing that may be wrong, with the figure behind it.
+
+    Attributes:
+        kind: what.
+        value, limit: the figure and what it should not exceed, in ``unit``.
+        unit: px, ms, terms, or of what the figure is a multiple.
+        detail: which direction or class, and what to do; may be empty.
+    """
+
+    kind: WarningKind
+    value: float
+    limit: float
+    unit: str
+    detail: str = ""
+
+    def __str__(self) -> str:
+        what = f"{self.kind.value}: {self.value:.3g} {self.unit}, at most {self.limit:.3g} {self.unit}"
+        return f"{what}: {self.detail}" if self.detail else what
+
+
+def wide_uncertainty(
+    matches: Sequence[TermMatches],
+    values: gtsam.Values,
+    covariance: FloatArray,
+    config: RematchConfig,
+    reach_px: float | None = None,
+) -> list[TermWarning]:
+    """A warning where the calibration may err by more than matches reach.
+
+    Args:
+        matches: of all terms.
+        values: the estimate.
+        covariance: (7, 7) of extrinsic and offset: at the start by all but these matches, at the end by all.
+        config: the schedule.
+        reach_px: limit; by default the search range of the matches [px].
+    """
+    found = [(each, each.term) for each in matches if each.factor is not None and each.term is not None]
+    if not found:
+        return []
+    gate = found[0][1].config.match.gate
+    limit = gate * found[0][0].kernel_px if reach_px is None else reach_px
+    if not np.isfinite(covariance).all():
+        return [TermWarning(WarningKind.WIDE_UNCERTAINTY, float("inf"), limit, "px")]
+    sigmas = [each.predicted_sigma_px(values, covariance) for each, _ in found]
+    sigma_px = float(np.sqrt(np.mean(np.square(sigmas))))
+    return [TermWarning(WarningKind.WIDE_UNCERTAINTY, sigma_px, limit, "px")] if sigma_px > limit else []
+
+
+def last_warnings(
+    matches: Sequence[TermMatches], values: gtsam.Values, covariance: FloatArray, config: RematchConfig
+) -> list[TermWarning]:
+    """What may be wrong with the last matches at the estimate."""
+    warnings = wide_uncertainty(matches, values, covariance, config, config.last_px)
+    left_ms = 1e3 * max((each.left_interval_s(values) for each in matches), default=0.0)
+    if left_ms > 0.0:
+        warnings.append(TermWarning(WarningKind.LEFT_INTERVAL, left_ms, 0.0, "ms"))
+    without = sum(each.factor is None for each in matches)
+    if without > 0.5 * len(matches):
+        warnings.append(TermWarning(WarningKind.NO_MATCHES, without, 0.5 * len(matches), "terms"))
+    return warnings
