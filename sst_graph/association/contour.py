@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.picture_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.association.sampling import sampled
-from sst_graph.shelf import Shelf, shelvable
+from sst_graph.shelf import Shelf, shape_of, shelvable
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -105,6 +105,12 @@ class ContourMap:
             distance -= shifts
             unknown |= unseen
         return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
+
+    @property
+    def box(self) -> tuple[int, int]:
+        """Columns and rows of the box."""
+        rows, columns = shape_of(self, "distance")
+        return columns, rows
 
     def on(self, shelf: Shelf) -> ContourMap:
         """The same with its fields on a shelf."""

@@ -340,11 +340,7 @@ def _feet(
     Args:
         counts: pixels of each contour, one contour's after the other's.
     """
-    fields = [contour.distance for contour in contours]
-    boxes = [
-        (contour.left, contour.top, *field.shape[::-1], contour.width, contour.height)
-        for contour, field in zip(contours, fields, strict=True)
-    ]
+    boxes = [(c.left, c.top, *c.box, c.width, c.height) for c in contours]
     left, top, columns, rows, width, height = np.repeat(boxes, counts, axis=0).T
     u, v = uvs
     column, row = u.astype(np.intp), v.astype(np.intp)
@@ -354,8 +350,8 @@ def _feet(
     corners = at + np.stack([np.zeros_like(columns), np.ones_like(columns), columns, columns + 1])
     values = np.empty(corners.shape, np.float32)
     spans = list(itertools.pairwise(np.cumsum([0, *counts]).tolist()))
-    for field, (start, end) in zip(fields, spans, strict=True):
-        values[:, start:end] = field.reshape(-1)[corners[:, start:end]]
+    for contour, (start, end) in zip(contours, spans, strict=True):
+        values[:, start:end] = contour.distance.reshape(-1)[corners[:, start:end]]
     a, b, c, d = values.astype(np.float64)
     x, y = u - column, v - row
     above, below = a + x * (b - a), c + x * (d - c)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.shelf import Shelf, shelvable
+from sst_graph.shelf import Shelf, shape_of, shelvable
 
 
 @shelvable("values")
@@ -59,6 +59,7 @@ def test_a_field_answers_the_array() -> None:
     plain, shelved = Holder("a", values), Holder("a", Shelf(0).put(values))
     assert plain.values is values
     np.testing.assert_array_equal(shelved.values, values)
+    assert shape_of(plain, "values") == shape_of(shelved, "values") == (6,)
     np.testing.assert_array_equal(replace(shelved, name="b").values, values)
     with pytest.raises(AttributeError):  # frozen as before
         shelved.values = values  # type: ignore[misc]
