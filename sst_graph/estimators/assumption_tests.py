@@ -22,7 +22,6 @@ from scipy.stats import t as student_t
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.joint import JointConfig, JointSolution, solve_joint
 from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks, state_from
@@ -38,7 +37,7 @@ from sst_graph.uncertainty.covariance import (
     match_table,
     robust_covariance,
 )
-from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance
+from sst_graph.uncertainty.marginal import Unknowns, marginal_covariance, scaled_inverse
 
 FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)

@@ -10,8 +10,9 @@ import gtsam
 import numpy as np
 
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Point, scaled_inverse, with_room
+from sst_graph.estimators.gaussian import Point, with_room
 from sst_graph.problem.state import object_bias_key, twist_key
+from sst_graph.uncertainty.marginal import scaled_inverse
 
 if TYPE_CHECKING:
     from sst_graph.estimators.smoother import WindowSmoother

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from factors import custom_factor
 from sst_graph.problem.state import State, underside_track
 from sst_graph.types import SemanticClass
+from sst_graph.uncertainty.marginal import scaled_inverse
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -347,18 +348,3 @@ def insert_point(values: gtsam.Values, keys: Sequence[int], point: Point) -> Non
     for key, scalar in zip(keys[1:], scalars, strict=True):
         if not values.exists(key):
             values.insert(key, np.array([float(scalar)]))
-
-
-def scaled_inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of an information matrix whose units differ by orders of magnitude.
-
-    Raises:
-        np.linalg.LinAlgError: it is singular or not finite.
-    """
-    diagonal = np.diag(matrix)
-    if not np.isfinite(matrix).all() or (diagonal <= 0.0).any():
-        raise np.linalg.LinAlgError("an information matrix that is not positive")
-    scale = 1.0 / np.sqrt(diagonal)
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + 1e-14 * np.eye(len(matrix)))
-    inverse = inverse * np.outer(scale, scale)
-    return np.asarray(0.5 * (inverse + inverse.T))

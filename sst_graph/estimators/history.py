@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.estimators.epochs import RetiredEpoch
-from sst_graph.estimators.gaussian import Gaussian, Point, scaled_inverse
+from sst_graph.estimators.gaussian import Gaussian, Point
 from sst_graph.estimators.smoother import WindowSmoother
+from sst_graph.uncertainty.marginal import scaled_inverse
 
 FloatArray = NDArray[np.float64]
 

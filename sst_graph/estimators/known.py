@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.alarm import Joint
-from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.estimators.track_update import UNKNOWN_SIGMAS
 from sst_graph.uncertainty.assumptions import steps_by
+from sst_graph.uncertainty.marginal import scaled_inverse
 
 FloatArray = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.change import Change, TwistFactor, read_point
 from sst_graph.estimators.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
-from sst_graph.estimators.gaussian import Gaussian, Point, insert_point, scaled_inverse
+from sst_graph.estimators.gaussian import Gaussian, Point, insert_point
 from sst_graph.estimators.score_sums import ScoreSums
 from sst_graph.estimators.tracker_config import DriftConfig
 from sst_graph.estimators.undecided import Undecided
@@ -33,6 +33,7 @@ from sst_graph.problem.state import (
 )
 from sst_graph.types import SemanticClass
 from sst_graph.uncertainty.covariance import ErrorModel
+from sst_graph.uncertainty.marginal import scaled_inverse
 from sst_graph.uncertainty.object_spread import composed
 
 FloatArray = NDArray[np.float64]

@@ -20,9 +20,9 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.errors import EstimationError
 from sst_graph.estimators.assumption_tests import Finding, few_objects
-from sst_graph.estimators.gaussian import scaled_inverse
 from sst_graph.estimators.smoother import WindowSmoother
 from sst_graph.uncertainty.assumptions import AssumptionConfig
+from sst_graph.uncertainty.marginal import scaled_inverse
 from sst_graph.uncertainty.object_spread import believed_flatness
 
 EVERY = 10

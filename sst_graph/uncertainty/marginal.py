@@ -171,3 +171,18 @@ class _Together:
         first = self.root(keys[0])
         for key in keys[1:]:
             self._above[self.root(key)] = first
+
+
+def scaled_inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of an information matrix whose units differ by orders of magnitude.
+
+    Raises:
+        np.linalg.LinAlgError: it is singular or not finite.
+    """
+    diagonal = np.diag(matrix)
+    if not np.isfinite(matrix).all() or (diagonal <= 0.0).any():
+        raise np.linalg.LinAlgError("an information matrix that is not positive")
+    scale = 1.0 / np.sqrt(diagonal)
+    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + 1e-14 * np.eye(len(matrix)))
+    inverse = inverse * np.outer(scale, scale)
+    return np.asarray(0.5 * (inverse + inverse.T))
