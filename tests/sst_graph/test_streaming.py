@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from streets import standing_street
 
 from factors.camera import PinholeCamera
 from sst_graph import open_source, shelf
@@ -23,7 +24,6 @@ from sst_graph.estimators import CalibrationConfig, prepare_drives
 from sst_graph.problem.drive import Drive
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.types import Frame, SemanticClass
-from tests.sst_graph.streets import standing_street
 
 VEHICLE = SemanticClass.VEHICLE
 
