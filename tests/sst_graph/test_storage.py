@@ -164,10 +164,10 @@ def test_objects_of_the_package() -> None:
 
 
 def test_a_finding_holds_its_assumption_by_name() -> None:
-    finding = Finding(ASSUMPTIONS["k1"], 0.1, 0.02, np.arange(7.0), True)
+    finding = Finding(ASSUMPTIONS["k1"], 0.1, 0.02, True)
     found = _again(finding)
     assert found.assumption is ASSUMPTIONS["k1"] and found.sentence == finding.sentence
-    assert np.array_equal(found.step, finding.step)
+    assert (found.value, found.sigma, found.contradicted) == (0.1, 0.02, True)
     node, data = stored(finding)
     text = json.dumps(node).replace('"k1"', '"k9"')
     with pytest.raises(ValueError, match="k9"):
