@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from .camera import MIN_DEPTH_M, PinholeCamera
     from .camera_motion import Between, camera_motion_factor
     from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
-    from .cloning import GncConfig, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
+    from .cloning import GncParams, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
     from .condensed import condense
     from .custom import FactorRecipe, custom_factor, recipe_of
     from .delay import delay_drift, delay_prior, extrinsic_drift
@@ -83,7 +83,7 @@ __all__ = [
     "Between",
     "FactorError",
     "FactorRecipe",
-    "GncConfig",
+    "GncParams",
     "GncSolution",
     "GroupedBias",
     "JacobianBlock",
@@ -136,7 +136,7 @@ _HOMES = {
     "Between": "camera_motion",
     "FactorError": "errors",
     "FactorRecipe": "custom",
-    "GncConfig": "cloning",
+    "GncParams": "cloning",
     "GncSolution": "cloning",
     "GroupedBias": "alignment",
     "JacobianBlock": "check",

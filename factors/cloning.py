@@ -103,7 +103,7 @@ def _recipe(factor: gtsam.CustomFactor) -> FactorRecipe:
 
 
 @dataclass(frozen=True)
-class GncConfig:
+class GncParams:
     """Graduated non-convexity with the truncated least squares kernel.
 
     Attributes:
@@ -112,12 +112,23 @@ class GncConfig:
         growth: of the control parameter, round by round, above 1.
         most_rounds: rounds, at most.
         settled: weights are settled when all are nearer than this to 0 or 1.
+
+    Raises:
+        FactorError: a value out of its range.
     """
 
     inlier_cost: float | Callable[[int], float]
     growth: float = 1.4
     most_rounds: int = 60
     settled: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if not 1.0 < self.growth < 1e6:
+            raise FactorError("growth", described(self.growth), "above 1 and below 1e6")
+        if not (isinstance(self.most_rounds, int) and 1 <= self.most_rounds <= 100_000):
+            raise FactorError("most_rounds", described(self.most_rounds), "a whole number from 1 to 100,000")
+        if not 0.0 < self.settled < 0.5:
+            raise FactorError("settled", described(self.settled), "above 0 and below 0.5")
 
 
 @dataclass(frozen=True)
@@ -138,7 +149,7 @@ class GncSolution:
 def gnc(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    config: GncConfig,
+    config: GncParams,
     known_inliers: Collection[int] = (),
 ) -> GncSolution:
     """Which factors are outliers, and the solution without them; ``gtsam.GncLMOptimizer`` for any factor.
@@ -177,7 +188,7 @@ def gnc(
     return GncSolution(values, weights, rounds, settled)
 
 
-def _limit(config: GncConfig, position: int) -> float:
+def _limit(config: GncParams, position: int) -> float:
     limit = config.inlier_cost(position) if callable(config.inlier_cost) else config.inlier_cost
     return checked_positive("inlier_cost", limit)
 

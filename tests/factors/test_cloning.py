@@ -15,7 +15,7 @@ from factor_bench import NAMES, Bench, D, E, X
 
 from factors import (
     FactorError,
-    GncConfig,
+    GncParams,
     PackedGraph,
     clone_factor,
     clone_graph,
@@ -137,14 +137,14 @@ def test_gnc_finds_the_outliers():
     values = gtsam.Values()
     values.insert(7, np.array([4.0]))
     for graph in (custom, native):
-        found = gnc(graph, values, GncConfig(inlier_cost=0.5 * 3.0**2))
+        found = gnc(graph, values, GncParams(inlier_cost=0.5 * 3.0**2))
         np.testing.assert_array_equal(found.weights > 0.5, np.arange(17) < 12)
         assert found.settled
         assert found.values.atVector(7)[0] == pytest.approx(targets[:12].mean(), abs=1e-6)
     theirs = gtsam.GncLMOptimizer(native, values, gtsam.GncLMParams())
     theirs.optimize()
     # its default limit is the 99 % quantile of chi^2 of one dimension
-    found = gnc(custom, values, GncConfig(inlier_cost=0.5 * 6.6349))
+    found = gnc(custom, values, GncParams(inlier_cost=0.5 * 6.6349))
     np.testing.assert_array_equal(theirs.getWeights() > 0.5, found.weights > 0.5)
 
 
@@ -159,7 +159,7 @@ def test_gnc_leaves_out_an_image_of_another_place(bench, make_scene):
         seen = replace(seen, pixels=seen.pixels + shift)
         graph.add(point_to_pixel_factor(seen, E, bench.offset_s, bench.twist))
     n = len(bench.points)
-    found = gnc(graph, values, GncConfig(inlier_cost=10.0 * n), known_inliers=[0])
+    found = gnc(graph, values, GncParams(inlier_cost=10.0 * n), known_inliers=[0])
     np.testing.assert_array_equal(found.weights > 0.5, np.arange(13) < 11)
     clean = gtsam.NonlinearFactorGraph()
     for i in range(11):
@@ -167,4 +167,13 @@ def test_gnc_leaves_out_an_image_of_another_place(bench, make_scene):
     expected = gtsam.LevenbergMarquardtOptimizer(clean, values).optimize()
     assert expected.atPose3(E).equals(found.values.atPose3(E), 1e-4)
     with pytest.raises(FactorError, match="inlier_cost"):
-        gnc(graph, values, GncConfig(inlier_cost=0.0))
+        gnc(graph, values, GncParams(inlier_cost=0.0))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"growth": 1.0}, {"growth": float("nan")}, {"most_rounds": 0}, {"most_rounds": 1.5}, {"settled": 0.0}],
+)
+def test_settings_out_of_range_are_refused(wrong):
+    with pytest.raises(FactorError, match=next(iter(wrong))):
+        GncParams(10.0, **wrong)
