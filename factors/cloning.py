@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .custom import FactorRecipe, recipe_of
-from .errors import FactorError, checked_positive
+from .errors import FactorError, checked_positive, described
 from .variables import checked_key
 
 FloatArray = NDArray[np.float64]
