@@ -8,8 +8,10 @@ TYPE_CHECKING = False  # as typing has it, whose import takes milliseconds of ev
 if TYPE_CHECKING:
     from typing import Any
 
+    from factors import PinholeCamera
     from sst_graph.data import open_source
     from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
+    from sst_graph.export import CalibrationMarginal
     from sst_graph.problem.align import align_frame
     from sst_graph.problem.alignment_keys import AlignmentKeys, Trajectory
     from sst_graph.problem.alignment_term import AlignmentTerm
@@ -17,14 +19,22 @@ if TYPE_CHECKING:
     from sst_graph.slam.covariance import calibration_covariance
     from sst_graph.slam.incremental_terms import IncrementalTerms
     from sst_graph.slam.rematching import solve_with_terms
+    from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
     from sst_graph.uncertainty.inspection import inspect_result
 
 __all__ = [
     "AlignmentKeys",
     "AlignmentTerm",
     "CalibrationConfig",
+    "CalibrationMarginal",
     "CalibrationResult",
+    "CameraImage",
+    "Frame",
     "IncrementalTerms",
+    "PinholeCamera",
+    "Scan",
+    "SemanticClass",
+    "Source",
     "TrackUpdate",
     "Tracker",
     "TrackerConfig",
@@ -40,19 +50,26 @@ __all__ = [
 _HOMES = {
     "AlignmentKeys": "sst_graph.problem.alignment_keys",
     "AlignmentTerm": "sst_graph.problem.alignment_term",
-    "IncrementalTerms": "sst_graph.slam.incremental_terms",
-    "Trajectory": "sst_graph.problem.alignment_keys",
-    "solve_with_terms": "sst_graph.slam.rematching",
     "CalibrationConfig": "sst_graph.estimators",
+    "CalibrationMarginal": "sst_graph.export",
     "CalibrationResult": "sst_graph.result",
+    "CameraImage": "sst_graph.types",
+    "Frame": "sst_graph.types",
+    "IncrementalTerms": "sst_graph.slam.incremental_terms",
+    "PinholeCamera": "factors",
+    "Scan": "sst_graph.types",
+    "SemanticClass": "sst_graph.types",
+    "Source": "sst_graph.types",
     "TrackUpdate": "sst_graph.estimators",
     "Tracker": "sst_graph.estimators",
     "TrackerConfig": "sst_graph.estimators",
+    "Trajectory": "sst_graph.problem.alignment_keys",
     "align_frame": "sst_graph.problem.align",
     "calibrate": "sst_graph.estimators",
     "calibration_covariance": "sst_graph.slam.covariance",
     "inspect_result": "sst_graph.uncertainty.inspection",
     "open_source": "sst_graph.data",
+    "solve_with_terms": "sst_graph.slam.rematching",
 }
 
 
