@@ -38,8 +38,10 @@ CLEAN, DRAWN = "clean", "drawn"
 CASES = (CLEAN, DRAWN, *SIZES)
 _TOLD_SIGMAS = 5.0
 """A size above this many of the deviations that its parameter would have as a variable is to be found."""
-_SILENT_NEES = 9.0
-"""NEES per dimension of an answer that is three sigmas off all round."""
+_UNTOLD_SPANS = 0.5
+"""A deviation above this share of its parameter's span, the prior of the test, is the prior's."""
+_SILENT_SIGMAS = 3.0
+"""An answer that is ``ok`` is to be off by no more than this on any of its seven axes."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class AssumptionTableConfig(Settings):
         cases: ``clean``, ``drawn`` (all parameters from their prior deviations at once), and names of
             assumptions that are broken; none: all of them.
         sizes: by which assumptions are broken; none: :data:`SIZES` of each.
+        in_sigmas: ``sizes`` count the deviation that the parameter has on the clean street, which is then
+            calibrated first; what a clean street says nothing of is left out.
         calibration: settings of the method.
     """
 
@@ -61,11 +65,16 @@ class AssumptionTableConfig(Settings):
     street: SimulationConfig = field(default_factory=lambda: SimulationConfig(frames=30, time_offset_s=0.1))
     cases: tuple[str, ...] = ()
     sizes: tuple[float, ...] = setting((), at_least=0.0, at_most=1000.0, length=(0, 100))
+    in_sigmas: bool = False
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.cases if name not in CASES]:
             raise ConfigError(f"cases: found {', '.join(unknown)}, expected some of {', '.join(CASES)}")
+        if self.in_sigmas and not self.sizes:
+            raise ConfigError("in_sigmas: found no sizes, expected some, as in sizes=[2,5,10]")
+        if self.in_sigmas and CLEAN not in (self.cases or CASES):
+            raise ConfigError("in_sigmas: cases leave out clean, expected it: it tells the deviations")
 
 
 @dataclass(frozen=True)
@@ -98,31 +107,51 @@ class Run:
         return float(self.error @ np.linalg.solve(self.covariance, self.error)) / len(self.error)
 
     @property
+    def worst_sigmas(self) -> float:
+        """Error over its sigma on the worst axis."""
+        return float((np.abs(self.error) / np.sqrt(np.diag(self.covariance))).max())
+
+    @property
     def silent(self) -> bool:
-        """``ok`` and more than three sigmas off."""
-        return self.status == "ok" and self.nees > _SILENT_NEES
+        """``ok`` and more than three sigmas off on an axis."""
+        return self.status == "ok" and self.worst_sigmas > _SILENT_SIGMAS
 
 
 def run(config: AssumptionTableConfig, progress: Progress | None = None) -> str:
     """A Markdown table: a row for each case and size, both senses together, and what they come to."""
-    return table(list(runs_of(config, progress)))
+    return table(list(runs_of(config, progress)), config.in_sigmas)
 
 
 def runs_of(config: AssumptionTableConfig, progress: Progress | None = None) -> Iterator[Run]:
     """All calibrations of the table: street by street, each simulated once."""
     cases = [
         (name, sign * size)
-        for name in config.cases or CASES
+        for name in sorted(config.cases or CASES, key=lambda name: name != CLEAN)
         for size in ((config.sizes or SIZES[name]) if name in SIZES else (0.0,))
         for sign in ((1.0, -1.0) if size else (1.0,))
     ]
     for number in range(config.streets):
         street = simulate(replace(config.street, seed=config.seed + number))
         kept = KeptDrive.of(street)
+        units = dict.fromkeys(SIZES, 1.0)
         for done, (name, size) in enumerate(cases):
-            yield _calibrated(_broken(street, kept, name, size), (street.config.seed, name, size), config)
+            if name not in SIZES or name in units:
+                by = size * units.get(name, 1.0)
+                one = _calibrated(_broken(street, kept, name, by), (street.config.seed, name, by), config)
+                if name == CLEAN and config.in_sigmas:
+                    units = _deviations(one)
+                yield one
             if progress is not None:
                 progress("assumptions", number * len(cases) + done + 1, config.streets * len(cases))
+
+
+def _deviations(clean: Run) -> dict[str, float]:
+    """Of the parameters that a clean street tells of, by name."""
+    return {
+        name: sigma
+        for name, (_, sigma) in clean.estimates.items()
+        if sigma < _UNTOLD_SPANS * ASSUMPTIONS[name].span
+    }
 
 
 def _broken(street: SimulatedDrive, kept: KeptDrive, case: str, size: float) -> KeptDrive:
@@ -153,22 +182,25 @@ def _calibrated(drive: KeptDrive, case: tuple[int, str, float], config: Assumpti
     return Run(*case, result.status, error, result.covariance, told, tuple(against))
 
 
-def table(runs: Sequence[Run]) -> str:
+def table(runs: Sequence[Run], in_sigmas: bool = False) -> str:
     """The table of some runs, with a summary below.
 
+    A row holds the runs of one size, or with ``in_sigmas`` those of one size over its deviation.
+
     "Told" is the size over the deviation that the parameter would have as a variable on the same street.
-    "Silent" runs are ``ok`` and have a NEES above 9 per dimension.
+    "Silent" runs are ``ok`` and more than three sigmas off on an axis.
     """
-    rows: dict[tuple[str, float], list[Run]] = {}
-    for one in runs:
-        rows.setdefault((one.case, abs(one.size)), []).append(one)
     sigmas = {
         (one.seed, name): sigma
         for one in runs
         if one.case == CLEAN
         for name, (_, sigma) in one.estimates.items()
     }
-    lines = [_row(case, size, some, sigmas) for (case, size), some in rows.items()]
+    rows: dict[tuple[str, float], list[Run]] = {}
+    for one in runs:
+        size = round(_told(one, sigmas), 6) if in_sigmas and one.size else abs(one.size)
+        rows.setdefault((one.case, size), []).append(one)
+    lines = [_row(case, some, sigmas) for (case, _), some in rows.items()]
     head = "| " + " | ".join(_COLUMNS) + " |\n|" + "---|" * len(_COLUMNS)
     return "\n".join([head, *lines, "", *_summary(runs, sigmas)]) + "\n"
 
@@ -192,7 +224,8 @@ def _told(one: Run, sigmas: Mapping[tuple[int, str], float]) -> float:
     return abs(one.size) / sigmas.get((one.seed, one.case), np.nan)
 
 
-def _row(case: str, size: float, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> str:
+def _row(case: str, runs: Sequence[Run], sigmas: Mapping[tuple[int, str], float]) -> str:
+    size = float(np.median([abs(one.size) for one in runs]))
     told = np.array([_told(one, sigmas) for one in runs])
     errors = np.array([one.error for one in runs])
     turn = np.degrees(np.median(np.linalg.norm(errors[:, :3], axis=1)))
@@ -201,7 +234,7 @@ def _row(case: str, size: float, runs: Sequence[Run], sigmas: Mapping[tuple[int,
     nees = [one.nees for one in runs]
     cells = [
         case,
-        f"{size:g}" if size else "–",
+        f"{size:.3g}" if size else "–",
         f"{np.median(told):.1f}" if size and np.isfinite(told).all() else "–",
         str(len(runs)),
         str(sum(bool(one.contradicted) for one in runs)),

@@ -10,7 +10,9 @@ import gtsam
 import numpy as np
 
 from sst_graph import Tracker, TrackerConfig
+from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.experiments.wrong_drives import with_distortion
 from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -52,6 +54,25 @@ def prepared_street(label_noise: float = 1.0) -> Drive:
     """:func:`standing_street`, reduced to what calibration needs of its vehicles."""
     config = PrepareConfig(use_visual_odometry=False)
     return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
+
+
+CROWDED_STREET = SimulationConfig(
+    seed=5000,
+    frames=20,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.3,
+    time_offset_s=0.1,
+)
+"""A drive with a stop past many vehicles, at half the usual size."""
+
+
+@cache
+def crowded_street(k1: float = 0.0) -> KeptDrive:
+    """:data:`CROWDED_STREET`, through a lens with radial distortion."""
+    return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulate(CROWDED_STREET))
 
 
 EARLY_START = TrackerConfig(start_scans=8, start_work=0)

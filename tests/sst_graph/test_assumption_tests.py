@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
+from functools import cache
 
 import gtsam
 import numpy as np
 import pytest
+from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.config import with_overrides
-from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.errors import ConfigError
 from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.estimators.assumption_tests import LinearProblem, SolvedProblem, few_objects
 from sst_graph.estimators.joint import solve_joint
-from sst_graph.experiments.assumptions import CLEAN, Run, table
-from sst_graph.experiments.wrong_drives import with_distortion, with_focal
+from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
+from sst_graph.experiments.wrong_drives import with_focal
+from sst_graph.problem.drive import Drive
 from sst_graph.problem.graph import Tracks
 from sst_graph.problem.objects import object_tracks
 from sst_graph.problem.state import State, nuisance_key
@@ -32,13 +34,14 @@ CONFIG = with_overrides(
 """Of what is beside the point here nothing: the global search, the motion, parts of the drive."""
 
 
-@pytest.fixture(scope="module")
-def street() -> KeptDrive:
-    return KeptDrive.of(simulate(SimulationConfig(seed=32, frames=18, time_offset_s=0.1)))
+@cache
+def prepared(k1: float = 0.0) -> list[Drive]:
+    """The street through a lens with radial distortion."""
+    return prepare_drives([crowded_street(k1)], CONFIG)
 
 
-def calibrated(drive: KeptDrive, config: CalibrationConfig = CONFIG) -> CalibrationResult:
-    return calibrate_prepared(prepare_drives([drive], config), drive.nominal, config)
+def calibrated(drives: Sequence[Drive], config: CalibrationConfig = CONFIG) -> CalibrationResult:
+    return calibrate_prepared(drives, crowded_street().nominal, config)
 
 
 def difference(a: CalibrationResult, b: CalibrationResult) -> tuple[float, float]:
@@ -48,8 +51,8 @@ def difference(a: CalibrationResult, b: CalibrationResult) -> tuple[float, float
 
 
 @pytest.fixture(scope="module")
-def clean(street: KeptDrive) -> CalibrationResult:
-    return calibrated(street)
+def clean() -> CalibrationResult:
+    return calibrated(prepared())
 
 
 def test_a_clean_street_contradicts_nothing(clean: CalibrationResult) -> None:
@@ -67,8 +70,8 @@ def test_the_parts_of_the_sigmas_add_up(clean: CalibrationResult) -> None:
 
 
 @pytest.mark.parametrize("k1", [-0.1])
-def test_a_distorted_picture_is_named_and_can_be_estimated(street: KeptDrive, k1: float) -> None:
-    bent = with_distortion(street, k1)
+def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
+    bent = prepared(k1)
     plain = calibrated(bent)
     assert plain.status == "not_converged"
     assert any("k1 = " in reason for reason in plain.reasons)
@@ -80,16 +83,16 @@ def test_a_distorted_picture_is_named_and_can_be_estimated(street: KeptDrive, k1
     # Points beyond the radius at which the lens would turn back tell nothing of it.
     assert found["sigma"] > 0.002
     # What the labels say of k1 where nothing is bent is in both.
-    rotation_deg, translation_m = difference(result, calibrated(street, config))
+    rotation_deg, translation_m = difference(result, calibrated(prepared(), config))
     assert rotation_deg < 0.1 and translation_m < 0.015
 
 
-def test_a_slight_distortion_is_covered_or_named(street: KeptDrive) -> None:
-    bent = with_distortion(street, -0.03)
-    result = calibrated(bent)
-    assert bent.truth is not None and bent.truth.time_offset_s is not None
-    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(bent.truth.cTl))
-    error = np.append(step, bent.truth.time_offset_s - result.time_offset_s)
+def test_a_slight_distortion_is_covered_or_named() -> None:
+    result = calibrated(prepared(-0.03))
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(truth.cTl))
+    error = np.append(step, truth.time_offset_s - result.time_offset_s)
     covered = (np.abs(error) < 3.0 * np.sqrt(np.diag(result.covariance))).all()
     assert covered or result.status != "ok"
     # The data complain, so that more than the prior deviation is considered.
@@ -98,13 +101,14 @@ def test_a_slight_distortion_is_covered_or_named(street: KeptDrive) -> None:
 
 
 @pytest.fixture(scope="module")
-def problem(street: KeptDrive) -> SolvedProblem:
+def problem() -> SolvedProblem:
     """Solved with a distortion that is not known of."""
-    drives = prepare_drives([with_distortion(street, -0.03)], CONFIG)
+    drives = prepared(-0.03)
     objects = [object_tracks(drive) for drive in drives]
     tracks = Tracks(drives, objects)
-    assert street.truth is not None and street.truth.time_offset_s is not None
-    guess = State(street.truth.cTl, (street.truth.time_offset_s,))
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    guess = State(truth.cTl, (truth.time_offset_s,))
     joint = dataclasses.replace(CONFIG.joint, kernel_px=(5.0, 3.0), max_outer=6)
     solution = solve_joint(drives, guess, joint, None, guess, tracks)
     return SolvedProblem(drives, tracks, objects, solution, joint, guess)
@@ -143,15 +147,33 @@ def test_the_table_counts_what_was_found() -> None:
     assert "- clean: 1 runs, 0 contradicted, 0 not ok, 0 silent" in text
 
 
-def test_a_wrong_focal_length_is_contradicted(street: KeptDrive) -> None:
-    result = calibrated(with_focal(street, 0.03))
+def test_rows_count_sizes_in_deviations_where_asked() -> None:
+    def one(seed: int, case: str, size: float) -> Run:
+        told = {"k1": (size, 0.01 * seed)}
+        return Run(seed, case, size, "ok", np.zeros(7), np.eye(7), told, ())
+
+    runs = [one(seed, CLEAN, 0.0) for seed in (1, 3)]
+    runs += [one(seed, "k1", sign * 0.05 * seed) for seed in (1, 3) for sign in (1.0, -1.0)]
+    assert "| k1 | 0.1 | 5.0 | 4 |" in table(runs, in_sigmas=True)
+    assert "| k1 | 0.05 | 5.0 | 2 |" in table(runs) and "| k1 | 0.15 | 5.0 | 2 |" in table(runs)
+
+
+def test_sizes_in_deviations_need_sizes_and_a_clean_street() -> None:
+    with pytest.raises(ConfigError, match="found no sizes"):
+        AssumptionTableConfig(in_sigmas=True)
+    with pytest.raises(ConfigError, match="cases leave out clean"):
+        AssumptionTableConfig(in_sigmas=True, sizes=(2.0,), cases=("k1",))
+
+
+def test_a_wrong_focal_length_is_contradicted() -> None:
+    result = calibrated(prepare_drives([with_focal(crowded_street(), 0.03)], CONFIG))
     assert result.status != "ok"
     assert result.diagnostics["assumptions"]["focal"]["contradicted"]
 
 
-def test_a_wider_assumption_gives_a_wider_covariance(street: KeptDrive, clean: CalibrationResult) -> None:
+def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -> None:
     wide = with_overrides(CONFIG, ["assumptions.sigmas.focal=0.01", "assumptions.test=false"])
-    result = calibrated(street, wide)
+    result = calibrated(prepared(), wide)
     report, told = result.diagnostics["assumptions"], clean.diagnostics["assumptions"]
     assert "estimate" not in report["focal"]
     # Untested, all other assumptions keep their prior deviations.
