@@ -24,6 +24,7 @@ from sst_graph.uncertainty.frame_information import (
     MAX_NUMBER,
     FrameInformation,
     positive_part,
+    unit_diagonal,
     with_offset,
 )
 from sst_graph.uncertainty.observability import ObservabilityConfig, limits_of_unknowns
@@ -209,8 +210,8 @@ def predicted_covariance(
     """
     lasting = np.zeros((7, 7)) if lasting is None else lasting
     own = positive_part(covariance - lasting) if lasting.any() else covariance
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    unit, scale = unit_diagonal(information)
+    values, vectors = np.linalg.eigh(unit)
     L = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     CL = own @ L
     # By least squares: beside a covariance of knowing nothing the unit matrix is lost in rounding.

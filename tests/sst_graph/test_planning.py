@@ -110,6 +110,15 @@ def test_information_adds_to_the_inverse() -> None:
     )
 
 
+def test_what_rounding_leaves_of_no_information_is_none() -> None:
+    C, L = 1e-4 * np.eye(7), 1e4 * np.eye(7)
+    for nothing in (0.0, -1e-9):
+        L[6] = L[:, 6] = 1e-6
+        L[6, 6] = nothing
+        after = predicted_covariance(C, L)
+        np.testing.assert_allclose(np.diag(after), [5e-5] * 6 + [1e-4], rtol=1e-9)
+
+
 def test_worst_ratio() -> None:
     sigmas = np.array([np.radians(0.25)] * 3 + [0.01, 0.01, 0.1] + [0.001])
     assert worst_ratio(np.diag(sigmas**2), LIMITS) == pytest.approx(2.0)
