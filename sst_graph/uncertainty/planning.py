@@ -68,7 +68,7 @@ class Prediction:
         name: of the proposal.
         sigmas: (7,) [rad, m, s] after it.
         worst: sigma of the direction known worst, over the limit: below 1 the status would be ok.
-        bits: information gained [bit].
+        bits: information gained [bit]; 0 where a covariance has no inverse, which tells none.
         enough: fewest frames that bring ``worst`` below 1, or None where :data:`MOST_FRAMES` don't, or
             where it was not looked for.
     """
@@ -188,7 +188,8 @@ def predict(
     """
     after = predicted_covariance(covariance, count * proposal.information, lasting)
     sigmas = np.sqrt(np.diag(covariance))
-    gain = np.linalg.slogdet(_scaled(covariance, sigmas))[1] - np.linalg.slogdet(_scaled(after, sigmas))[1]
+    before, left = (np.linalg.slogdet(_scaled(one, sigmas))[1] for one in (covariance, after))
+    gain = before - left if np.isfinite([before, left]).all() else 0.0
     return Prediction(
         proposal.name,
         np.sqrt(np.maximum(np.diag(after), 0.0)),

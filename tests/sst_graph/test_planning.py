@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import gtsam
@@ -77,6 +78,27 @@ def test_what_is_taken_for_granted_stays() -> None:
     for found, free in zip(plan.motions, without.motions, strict=True):
         np.testing.assert_allclose(found.sigmas**2, free.sigmas**2 + step**2, rtol=1e-6)
     assert plan.best.sigmas[1] > 2e-3 > 4.0 * without.best.sigmas[1]
+
+
+@pytest.mark.parametrize("taken", [[0, 1], [0, 4], [5, 6], [2]])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e10])
+def test_an_assumption_that_takes_all_of_a_variance(
+    taken: list[int], size: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing is left on the diagonal, but something beside it: it is not divided by."""
+    result, frames = at_constant_speed()
+    step = np.zeros(7)
+    step[taken] = size
+    covariance = np.diag(np.where(step > 0.0, step, 1e-3) ** 2)
+    covariance[np.ix_(taken, taken)] += 0.5 * size**2 * (1.0 - np.eye(len(taken)))
+    entry = {"sigma": 1.0, "sensitivity": step.tolist()}
+    granted = replace(result, covariance=covariance, diagnostics={"assumptions": {"cx": entry}})
+    plan = plan_recording(granted, frames, 10)
+    for found in (plan.now, plan.best, *plan.motions):
+        np.testing.assert_allclose(found.sigmas[taken], size, rtol=1e-6)  # no frames reduce it
+        assert (np.delete(found.sigmas, taken) <= 1e-3 * (1.0 + 1e-6)).all()
+    assert json.dumps(plan.to_dict(), allow_nan=False)
+    assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
