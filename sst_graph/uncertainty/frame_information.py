@@ -27,6 +27,10 @@ DIGITS = 4
 MAX_NUMBER = 1e18
 """Of any quantity that is kept: information of a sigma of 1e-9 [rad, m, s], and far beyond all others."""
 
+_ROUNDING = 6.0 * 10.0 ** (1 - DIGITS)
+"""How far :data:`DIGITS` may move an eigenvalue of a (6, 6) matrix scaled to a unit diagonal: six entries of
+a row, each off by half a unit of its last digit, and by as much again through the diagonal."""
+
 _UPPER = np.triu_indices(6)
 
 
@@ -144,7 +148,7 @@ def from_document(document: Any, place: str = f"diagnostics.{KEY}") -> tuple[Fra
             float(column["bits"][k]),
             column["without"][k],
             column["so_far"][k],
-            _symmetric(column["view"][k]),
+            _symmetric(column["view"][k], f"{place}.view"),
             column["l_twist"][k],
             int(column["matches"][k]),
             int(column["objects"][k]),
@@ -166,19 +170,48 @@ def _column(document: Mapping[str, Any], name: str, shape: tuple[int, ...], plac
     return array
 
 
-def _symmetric(upper: FloatArray) -> FloatArray:
-    """(6, 6) from its upper triangle; rounding may leave it a little indefinite, which is cut off."""
+def _symmetric(upper: FloatArray, place: str) -> FloatArray:
+    """(6, 6) from its upper triangle; rounding may leave it a little indefinite, which is cut off.
+
+    Raises:
+        DataError: more indefinite than rounding makes it.
+    """
     A = np.zeros((6, 6))
     A[_UPPER] = upper
     A = A + np.triu(A, 1).T
+    expected = "information (positive semi-definite)"
+    sigmas = np.sqrt(np.maximum(np.diag(A), 0.0))
+    if (np.abs(A) > (1.0 + _ROUNDING) * np.outer(sigmas, sigmas)).any():
+        raise DataError(place, "entries that their diagonal does not allow", expected)
+    least = float(np.linalg.eigvalsh(unit_diagonal(A)[0])[0])
+    if least < -_ROUNDING:
+        raise DataError(place, f"the eigenvalue {least:.3g} (scaled to a unit diagonal)", expected)
     return positive_part(A)
 
 
 def positive_part(A: FloatArray) -> FloatArray:
-    """The symmetric matrix nearest to ``A`` (scaled to a unit diagonal) without negative eigenvalues."""
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
-    values, vectors = np.linalg.eigh(0.5 * (A + A.T) / np.outer(scale, scale))
+    """A symmetric matrix (n, n) without correlations beyond 1 and without negative eigenvalues.
+
+    They are cut off at a unit diagonal. A direction whose diagonal is not above 0 has zeros.
+    """
+    unit, scale = unit_diagonal(0.5 * (A + A.T))
+    values, vectors = np.linalg.eigh(unit)
     return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(scale, scale))
+
+
+def unit_diagonal(A: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """A symmetric matrix scaled to a unit diagonal (n, n), and its scale (n,): unit * scale_i scale_j.
+
+    Entries are bounded as those of a semi-definite matrix are: to -1 and 1, and to 0 in the row and column
+    of a diagonal that is not above 0. There the scale is 0. So neither a zero nor what rounding leaves
+    in its place is divided by.
+    """
+    diagonal = np.diag(A)
+    told = diagonal > 0.0
+    scale = np.sqrt(np.where(told, diagonal, 1.0))
+    with np.errstate(over="ignore"):
+        unit = np.clip(A / scale[:, None] / scale, -1.0, 1.0)
+    return unit * np.outer(told, told), scale * told
 
 
 def _rounded(value: float) -> float:

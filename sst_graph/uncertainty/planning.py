@@ -24,6 +24,7 @@ from sst_graph.uncertainty.frame_information import (
     MAX_NUMBER,
     FrameInformation,
     positive_part,
+    unit_diagonal,
     with_offset,
 )
 from sst_graph.uncertainty.observability import ObservabilityConfig, limits_of_unknowns
@@ -67,7 +68,7 @@ class Prediction:
         name: of the proposal.
         sigmas: (7,) [rad, m, s] after it.
         worst: sigma of the direction known worst, over the limit: below 1 the status would be ok.
-        bits: information gained [bit].
+        bits: information gained [bit]; 0 where a covariance has no inverse, which tells none.
         enough: fewest frames that bring ``worst`` below 1, or None where :data:`MOST_FRAMES` don't, or
             where it was not looked for.
     """
@@ -187,7 +188,8 @@ def predict(
     """
     after = predicted_covariance(covariance, count * proposal.information, lasting)
     sigmas = np.sqrt(np.diag(covariance))
-    gain = np.linalg.slogdet(_scaled(covariance, sigmas))[1] - np.linalg.slogdet(_scaled(after, sigmas))[1]
+    before, left = (np.linalg.slogdet(_scaled(one, sigmas))[1] for one in (covariance, after))
+    gain = before - left if np.isfinite([before, left]).all() else 0.0
     return Prediction(
         proposal.name,
         np.sqrt(np.maximum(np.diag(after), 0.0)),
@@ -209,8 +211,8 @@ def predicted_covariance(
     """
     lasting = np.zeros((7, 7)) if lasting is None else lasting
     own = positive_part(covariance - lasting) if lasting.any() else covariance
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    unit, scale = unit_diagonal(information)
+    values, vectors = np.linalg.eigh(unit)
     L = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
     CL = own @ L
     # By least squares: beside a covariance of knowing nothing the unit matrix is lost in rounding.

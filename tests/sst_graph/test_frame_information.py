@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -116,8 +117,50 @@ def test_columns_must_be_an_object() -> None:
         from_document([1, 2])
 
 
+def first_view_is(*upper: float) -> Any:
+    """A change of the document: the first entries of the first view's upper triangle, zeros after them."""
+    return lambda document: document["view"].__setitem__(0, [*upper, *[0.0] * (21 - len(upper))])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        first_view_is(0.0, 1.0),  # nothing on the diagonal, and something beside it
+        first_view_is(0.0, 1e18),
+        first_view_is(4.0, 1e3),
+        first_view_is(-1.0),
+        # three unknowns that are each the opposite of both others
+        first_view_is(1.0, -0.9, -0.9, 0.0, 0.0, 0.0, 1.0, -0.9, 0.0, 0.0, 0.0, 1.0),
+    ],
+)
+def test_a_view_that_is_no_information_is_refused(change: Any) -> None:
+    document = to_document(some_frames())
+    change(document)
+    with pytest.raises(DataError, match=r"frame_information\.view.*semi-definite"):
+        from_document(document)
+
+
+def test_rounding_of_views_that_tell_little_is_read() -> None:
+    # One equation on six unknowns, rounded: the five eigenvalues of zero are off to both sides.
+    rng = np.random.default_rng(3)
+    for frame in some_frames(200):
+        row = rng.normal(size=6) * 10.0 ** rng.uniform(-6.0, 6.0, 6) * (rng.random(6) < 0.7)
+        (back,) = from_document(to_document([replace(frame, view=np.outer(row, row))]))
+        scale = np.where(row == 0.0, 1.0, np.abs(row))
+        np.testing.assert_allclose(
+            back.view / np.outer(scale, scale), np.outer(row, row) / np.outer(scale, scale), atol=6e-3
+        )
+
+
 def test_positive_part() -> None:
     A = np.array([[4.0, 2.0], [2.0, 3.0]])
     np.testing.assert_allclose(positive_part(A), A)
-    cut = positive_part(np.array([[1.0, 1.2], [1.2, 1.0]]))
-    np.testing.assert_allclose(cut, np.full((2, 2), 1.1), atol=1e-12)
+    # A correlation is at most 1 ...
+    np.testing.assert_allclose(positive_part(np.array([[4.0, 2.4], [2.4, 1.0]])), [[4.0, 2.0], [2.0, 1.0]])
+    # ... three of -0.9 are cut down to -0.5 of their diagonal, ...
+    cut = positive_part(1.9 * np.eye(3) - 0.9)
+    np.testing.assert_allclose(cut / cut[0, 0], 1.5 * np.eye(3) - 0.5, atol=1e-12)
+    # ... and beside nothing, or less than nothing by rounding, stands nothing.
+    for nothing in (0.0, -1e-17, 5e-324):
+        part = positive_part(np.array([[nothing, 1e-12], [1e-12, 3.0]]))
+        np.testing.assert_allclose(part, np.diag([0.0, 3.0]), atol=1e-150)

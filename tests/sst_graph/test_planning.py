@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import gtsam
@@ -79,6 +80,27 @@ def test_what_is_taken_for_granted_stays() -> None:
     assert plan.best.sigmas[1] > 2e-3 > 4.0 * without.best.sigmas[1]
 
 
+@pytest.mark.parametrize("taken", [[0, 1], [0, 4], [5, 6], [2]])
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e10])
+def test_an_assumption_that_takes_all_of_a_variance(
+    taken: list[int], size: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing is left on the diagonal, but something beside it: it is not divided by."""
+    result, frames = at_constant_speed()
+    step = np.zeros(7)
+    step[taken] = size
+    covariance = np.diag(np.where(step > 0.0, step, 1e-3) ** 2)
+    covariance[np.ix_(taken, taken)] += 0.5 * size**2 * (1.0 - np.eye(len(taken)))
+    entry = {"sigma": 1.0, "sensitivity": step.tolist()}
+    granted = replace(result, covariance=covariance, diagnostics={"assumptions": {"cx": entry}})
+    plan = plan_recording(granted, frames, 10)
+    for found in (plan.now, plan.best, *plan.motions):
+        np.testing.assert_allclose(found.sigmas[taken], size, rtol=1e-6)  # no frames reduce it
+        assert (np.delete(found.sigmas, taken) <= 1e-3 * (1.0 + 1e-6)).all()
+    assert json.dumps(plan.to_dict(), allow_nan=False)
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.parametrize(
     "entry",
     [
@@ -108,6 +130,15 @@ def test_information_adds_to_the_inverse() -> None:
     np.testing.assert_allclose(
         np.diag(predicted_covariance(flat, L)), [5e-13, 0.5, 0.0, 5e5, 1.0, 0.25, 1.0], rtol=1e-9
     )
+
+
+def test_what_rounding_leaves_of_no_information_is_none() -> None:
+    C, L = 1e-4 * np.eye(7), 1e4 * np.eye(7)
+    for nothing in (0.0, -1e-9):
+        L[6] = L[:, 6] = 1e-6
+        L[6, 6] = nothing
+        after = predicted_covariance(C, L)
+        np.testing.assert_allclose(np.diag(after), [5e-5] * 6 + [1e-4], rtol=1e-9)
 
 
 def test_worst_ratio() -> None:
