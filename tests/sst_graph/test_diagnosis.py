@@ -20,6 +20,7 @@ from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size
 from sst_graph.diagnosis.clocks import stamps, two_clocks
+from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.errors import DataError
 from sst_graph.estimators.batch import prepare_drives
@@ -161,6 +162,21 @@ def test_what_would_make_the_labels_agree_names_the_cause(lie: str) -> None:
     result = calibrate(wrong, wrong.nominal)
     assert result.status != "ok"
     assert NAMED[lie] in result.reasons[0]
+
+
+def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
+    """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
+    right = prepared().camera
+
+    def fit(one: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit:
+        if one.camera.fx > 1.5 * right.fx:
+            return Fit(CTL, offset_s, 0.68, 0.86)
+        if guess is not None and guess.equals(CTL.inverse(), 1e-9):
+            return Fit(CTL, offset_s, 0.53, 0.78)
+        return Fit(CTL, offset_s, 0.22, 0.47)
+
+    found = best_hypothesis(prepared(), CTL, 0.0, fit, fit(prepared(), CTL, 0.0))
+    assert found is not None and NAMED["half the focal length"] in found.cause
 
 
 @pytest.mark.parametrize("lie", ["masks of another drive", "clouds in camera axes"])
