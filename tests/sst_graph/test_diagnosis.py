@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -236,11 +237,14 @@ def test_a_crop_is_no_other_size(crop: float) -> None:
     assert image_size(camera) is None
 
 
-@pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "0.26 times")])
+@pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "about 0.26 times")])
 def test_pictures_of_another_size(scale: float, name: str) -> None:
     camera = PinholeCamera(721.0, 721.0, 609.6, 172.9, round(1242 * scale), round(375 * scale))
     finding = image_size(camera)
     assert finding is not None and f"the pictures are {name} the size" in finding.cause
+    # The principal point tells the ratio to some per cent only.
+    ratio = re.search(r"\(about ([0-9.]+)\)", finding.check)
+    assert ratio is not None and abs(float(ratio[1]) / scale - 1.0) < 0.05
 
 
 CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.05, -0.08, -0.27]))
