@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -45,14 +46,14 @@ def street(seed: int, output: str, frames: int) -> SimulationConfig:
 
 
 def decided(config: SimulationConfig) -> SweepDecision:
-    """What the scans of a street tell."""
+    """What the scans of a street tell; each is made once."""
     drive = simulate(config)
-    return decide_sweep(drive.scan, len(drive))
+    return decide_sweep(functools.cache(drive.scan), len(drive))
 
 
 def decide(args: argparse.Namespace) -> None:
-    """Of every street, raw and compensated: right, undecided or wrong."""
-    counts: dict[str, list[int]] = {}
+    """Of every street, raw and compensated: right, undecided or wrong, by view."""
+    counts: dict[tuple[str, str], list[int]] = {}
     print("| street | truth | speed, rate, motion, view | decision | sigmas |\n|---|---|---|---|---|")
     for seed in range(args.seed, args.seed + args.streets):
         for output in args.outputs.split(","):
@@ -62,7 +63,8 @@ def decide(args: argparse.Namespace) -> None:
             found = decided(config)
             seconds = time.perf_counter() - began
             kind = 0 if found.kind == truth else 2 if found.kind in FRACTIONS else 1
-            counts.setdefault(output, [0, 0, 0])[kind] += 1
+            seen = "full" if config.azimuth_limit_deg == 180.0 else "cropped"
+            counts.setdefault((seen, output), [0, 0, 0])[kind] += 1
             how = f"{config.speed_mps:.1f} m/s, {config.frame_rate_hz:.0f} Hz, {config.motion}, "
             worse = ", ".join(f"{name} {sigmas:.1f}" for name, sigmas in found.worse_by.items())
             start = f", start {config.sweep_start_deg:.0f} deg"
@@ -71,8 +73,9 @@ def decide(args: argparse.Namespace) -> None:
                 f"| {seed} | {truth} | {view} | {found.sentence} | {worse} | <!-- {seconds:.0f} s -->",
                 flush=True,
             )
-    for output, (right, open_, wrong) in counts.items():
-        print(f"\n{output}: {right} right, {open_} undecided, {wrong} wrong of {right + open_ + wrong}")
+    print("\n| view | clouds | right | undecided | wrong |\n|---|---|---|---|---|")
+    for (seen, output), (right, open_, wrong) in sorted(counts.items(), reverse=True):
+        print(f"| {seen} | {output} | {right} | {open_} | {wrong} |")
 
 
 def errors(config: SimulationConfig, timed: bool) -> tuple[list[float], str, str]:

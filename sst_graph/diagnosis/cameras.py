@@ -13,16 +13,23 @@ _ALIKE = 1.25
 
 def image_size(camera: PinholeCamera) -> Finding | None:
     """Pictures of another size than the intrinsics were made for: the principal point is off the middle by
-    one factor across and down."""
+    one factor across and down, which tells the ratio of the sizes to some per cent."""
     across, down = 2.0 * camera.cx / camera.width, 2.0 * camera.cy / camera.height
     if min(across, down) <= 0.0:
         return None
     factor = (across * down) ** 0.5
     if max(across, down) > _ALIKE * min(across, down) or 1.0 / _FAR < factor < _FAR:
         return None
-    size = "half" if 1.7 < factor < 2.4 else "twice" if 0.4 < factor < 0.6 else f"{1.0 / factor:.2g} times"
+    if 1.7 < factor < 2.4:
+        size, scale = "half", 0.5
+    elif 0.4 < factor < 0.6:
+        size, scale = "twice", 2.0
+    else:
+        scale = 1.0 / factor
+        size = f"about {scale:.2g} times"
     return Finding(
         f"the pictures are {size} the size the intrinsics were made for",
         f"cx = {camera.cx:.0f} of {camera.width} px, cy = {camera.cy:.0f} of {camera.height} px",
-        f"scale fx, fy, cx and cy by {1.0 / factor:.2g}, or give the pictures and masks at their full size",
+        f"scale fx, fy, cx and cy by the pictures' width over the calibration's (about {scale:.2g}), "
+        "or give the pictures and masks at their full size",
     )

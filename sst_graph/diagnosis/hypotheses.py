@@ -60,12 +60,21 @@ _WINDOW_S = 0.9
 def best_hypothesis(
     drive: Drive, guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, given: Fit | None
 ) -> Finding | None:
-    """The change under which the labels agree, where they clearly do; None where none helps."""
-    tried = itertools.chain(hypotheses(drive, guess, offset_s), _shifts(drive, guess, offset_s))
-    return _best(tried, offset_s, fit, given)
+    """The change under which the labels agree, where they clearly do; None where none helps.
+
+    All changes are compared, for a wrong one may fit well by chance; shifts in time only where none does.
+    """
+    best = _best(hypotheses(drive, guess, offset_s), offset_s, fit, given)
+    if best is None or best[0] <= WELL:
+        shifted = _best(_shifts(drive, guess, offset_s), offset_s, fit, given, enough=WELL)
+        best = max((b for b in (best, shifted) if b is not None), key=lambda b: b[0], default=None)
+    return None if best is None else best[1]
 
 
-def _best(tried: Iterator[Hypothesis], offset_s: float, fit: Fitter, given: Fit | None) -> Finding | None:
+def _best(
+    tried: Iterator[Hypothesis], offset_s: float, fit: Fitter, given: Fit | None, enough: float = np.inf
+) -> tuple[float, Finding] | None:
+    """Quality and cause of the best change that is believed; none is tried after one of ``enough``."""
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:
@@ -87,9 +96,9 @@ def _best(tried: Iterator[Hypothesis], offset_s: float, fit: Fitter, given: Fit 
             if hypothesis.start is not None:
                 finding = start_finding(hypothesis.start, found, finding)
             best = found.quality, finding
-        if found.quality > WELL:
+        if found.quality > enough:
             break
-    return None if best is None else best[1]
+    return best
 
 
 def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
@@ -117,7 +126,8 @@ def mirrored(
             cloud by 180 degrees.
     """
     tried = itertools.islice(_mirrorings(drive, guess, offset_s), 1 if sideways else None)
-    return _best(tried, offset_s, fit, given)
+    best = _best(tried, offset_s, fit, given)
+    return None if best is None else best[1]
 
 
 def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -20,6 +21,7 @@ from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.diagnosis import Fit, other_camera, preflight
 from sst_graph.diagnosis.cameras import image_size
 from sst_graph.diagnosis.clocks import stamps, two_clocks
+from sst_graph.diagnosis.hypotheses import best_hypothesis
 from sst_graph.diagnosis.poses import wrong_start
 from sst_graph.errors import DataError
 from sst_graph.estimators.batch import prepare_drives
@@ -163,6 +165,21 @@ def test_what_would_make_the_labels_agree_names_the_cause(lie: str) -> None:
     assert NAMED[lie] in result.reasons[0]
 
 
+def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
+    """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
+    right = prepared().camera
+
+    def fit(one: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit:
+        if one.camera.fx > 1.5 * right.fx:
+            return Fit(CTL, offset_s, 0.68, 0.86)
+        if guess is not None and guess.equals(CTL.inverse(), 1e-9):
+            return Fit(CTL, offset_s, 0.53, 0.78)
+        return Fit(CTL, offset_s, 0.22, 0.47)
+
+    found = best_hypothesis(prepared(), CTL, 0.0, fit, fit(prepared(), CTL, 0.0))
+    assert found is not None and NAMED["half the focal length"] in found.cause
+
+
 @pytest.mark.parametrize("lie", ["masks of another drive", "clouds in camera axes"])
 def test_what_shows_only_once_a_result_is_doubted(lie: str) -> None:
     """Neither is certain by itself: masks may be coarse, and a scanner may be mounted on its side."""
@@ -220,11 +237,14 @@ def test_a_crop_is_no_other_size(crop: float) -> None:
     assert image_size(camera) is None
 
 
-@pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "0.26 times")])
+@pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "about 0.26 times")])
 def test_pictures_of_another_size(scale: float, name: str) -> None:
     camera = PinholeCamera(721.0, 721.0, 609.6, 172.9, round(1242 * scale), round(375 * scale))
     finding = image_size(camera)
     assert finding is not None and f"the pictures are {name} the size" in finding.cause
+    # The principal point tells the ratio to some per cent only.
+    ratio = re.search(r"\(about ([0-9.]+)\)", finding.check)
+    assert ratio is not None and abs(float(ratio[1]) / scale - 1.0) < 0.05
 
 
 CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.05, -0.08, -0.27]))
