@@ -74,12 +74,13 @@ class Search:
 
     Attributes:
         drive: the scans and images that it is made of, as they were when it began.
+        numbers: of the scans.
         guess: where it begins.
         work: how much of it was asked for.
     """
 
-    def __init__(self, drive: Drive, guess: Guess, config: TrackerConfig) -> None:
-        self.drive, self.guess, self.config = drive, guess, config
+    def __init__(self, drive: Drive, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
+        self.drive, self.numbers, self.guess, self.config = drive, tuple(numbers), guess, config
         self.work = 0
         self._run: _Run | None = None
 
@@ -182,7 +183,7 @@ class Starting:
         if self.search is not None:
             point = self.search.go_on(self.config.start_work or None)
             if point is not None:
-                self._enter(matcher.window, point)
+                self._enter(matcher.window, point, self.search.numbers)
             if self.config.start_work > 0:
                 return None
         return None if self.entering is None else self._entered(matcher, self.config.start_work or None)
@@ -203,9 +204,10 @@ class Starting:
             except EXPECTED:
                 if search.drive.scans[-1] is window.scans[-1][1]:
                     raise
-                point = self._search(window).go_on(None)
+                search = self._search(window)
+                point = search.go_on(None)
             assert point is not None
-            self._enter(window, point)
+            self._enter(window, point, search.numbers)
         return self._entered(matcher, None)
 
     def _due(self, window: Window) -> bool:
@@ -216,16 +218,28 @@ class Starting:
 
     def _search(self, window: Window) -> Search:
         """Over the latest scans, no more than twice as many as are needed: a step's work grows with them."""
-        drive, _ = window.drive()
-        scans = drive.scans[-2 * self.needed :]
+        drive, numbers = window.drive()
+        scans, numbers = drive.scans[-2 * self.needed :], numbers[-2 * self.needed :]
         motions = tuple(m for m in drive.lidar_motions if m.from_ns >= scans[0].stamp_ns)
         drive = replace(drive, scans=scans, lidar_motions=motions)
-        return Search(drive, self.guess, self.config)
+        return Search(drive, numbers, self.guess, self.config)
 
-    def _enter(self, window: Window, point: Point) -> None:
-        """Begin with a graph of the latest scans, that goes on from an estimate."""
-        most = len(window.scans) if self.config.start_work == 0 else self.needed
-        chosen = [number for number, _ in window.scans][-most:]
+    def _enter(self, window: Window, point: Point, searched: Sequence[int]) -> None:
+        """Begin with a graph that goes on from an estimate.
+
+        It is made of the scans that the estimate is: it fits them. Scans that came meanwhile are new to it,
+        and enter as new scans do. All are taken at once where no work is saved.
+
+        Args:
+            searched: numbers of the scans that the estimate was made of.
+        """
+        numbers = [number for number, _ in window.scans]
+        chosen = [number for number in numbers if number in searched]
+        if self.config.start_work == 0:
+            chosen = numbers
+        elif len(chosen) < min(self.needed, len(searched)):
+            # A search was so long that its scans have left.
+            chosen = numbers[-self.needed :]
         self.search, self.entering = None, Entering(point, chosen, self.config)
 
     def _entered(self, matcher: WindowMatcher, work: int | None) -> Started | None:

@@ -117,9 +117,9 @@ class TrackerConfig(Settings):
         settle_scans: scans matched anew with each frame while a running tracker settles.
         start_scans: scans before the first batch solution is tried, and between attempts.
         restart_scans: the same after an alarm.
-        start_work: work on a start that is done with each frame, in units of about 4 ms, so that no frame
-            takes long for it: the estimate comes when all is done, tens of frames later, and until then the
-            status is ``starting``. 0: all with one frame, which takes seconds.
+        start_work: work on a start that is done with each frame, in units of 1 to 4 ms, so that no frame
+            takes long for it: the estimate comes when all is done, some twenty frames later, and until then
+            the status is ``starting``. 0: all with one frame, which takes seconds.
         start_attempts: failed attempts near the last estimate after an alarm before the search begins anew.
         start_share: least share of the pairs that the first solution must still match.
         start_gain: by which fraction of the cost a start whose time offset was searched must be better.
@@ -140,7 +140,7 @@ class TrackerConfig(Settings):
     settle_scans: int = setting(5, at_least=1, at_most=1000)
     start_scans: int = setting(12, at_least=1, at_most=1000)
     restart_scans: int = setting(8, at_least=1, at_most=1000)
-    start_work: int = setting(24, at_least=0, at_most=1_000_000)
+    start_work: int = setting(48, at_least=0, at_most=1_000_000)
     start_attempts: int = setting(2, at_least=1, at_most=1000)
     start_share: float = setting(0.7, at_least=0.0, at_most=1.0)
     start_gain: float = setting(0.1, at_least=0.0, at_most=1.0)

@@ -179,6 +179,11 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -
     search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
     enabled = guess.search or guess.cTl is None
     start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    if config.start_work > 0:
+        # The estimate is waited for, and scans of one second show much the same: candidates are compared on
+        # every other one, and the best are solved on all.
+        few = min(start.contest_scans, (len(drive.scans) + 1) // 2)
+        start = dataclasses.replace(start, contest_scans=few)
     joint = _damped(config) if delay_s == 0.0 else calibration.joint
     contest = yield from choosing_start(
         [drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, joint, start
