@@ -20,8 +20,9 @@ _USUAL_PERIODS_S = (0.008, 2.0)
 _TIME_UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 _FASTEST_MPS = 60.0
 """Faster than road vehicles that record for calibration [m/s]."""
-_HARDEST_MPS2 = 12.0
-"""Tyres brake and turn with 10 m/s^2 at most [m/s^2]."""
+_HARDEST_MPS2 = 20.0
+"""Tyres brake and turn with 10 m/s^2 at most; twice that leaves room for what odometry errs by, and for
+simulated drives that brake harder than tyres do (14 m/s^2 on a street of the second simulator) [m/s^2]."""
 _SLOWEST_TURN_S = 0.5
 """Spinning LiDARs turn 5 to 20 times a second, none less than twice [s]."""
 _SHARE = 0.2
