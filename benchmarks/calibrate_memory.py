@@ -15,7 +15,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 
 def peak_mb(drive: Path, frames: int, out: Path) -> float:

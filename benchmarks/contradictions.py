@@ -17,16 +17,16 @@ import gtsam
 import numpy as np
 
 from sst_graph import CalibrationConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.contradictions import Contradictions, find_contradictions
+from sst_graph.batch.parts import Parts
 from sst_graph.errors import EstimationError
-from sst_graph.estimators.batch import prepare_drives
-from sst_graph.estimators.contest import narrowed
-from sst_graph.estimators.contradictions import Contradictions, find_contradictions
-from sst_graph.estimators.joint import solve_joint
-from sst_graph.estimators.parts import Parts
-from sst_graph.problem.graph import Tracks
-from sst_graph.problem.objects import object_tracks
-from sst_graph.problem.state import State
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.state import State
+from sst_graph.initialization.selection import narrowed
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Frame, Source
 
 FRAMES = 30

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from second_street import SecondStreet, StreetConfig
 from third_street import ThirdConfig, ThirdStreet
 
-from sst_graph.association.boundary import find_boundaries
-from sst_graph.association.contour import ContourMap
-from sst_graph.association.silhouettes import SIDE_OF
-from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.association.edge_matching import SIDE_OF
+from sst_graph.features.lidar_edges import find_boundaries
+from sst_graph.features.mask_contour import ContourMap
+from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass, Source
 
 FloatArray = NDArray[np.float64]

@@ -30,10 +30,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.errors import SstGraphError
-from sst_graph.estimators.checkpoint import load_checkpoint
 from sst_graph.files.staging import SUFFIX
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.tracker.storage.checkpoint import load_checkpoint
 
 PROGRAM = [sys.executable, "-c", "import sys; from sst_graph.cli import main; sys.exit(main())"]
 """What the installed script does."""

@@ -41,12 +41,12 @@ from sst_graph import CalibrationConfig, Tracker, TrackerConfig, calibrate, open
 from sst_graph.cli import main as command
 from sst_graph.config import read_config, with_overrides
 from sst_graph.config import to_dict as config_to_dict
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.drive.preparation import prepare_drive
 from sst_graph.errors import SstGraphError
-from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.export.marginal import fuse_marginals, marginal_of_result, read_marginal
-from sst_graph.problem.drive import prepare_drive
 from sst_graph.reference import read_reference
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import Frame, SemanticClass
 
 MAX_SECONDS = 5.0

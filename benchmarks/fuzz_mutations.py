@@ -81,7 +81,7 @@ TEXTS = (
     "x" * 100_000,
     "../../etc/passwd",
     "__class__",
-    "sst_graph.estimators.incremental:Tracker",
+    "sst_graph.tracker.tracker:Tracker",
     "%s%n{0}",
     "é" * 50,
 )

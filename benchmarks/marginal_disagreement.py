@@ -13,8 +13,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import Alignment, PinholeCamera, RobustKernel, delay_prior, frame_factor, velocity_factor
 from sst_graph.export import CalibrationMarginal, fuse_graphs, fuse_marginals, marginal_of_graph
+from sst_graph.factors import (
+    Alignment,
+    PinholeCamera,
+    RobustKernel,
+    frame_factor,
+    time_offset_prior,
+    velocity_factor,
+)
 
 FloatArray = NDArray[np.float64]
 E, D = gtsam.symbol("E", 0), gtsam.symbol("D", 0)
@@ -44,9 +51,9 @@ def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.Nonlinear
         graph.add(frame_factor([matches], E, D, V, bias))
         graph.add(velocity_factor(V, twist + rng.normal(0.0, 0.02, 6), 4e-4 * np.eye(6)))
         values.insert(V, twist)
-    graph.add(delay_prior(bias, 0.0, 1.0))
+    graph.add(time_offset_prior(bias, 0.0, 1.0))
     graph.add(gtsam.PriorFactorPose3(E, cTl, gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
-    graph.add(delay_prior(D, offset_s, 1.0))
+    graph.add(time_offset_prior(D, offset_s, 1.0))
     values.insert(bias, np.zeros(1))
     values.insert(E, cTl)
     values.insert(D, np.array([offset_s]))

@@ -14,12 +14,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators import calibrate_prepared
-from sst_graph.problem.drive import Drive, PrepareConfig, prepare_drive
+from sst_graph.batch import calibrate_prepared
+from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
+from sst_graph.inspect.frame_information import frames_of, with_offset
+from sst_graph.inspect.planning import considered_covariance, predicted_covariance
+from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.frame_information import frames_of, with_offset
-from sst_graph.uncertainty.planning import considered_covariance, predicted_covariance
 
 CUTS = (14, 28, 42)
 

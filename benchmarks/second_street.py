@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial import ConvexHull
 
-from factors.camera import PinholeCamera
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]

@@ -26,13 +26,14 @@ from typing import Any, Literal, get_args
 import gtsam
 import numpy as np
 
-from factors.camera import PinholeCamera
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Range, walk_settings, with_overrides
-from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError, SstGraphError
-from sst_graph.estimators import CalibrationConfig, Tracker, calibrate_prepared, prepare_drives
-from sst_graph.estimators.tracker_config import TrackerConfig
-from sst_graph.problem.drive import Drive
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.tracker import Tracker
+from sst_graph.tracker.config import TrackerConfig
 from sst_graph.types import Frame, GroundTruth
 
 FRAMES = 6

@@ -21,8 +21,8 @@ import gtsam
 import numpy as np
 
 from sst_graph import CalibrationConfig, calibrate
-from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.odometry.sweep import FRACTIONS, SweepDecision, decide_sweep
+from sst_graph.simulator import SimulationConfig, simulate
 
 
 def street(seed: int, output: str, frames: int) -> SimulationConfig:

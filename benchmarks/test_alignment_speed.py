@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Alignment, PinholeCamera, RobustKernel, custom_factor, frame_factor
-from factors.motion import se3_left_jacobian
+from sst_graph.factors import Alignment, PinholeCamera, RobustKernel, custom_factor, frame_factor
+from sst_graph.factors.motion import se3_left_jacobian
 
 E, D, V = (gtsam.symbol(letter, 0) for letter in "edv")
 CAMERA = PinholeCamera(718.0, 718.0, 607.0, 185.0, 1242, 375)

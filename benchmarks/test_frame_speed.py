@@ -12,8 +12,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Alignment, PinholeCamera, frame_factor
 from sst_graph.association.nearest import ClassView, match_nearest
+from sst_graph.factors import Alignment, PinholeCamera, frame_factor
 from sst_graph.types import SemanticClass
 
 E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)

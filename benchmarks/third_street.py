@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from factors.camera import PinholeCamera
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]

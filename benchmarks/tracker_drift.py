@@ -20,8 +20,8 @@ from tracker_run import PERIOD_NS, endless
 from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.estimators.tracker_config import DriftConfig
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.tracker.config import DriftConfig
 from sst_graph.types import Frame
 
 DRIFT = DriftConfig(enabled=True, rotation_deg=0.05, translation_m=0.0005, offset_s=0.001)

@@ -31,10 +31,10 @@ from numpy.typing import NDArray
 from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig, open_source
-from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators.checkpoint import Saver
-from sst_graph.estimators.track_update import TrackUpdate
-from sst_graph.estimators.tracker_config import DriftConfig
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.tracker.config import DriftConfig
+from sst_graph.tracker.storage.checkpoint import Saver
+from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Frame
 
 PERIOD_NS = 100_000_000

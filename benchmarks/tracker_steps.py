@@ -22,9 +22,9 @@ import gtsam
 import numpy as np
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.data.simulator.config import Motion
-from sst_graph.estimators.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator.config import Motion
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import CameraImage, Frame
 
 GUESS = np.array([0.02, -0.02, 0.02, 0.05, -0.05, 0.05])

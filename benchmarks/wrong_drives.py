@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.data.simulator import SimulatedDrive
+from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]

@@ -16,12 +16,12 @@ from pathlib import Path
 from wrong_drives import LIES, NAMED, right_camera
 
 from sst_graph import CalibrationConfig, open_source
+from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.data.simulator import SimulationConfig, simulate
 from sst_graph.diagnosis import preflight
 from sst_graph.errors import SstGraphError
-from sst_graph.estimators.batch import calibrate_prepared, prepare_drives
 from sst_graph.metrics import calibration_errors
+from sst_graph.simulator import SimulationConfig, simulate
 
 CLEAN, RIGHT = "clean", "right camera"
 

@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from .cloning import GncParams, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
     from .condensed import condense
     from .custom import FactorRecipe, custom_factor, recipe_of
-    from .delay import delay_drift, delay_prior, extrinsic_drift
+    from .delay import extrinsic_drift, time_offset_drift, time_offset_prior
     from .errors import FactorError
     from .hand_eye import hand_eye_factor, rotation_hand_eye
     from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
@@ -107,8 +107,6 @@ __all__ = [
     "clone_graph",
     "condense",
     "custom_factor",
-    "delay_drift",
-    "delay_prior",
     "extrinsic_drift",
     "frame_factor",
     "gnc",
@@ -123,6 +121,8 @@ __all__ = [
     "residuals",
     "rotation_hand_eye",
     "silhouette_factor",
+    "time_offset_drift",
+    "time_offset_prior",
     "twist_jerk_factor",
     "twist_smoothness_factor",
     "twist_transfer_factor",
@@ -161,8 +161,8 @@ _HOMES = {
     "clone_graph": "cloning",
     "condense": "condensed",
     "custom_factor": "custom",
-    "delay_drift": "delay",
-    "delay_prior": "delay",
+    "time_offset_drift": "delay",
+    "time_offset_prior": "delay",
     "extrinsic_drift": "delay",
     "frame_factor": "alignment",
     "gnc": "cloning",
@@ -190,7 +190,7 @@ def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for: the exceptions alone need no gtsam."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"factors.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"sst_graph.factors.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:

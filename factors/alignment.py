@@ -1,4 +1,4 @@
-"""Alignment factors: a frame's matches as ONE vectorised factor (see :mod:`factors.reprojection`).
+"""Alignment factors: a frame's matches as ONE vectorised factor (see :mod:`sst_graph.factors.reprojection`).
 
 The cost of a factor is the robust cost sum rho(|r_i| / sigma_i); its linearization carries the weights
 w_i of each match. Condensed (the default) it has cols + 2 rows however many matches there are, with the
@@ -323,7 +323,7 @@ def frame_residual(
         raise FactorError(f"alignments of {name}", "none", "one or more")
     for alignment in alignments:
         if not isinstance(alignment, Alignment):
-            raise FactorError(f"alignments of {name}", described(alignment), "factors.Alignment")
+            raise FactorError(f"alignments of {name}", described(alignment), "sst_graph.factors.Alignment")
         if alignment.c_acceleration.ndim > 1:
             found = f"shape {alignment.c_acceleration.shape}"
             raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")

@@ -5,7 +5,7 @@
 
 Each image falls between two poses of the trajectory, stamped by the LiDAR's clock, between which the body
 moves with one twist. The camera's motion so corrects the trajectory through the calibration, and the
-trajectory the calibration: a hand-eye constraint (:mod:`factors.hand_eye`) with both sides unknown.
+trajectory the calibration: a hand-eye constraint (:mod:`sst_graph.factors.hand_eye`) with both sides unknown.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def camera_motion_factor(
         c1Tc2: measured pose of the camera at image 2 in the camera at image 1; any length where the scale
             is unknown.
         covariance: (6, 6) of it [rot, trans], right perturbation; see
-            :func:`factors.hand_eye.hand_eye_factor` for an unknown scale.
+            :func:`sst_graph.factors.hand_eye.hand_eye_factor` for an unknown scale.
         bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
         scale_known: False where the translation's direction alone was measured.
 

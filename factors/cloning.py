@@ -2,7 +2,7 @@
 
 gtsam 4.3 has no ``clone()`` for a ``CustomFactor``: ``graph.clone()``, ``copy.deepcopy``, ``rekey``, pickling
 and ``gtsam.GncLMOptimizer`` fail on it, and on any graph that holds one. A factor of this package gives its
-recipe (:func:`factors.recipe_of`), from which it is built anew.
+recipe (:func:`sst_graph.factors.recipe_of`), from which it is built anew.
 """
 
 from __future__ import annotations
@@ -98,7 +98,8 @@ def _recipe(factor: gtsam.CustomFactor) -> FactorRecipe:
     recipe = recipe_of(factor)
     if recipe is None:
         keys = ", ".join(gtsam.DefaultKeyFormatter(key) for key in list(factor.keys()))
-        raise FactorError(f"CustomFactor on {keys}", "one that another made", "one of factors.custom_factor")
+        expected = "one of sst_graph.factors.custom_factor"
+        raise FactorError(f"CustomFactor on {keys}", "one that another made", expected)
     return recipe
 
 

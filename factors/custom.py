@@ -117,8 +117,8 @@ def custom_factor(
             for each variable (tangent space as gtsam has it). A value is what ``gtsam.Values`` holds: an
             object of gtsam (Pose3, NavState, ConstantBias, Unit3, Cal3_S2, ...) or an array; a ``double``
             comes as a ``Vector(1)`` does, (1,).
-        dims: of each variable its tangent dimension, or a class of gtsam or :class:`factors.Vector` where
-            nothing else will do.
+        dims: of each variable its tangent dimension, or a class of gtsam or
+            :class:`sst_graph.factors.Vector` where nothing else will do.
         rows: length of the error.
         name: of the factor, for errors.
 

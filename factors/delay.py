@@ -13,11 +13,11 @@ from .errors import checked_array, checked_positive
 from .variables import checked_key, checked_keys
 
 
-def delay_prior(
+def time_offset_prior(
     D_key: int, offset_s: float, sigma_s: float, *, double: bool = False
 ) -> gtsam.PriorFactorVector | gtsam.PriorFactorDouble:
     """D - offset_s with sigma_s [s]; ``double``: D is kept as a ``double``."""
-    key = checked_key("delay_prior", "D_key", D_key)
+    key = checked_key("time_offset_prior", "D_key", D_key)
     prior = checked_array("offset_s", [offset_s], (1,))
     noise = gtsam.noiseModel.Isotropic.Sigma(1, checked_positive("sigma_s", sigma_s))
     if double:
@@ -25,14 +25,14 @@ def delay_prior(
     return gtsam.PriorFactorVector(key, prior, noise)
 
 
-def delay_drift(
+def time_offset_drift(
     D_a: int, D_b: int, seconds: float, sigma_s_per_sqrt_s: float, *, double: bool = False
 ) -> gtsam.BetweenFactorVector | gtsam.BetweenFactorDouble:
     """D_b - D_a, a random walk over ``seconds``: sigma = sigma_s_per_sqrt_s * sqrt(seconds) [s].
 
     ``double``: both are kept as ``double``.
     """
-    a, b = checked_keys("delay_drift", {"D_a": D_a, "D_b": D_b})
+    a, b = checked_keys("time_offset_drift", {"D_a": D_a, "D_b": D_b})
     sigma = checked_positive("sigma_s_per_sqrt_s", sigma_s_per_sqrt_s) * _sqrt_seconds(seconds)
     noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
     if double:

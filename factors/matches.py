@@ -22,7 +22,7 @@ class Alignment:
     """Matches (lP_i, q_i) of one image, frozen for an inner optimisation.
 
     Those of many images of one camera can stand in one, too, where each match has its own ``c_acceleration``;
-    :func:`factors.residuals` then takes a twist for each. A factor has the matches of one image.
+    :func:`sst_graph.factors.residuals` then takes a twist for each. A factor has the matches of one image.
 
     Shapes are checked and arrays copied (read-only) once, here. No match at all (n = 0) is allowed.
 
@@ -36,7 +36,7 @@ class Alignment:
             side on which the signed distance is positive), or None for point-to-pixel matches.
         kernel: robust kernel on each match's whitened residual (its 2-norm where it has two rows).
         c_acceleration: (6,) twist's rate of change, or (n, 6) of each match's image [rad/s^2, m/s^2].
-        motion_model: "se3" or the first-order "translation" (see :mod:`factors.motion`).
+        motion_model: "se3" or the first-order "translation" (see :mod:`sst_graph.factors.motion`).
         weights: (n,) or one number: factor on the cost of each match (after the kernel).
         l_velocities: (n, 3) velocity over ground of the object that each point lies on, in the LiDAR frame
             [m/s], or None where all stand.

@@ -3,7 +3,7 @@
     r_i = uv(cP_i) - q_i                          point-to-pixel and pixel-to-point, 2 rows
     r_i = n_i . (uv(cP_i) - q_i) + bias           silhouette, 1 row
 
-in pixels, with cP_i = Exp(-tau_i w_i) . (cTl . lP_i) (:mod:`factors.motion`) and uv the pinhole
+in pixels, with cP_i = Exp(-tau_i w_i) . (cTl . lP_i) (:mod:`sst_graph.factors.motion`) and uv the pinhole
 projection; sources: SST-Calib (Kodaira et al., ITSC 2022), eq. 2-6, for the first.
 
 Behind the camera. A point that is not :meth:`PinholeCamera.in_front` has no pixel: its rows are zero,

@@ -27,7 +27,7 @@ def silhouette_factor(
     q_i is the contour's point nearest to the predicted pixel and n_i its outward unit normal; frozen,
     they are the contour's tangent line. ``bias_px`` is how far a class's masks reach outside the true
     outline (dilation positive): the outline lies that far inside the contour. The arguments are those of
-    :func:`factors.frame_factor`.
+    :func:`sst_graph.factors.frame_factor`.
 
     Raises:
         FactorError: the alignment has no normals.

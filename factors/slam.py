@@ -1,6 +1,6 @@
 """Alignment in somebody else's graph: on the poses of a trajectory instead of a twist.
 
-    cP_i = Exp(-tau_i c_twist) . cTl . lTs . lP_i,      residuals as in :mod:`factors.reprojection`
+    cP_i = Exp(-tau_i c_twist) . cTl . lTs . lP_i,      residuals as in :mod:`sst_graph.factors.reprojection`
     c_twist = Ad(cTl) Ad(lTb) Log(wTb_a^-1 wTb_b) / seconds
     lTs = lTb . wTb_a^-1 . wTb_s . bTl
 
@@ -61,7 +61,7 @@ def pose_alignment_factor(
         seconds: from X_a to X_b, in the LiDAR's clock [s].
         X_scan: key of wTb at the scan's stamp, where that is another pose than X_a.
         bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
-        biases_px: as in :func:`factors.frame_factor`.
+        biases_px: as in :func:`sst_graph.factors.frame_factor`.
         image_after_middle_s: t_image_stamp minus the middle between X_a and X_b [s]. Given, the twist at
             the image's instant is the mean one plus (offset + image_after_middle_s) times the
             alignments' common ``c_acceleration``; None: the mean twist holds throughout.
@@ -76,7 +76,7 @@ def pose_alignment_factor(
         in all its rows, the given one.
 
     Raises:
-        FactorError: keys or intervals that make no factor; see also :func:`factors.frame_factor`.
+        FactorError: keys or intervals that make no factor; see also :func:`sst_graph.factors.frame_factor`.
     """
     frame = _on_poses(
         alignments, X_a, X_b, cTl, offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s

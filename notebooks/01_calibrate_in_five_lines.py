@@ -16,9 +16,9 @@ import tempfile
 from pathlib import Path
 
 import sst_graph
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.export import export_text
 from sst_graph.metrics import calibration_errors
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 folder = Path(tempfile.mkdtemp()) / "drive"
 street = SimulationConfig(

@@ -29,21 +29,21 @@ import gtsam
 import numpy as np
 
 import sst_graph
-from factors import (
+from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.batch import calibrate_prepared
+from sst_graph.drive.preparation import PrepareConfig, prepare_drive
+from sst_graph.factors import (
     Between,
     GroupedBias,
     RobustKernel,
     camera_motion_factor,
-    delay_prior,
     pose_alignment_factor,
+    time_offset_prior,
 )
-from sst_graph.association.picture_edges import PictureConfig
-from sst_graph.association.silhouettes import MatchConfig
-from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators import calibrate_prepared
+from sst_graph.features.image_edges import PictureConfig
+from sst_graph.objects.tracks import object_tracks
 from sst_graph.odometry import RegisteredScan, loop_closures, metric_motions, scan_to_scan
-from sst_graph.problem.drive import PrepareConfig, prepare_drive
-from sst_graph.problem.objects import object_tracks
+from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass
 
 E, D, B = gtsam.symbol("E", 0), gtsam.symbol("D", 0), gtsam.symbol("B", 0)
@@ -226,8 +226,8 @@ loose = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.2, 0.5], 3))
 for kernel_px in (5.0, 4.0, 3.0, 3.0, 3.0):
     graph = gtsam.NonlinearFactorGraph(slam_graph)
     graph.add(gtsam.PriorFactorPose3(E, drive.nominal, loose))
-    graph.add(delay_prior(D, 0.0, 1.0))
-    graph.add(delay_prior(B, 0.0, 3.0))
+    graph.add(time_offset_prior(D, 0.0, 1.0))
+    graph.add(time_offset_prior(B, 0.0, 3.0))
     where = places(values)
     seen = add_silhouettes(graph, values, where, kernel_px)
     add_visual_odometry(graph, values, where)

@@ -20,8 +20,8 @@ import gtsam
 import numpy as np
 
 import sst_graph
-from sst_graph.data.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.export import fuse_marginals, marginal_of_result
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 folder = Path(tempfile.mkdtemp()) / "drive"
 street = SimulationConfig(

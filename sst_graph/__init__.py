@@ -8,19 +8,20 @@ TYPE_CHECKING = False  # as typing has it, whose import takes milliseconds of ev
 if TYPE_CHECKING:
     from typing import Any
 
-    from factors import PinholeCamera
+    from sst_graph.batch import CalibrationConfig, calibrate
     from sst_graph.data import open_source
-    from sst_graph.estimators import CalibrationConfig, Tracker, TrackerConfig, TrackUpdate, calibrate
     from sst_graph.export import CalibrationMarginal
-    from sst_graph.problem.align import align_frame
-    from sst_graph.problem.alignment_keys import AlignmentKeys, Trajectory
-    from sst_graph.problem.alignment_term import AlignmentTerm
+    from sst_graph.factors import PinholeCamera
+    from sst_graph.inspect.inspection import inspect_result
     from sst_graph.result import CalibrationResult
+    from sst_graph.slam.align import align_frame
+    from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
+    from sst_graph.slam.alignment_term import AlignmentTerm
     from sst_graph.slam.covariance import calibration_covariance
     from sst_graph.slam.incremental_terms import IncrementalTerms
-    from sst_graph.slam.rematching import solve_with_terms
+    from sst_graph.slam.solving import solve_with_terms
+    from sst_graph.tracker import Tracker, TrackerConfig, TrackUpdate
     from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
-    from sst_graph.uncertainty.inspection import inspect_result
 
 __all__ = [
     "AlignmentKeys",
@@ -48,28 +49,28 @@ __all__ = [
 ]
 
 _HOMES = {
-    "AlignmentKeys": "sst_graph.problem.alignment_keys",
-    "AlignmentTerm": "sst_graph.problem.alignment_term",
-    "CalibrationConfig": "sst_graph.estimators",
+    "AlignmentKeys": "sst_graph.slam.alignment_keys",
+    "AlignmentTerm": "sst_graph.slam.alignment_term",
+    "CalibrationConfig": "sst_graph.batch",
     "CalibrationMarginal": "sst_graph.export",
     "CalibrationResult": "sst_graph.result",
     "CameraImage": "sst_graph.types",
     "Frame": "sst_graph.types",
     "IncrementalTerms": "sst_graph.slam.incremental_terms",
-    "PinholeCamera": "factors",
+    "PinholeCamera": "sst_graph.factors",
     "Scan": "sst_graph.types",
     "SemanticClass": "sst_graph.types",
     "Source": "sst_graph.types",
-    "TrackUpdate": "sst_graph.estimators",
-    "Tracker": "sst_graph.estimators",
-    "TrackerConfig": "sst_graph.estimators",
-    "Trajectory": "sst_graph.problem.alignment_keys",
-    "align_frame": "sst_graph.problem.align",
-    "calibrate": "sst_graph.estimators",
+    "TrackUpdate": "sst_graph.tracker",
+    "Tracker": "sst_graph.tracker",
+    "TrackerConfig": "sst_graph.tracker",
+    "Trajectory": "sst_graph.slam.alignment_keys",
+    "align_frame": "sst_graph.slam.align",
+    "calibrate": "sst_graph.batch",
     "calibration_covariance": "sst_graph.slam.covariance",
-    "inspect_result": "sst_graph.uncertainty.inspection",
+    "inspect_result": "sst_graph.inspect.inspection",
     "open_source": "sst_graph.data",
-    "solve_with_terms": "sst_graph.slam.rematching",
+    "solve_with_terms": "sst_graph.slam.solving",
 }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from factors.exceptions import SstGraphError, printable
+from sst_graph.factors.exceptions import SstGraphError, printable
 
 __all__ = [
     "CheckpointError",

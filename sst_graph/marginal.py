@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, EstimationError
-from sst_graph.input_files import MARGINAL, parse_json, read_text
-from sst_graph.json_table import JsonTable, json_table
+from sst_graph.files.json_table import JsonTable, json_table
+from sst_graph.files.reading import MARGINAL, parse_json, read_text
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]

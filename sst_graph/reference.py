@@ -8,8 +8,8 @@ import gtsam
 
 from sst_graph.data.calib import read_calibration
 from sst_graph.errors import DataError
-from sst_graph.input_files import CALIBRATION, read_json
-from sst_graph.json_table import JsonTable
+from sst_graph.files.json_table import JsonTable
+from sst_graph.files.reading import CALIBRATION, read_json
 from sst_graph.result import UNNAMED_CAMERA
 from sst_graph.types import GroundTruth
 

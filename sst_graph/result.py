@@ -18,12 +18,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
-from sst_graph.checked import check_covariance, check_finite, checked_camera, checked_text
 from sst_graph.errors import DataError
-from sst_graph.input_files import CALIBRATION, parse_json, read_text
-from sst_graph.json_table import JsonTable, json_table
-from sst_graph.strict_json import strict_json
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.checked_values import check_covariance, check_finite, checked_camera, checked_text
+from sst_graph.files.json_table import JsonTable, json_table
+from sst_graph.files.reading import CALIBRATION, parse_json, read_text
+from sst_graph.files.strict_json import strict_json
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]

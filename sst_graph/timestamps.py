@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.input_files import TIMES_TXT, read_text
+from sst_graph.files.reading import TIMES_TXT, read_text
 
 NS_PER_S = 1_000_000_000
 

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
+from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
 

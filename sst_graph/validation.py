@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import NO_PICTURE, CameraImage, Scan, SemanticClass
 
 MOST_POINTS = 10_000_000

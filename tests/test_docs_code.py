@@ -10,8 +10,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, check_jacobians
 from sst_graph.export import CalibrationMarginal
+from sst_graph.factors import FactorError, check_jacobians
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 

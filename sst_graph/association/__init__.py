@@ -1,0 +1,1 @@
+"""Which data belong together: images and scans in time, points and pixels, edges and contours."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from factors import Alignment, MotionModel, PinholeCamera, move_points
+from sst_graph.factors import Alignment, MotionModel, PinholeCamera, move_points
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +41,7 @@ class NearestPixels:
     def at(self, uvs: FloatArray) -> FloatArray:
         """(n, 2) centre of the class's pixel nearest to the pixel that each of uvs (n, 2) lies in [px].
 
-        uvs must lie on the image (see :meth:`factors.PinholeCamera.in_image`).
+        uvs must lie on the image (see :meth:`sst_graph.factors.PinholeCamera.in_image`).
         """
         h, w = self.index.shape
         columns = np.clip((uvs[:, 0] + 0.5).astype(np.intp), 0, w - 1)
@@ -137,7 +137,7 @@ def match_nearest(
     Args:
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
         pixel_weight: w_l; 0 leaves the pixels out.
-        motion_model: see :mod:`factors.motion`; the paper's is "translation".
+        motion_model: see :mod:`sst_graph.factors.motion`; the paper's is "translation".
         max_px: points farther than this from their pixel are left out [px].
     """
     tau_s = offset_s + view.base_tau_s

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
+from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
 

@@ -39,7 +39,7 @@ def run(argv: Sequence[str]) -> int:
 def _run(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     _set_up_logging(args.verbose)
-    command = importlib.import_module(f"sst_graph.cli.{args.command}")
+    command = importlib.import_module(f"sst_graph.cli.commands.{args.command}")
     code: int = command.run(args)
     return code
 
@@ -67,7 +67,6 @@ def _set_up_logging(verbose: bool) -> None:
     # A message that cannot be logged is no reason for a traceback.
     logging.raiseExceptions = False
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(name)s: %(message)s", force=True)
-    for name in ("sst_graph", "factors"):
-        logging.getLogger(name).setLevel(level)
+    logging.getLogger("sst_graph").setLevel(level)
     if sys.stderr is not None:
         logging.captureWarnings(True)

@@ -10,12 +10,12 @@ from pathlib import Path
 
 from sst_graph.cli.messages import complain
 from sst_graph.cli.pictures import overlay, png, telling_positions
+from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
-from sst_graph.frame_parts import RecentReader
+from sst_graph.inspect.report import Comparison, markdown_report
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
-from sst_graph.report import Comparison, markdown_report
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement

@@ -10,8 +10,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import DataError
-from sst_graph.frame_parts import RecentReader
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame, Scan, SemanticClass, Source

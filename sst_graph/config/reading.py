@@ -13,7 +13,7 @@ from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
 from sst_graph.errors import ConfigError, DataError, SstGraphError
-from sst_graph.input_files import SETTINGS, read_json, read_toml
+from sst_graph.files.reading import SETTINGS, read_json, read_toml
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.input_files import FileKind, read_file
+from sst_graph.files.reading import FileKind, read_file
 
 MAX_POINTS = 10_000_000
 """Points of a scan: a sweep of the densest spinning scanners has under one million. This many take 160 MB."""

@@ -15,10 +15,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
-from sst_graph.checked import checked_camera, checked_pose
 from sst_graph.errors import ConfigError, DataError
-from sst_graph.input_files import CALIB_TXT, read_text
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.checked_values import checked_camera, checked_pose
+from sst_graph.files.reading import CALIB_TXT, read_text
 
 FloatArray = NDArray[np.float64]
 

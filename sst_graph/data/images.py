@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sst_graph.data.decoder_output import decoder_output
 from sst_graph.data.image_header import check_whole, image_size
 from sst_graph.errors import DataError
-from sst_graph.input_files import FileKind, read_file
+from sst_graph.files.reading import FileKind, read_file
 
 IMAGE = FileKind("a PNG or JPEG file", 128 * 1024 * 1024)
 

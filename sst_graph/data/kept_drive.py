@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import gtsam
 
-from factors.camera import PinholeCamera
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
 
 

@@ -21,7 +21,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
 from sst_graph.data.arrays import read_labels, read_offsets, read_points
 from sst_graph.data.calib import read_calibration
@@ -31,6 +30,7 @@ from sst_graph.data.kitti_truth import drive_truth
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions, Sweep
 from sst_graph.errors import ConfigError, printable
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.timestamps import read_times
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, GroundTruth, Scan, SemanticClass

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from sst_graph.data.calib import KittiCalibration, pose_from
 from sst_graph.errors import DataError
-from sst_graph.input_files import GROUND_TRUTH, read_json
-from sst_graph.json_table import JsonTable
+from sst_graph.files.json_table import JsonTable
+from sst_graph.files.reading import GROUND_TRUTH, read_json
 from sst_graph.types import GroundTruth
 
 _FILE = "groundtruth.json"

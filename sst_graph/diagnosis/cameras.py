@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from factors.camera import PinholeCamera
 from sst_graph.diagnosis.finding import Finding
+from sst_graph.factors.camera import PinholeCamera
 
 _FAR = 1.4
 """A principal point off the middle by this factor, in both directions alike, is that of another image size:

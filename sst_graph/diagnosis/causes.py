@@ -11,7 +11,7 @@ from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.fit import LEAST_QUALITY, WELL, Fit, Fitter
 from sst_graph.diagnosis.hypotheses import best_hypothesis, mirrored
 from sst_graph.diagnosis.poses import wrong_start
-from sst_graph.problem.drive import Drive
+from sst_graph.drive.preparation import Drive
 from sst_graph.types import SemanticClass
 
 

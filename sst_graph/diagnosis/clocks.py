@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.problem.drive import Drive
+from sst_graph.drive.preparation import Drive
 
 FloatArray = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import gtsam
 
-from sst_graph.problem.drive import Drive
+from sst_graph.drive.preparation import Drive
 
 WELL = 0.4
 """Quality above which nothing else is tried: right data have 0.2 (hand-drawn labels, crowded street) to 0.6,

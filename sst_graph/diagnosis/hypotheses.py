@@ -25,7 +25,7 @@ from sst_graph.diagnosis.fit import (
     Fitter,
 )
 from sst_graph.diagnosis.poses import start_finding
-from sst_graph.problem.drive import Drive, ScanFeatures
+from sst_graph.drive.preparation import Drive, ScanFeatures
 
 FloatArray = NDArray[np.float64]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
-from sst_graph.association.mask_shift import MaskShift, mask_shift
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.units import FLAT, usual_ground
-from sst_graph.problem.drive import Drive
-from sst_graph.problem.survey import Survey
+from sst_graph.drive.preparation import Drive
+from sst_graph.drive.survey import Survey
+from sst_graph.features.mask_shift import MaskShift, mask_shift
 from sst_graph.types import SemanticClass
 
 _LEAST_SHIFT_PX = 1.5

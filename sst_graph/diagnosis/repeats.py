@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.problem.drive import Drive
+from sst_graph.drive.preparation import Drive
 
 _LEAST = 3
 """Equal frames in a row: a doubled one now and then is left to the robust matching."""

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
-from sst_graph.problem.drive import Drive
-from sst_graph.problem.survey import Ground, Survey
+from sst_graph.drive.preparation import Drive
+from sst_graph.drive.survey import Ground, Survey
 
 FloatArray = NDArray[np.float64]
 

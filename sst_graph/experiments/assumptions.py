@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Settings, setting
 from sst_graph.data.kept_drive import KeptDrive
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.wrong_drives import WRONG, with_line_delay
-from sst_graph.problem.drive import Progress
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 
 FloatArray = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Settings, setting
-from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
-from sst_graph.problem.drive import Progress
+from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import GroundTruth
 
 FloatArray = NDArray[np.float64]
@@ -64,17 +64,17 @@ class Run:
         error: (7,) in the covariance's own coordinates.
         covariance: (7, 7).
         doubted: whether the status is a doubt.
-        tells_delay: whether the drive can tell the time offset: if not, it is the prior's and not judged.
+        tells_offset: whether the drive can tell the time offset: if not, it is the prior's and not judged.
     """
 
     error: FloatArray
     covariance: FloatArray
     doubted: bool
-    tells_delay: bool = True
+    tells_offset: bool = True
 
     def judged(self, part: slice) -> slice:
         """Those of some of the seven that the drive can tell."""
-        return slice(part.start, part.stop if self.tells_delay else min(part.stop, 6))
+        return slice(part.start, part.stop if self.tells_offset else min(part.stop, 6))
 
     def nees(self, part: slice) -> float:
         """Normalised estimation error squared of some of the seven, over their number."""
@@ -109,7 +109,7 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     result = calibrate_prepared(prepared, start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
     doubted = result.status == "not_converged" or not result.frames_used
-    return Run(error, result.covariance, doubted, tells_delay=drive["motion"] != "standing")
+    return Run(error, result.covariance, doubted, tells_offset=drive["motion"] != "standing")
 
 
 def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:

@@ -9,15 +9,15 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.trajectory import camera_twist
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared, prepare_drives
 from sst_graph.experiments.starts import start_near
+from sst_graph.graph.building import Tracks
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Drive, Progress
-from sst_graph.problem.graph import Tracks
-from sst_graph.problem.trajectory import camera_twist
 from sst_graph.result import CalibrationResult
 from sst_graph.types import GroundTruth, Source
 

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
-from sst_graph.data.simulator import SimulationConfig, simulate
+from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Progress, prepare_drive
 from sst_graph.result import Status
+from sst_graph.simulator import SimulationConfig, simulate
 
 DRIVES: Mapping[str, Mapping[str, Any]] = {
     "turning": {"motion": "turning"},

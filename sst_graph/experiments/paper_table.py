@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 import gtsam
 import numpy as np
 
+from sst_graph.batch import CalibrationConfig, calibrate_prepared
+from sst_graph.batch.config import Method
 from sst_graph.config import Settings, setting
-from sst_graph.data.simulator import SimulationConfig, simulate
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
-from sst_graph.estimators.config import Method
+from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Progress, prepare_drive
 from sst_graph.result import Status
+from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import GroundTruth
 
 PUBLISHED = (

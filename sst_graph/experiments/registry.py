@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
 from sst_graph.experiments import (
     accuracy,
@@ -17,7 +18,6 @@ from sst_graph.experiments import (
     slam,
     windows,
 )
-from sst_graph.problem.drive import Progress
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,9 @@
 """Pose3 SLAM and calibration in one graph against either alone, on simulated streets.
 
-The vehicle drives forward and returns in reverse. LiDAR odometry from scan to scan and loop closures by
-scan registration make a pose graph; silhouettes (:func:`factors.pose_alignment_factor`) and visual odometry
-(:func:`factors.camera_motion_factor`) join the camera to it through extrinsic and time offset.
+The vehicle drives forward and returns in reverse. LiDAR odometry from scan to scan and loop closures by scan
+registration make a pose graph; silhouettes (:func:`sst_graph.factors.pose_alignment_factor`) and visual
+odometry (:func:`sst_graph.factors.camera_motion_factor`) join the camera to it through extrinsic and time
+offset.
 """
 
 from __future__ import annotations
@@ -16,10 +17,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.picture_edges import PictureConfig
+from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
-from sst_graph.data.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.estimators import CalibrationConfig, calibrate_prepared
+from sst_graph.drive.preparation import PrepareConfig, Progress, prepare_drive
 from sst_graph.experiments.slam_graph import (
     DELAY,
     EXTRINSIC,
@@ -28,8 +28,9 @@ from sst_graph.experiments.slam_graph import (
     pose_key,
     with_camera,
 )
+from sst_graph.features.image_edges import PictureConfig
 from sst_graph.odometry import LoopConfig, RegisteredScan, RegistrationConfig, loop_closures, scan_to_scan
-from sst_graph.problem.drive import PrepareConfig, Progress, prepare_drive
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Frame
 
 FloatArray = NDArray[np.float64]

@@ -10,21 +10,21 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors import (
+from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import Drive
+from sst_graph.drive.trajectory import TwistTrack
+from sst_graph.factors import (
     Between,
     GroupedBias,
     RobustKernel,
     camera_motion_factor,
-    delay_prior,
     pose_alignment_factor,
+    time_offset_prior,
 )
-from sst_graph.association.silhouettes import MatchConfig
-from sst_graph.config import Settings, setting
+from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.odometry import LoopClosure, metric_motions
-from sst_graph.problem.align import align_frame
-from sst_graph.problem.drive import Drive
-from sst_graph.problem.objects import ObjectId, object_tracks
-from sst_graph.problem.trajectory import TwistTrack
+from sst_graph.slam.align import align_frame
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -168,8 +168,8 @@ def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
 def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config: CameraGraphConfig) -> None:
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([config.nominal_rad, config.nominal_m], 3))
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, nominal, noise))
-    graph.add(delay_prior(DELAY, 0.0, config.delay_sigma_s))
-    graph.add(delay_prior(BIAS, 0.0, config.bias_sigma_px))
+    graph.add(time_offset_prior(DELAY, 0.0, config.delay_sigma_s))
+    graph.add(time_offset_prior(BIAS, 0.0, config.bias_sigma_px))
 
 
 def _add_silhouettes(

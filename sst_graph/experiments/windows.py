@@ -9,12 +9,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.config import Settings, setting
 from sst_graph.data import open_source
+from sst_graph.drive.preparation import Progress
 from sst_graph.errors import ConfigError
-from sst_graph.estimators import CalibrationConfig, calibrate
 from sst_graph.metrics import CalibrationErrors, calibration_errors
-from sst_graph.problem.drive import Progress
 from sst_graph.result import CalibrationResult
 
 FloatArray = NDArray[np.float64]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
+from sst_graph.covariance.contradiction import Difference, PartAnswer, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError
-from sst_graph.uncertainty.contradiction import Difference, PartAnswer, combined, name_step
 
 FloatArray = NDArray[np.float64]
 

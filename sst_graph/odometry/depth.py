@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from factors.camera import PinholeCamera
 from sst_graph.config import Settings, setting
+from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
-from sst_graph.odometry.movers import MoverConfig, StandingObjects
+from sst_graph.odometry.stationary_objects import MoverConfig, StandingObjects
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]

@@ -8,8 +8,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.config import Settings, setting
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.depth import DepthConfig, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
 from sst_graph.odometry.relative import DirectionMotion, huber_weights, rays, skew

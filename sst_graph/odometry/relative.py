@@ -9,8 +9,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.config import Settings, setting
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks
 
 FloatArray = NDArray[np.float64]

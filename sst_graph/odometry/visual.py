@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
 from sst_graph.config import Settings
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import FeatureConfig, FeatureTracker, Tracks
 from sst_graph.odometry.metric import MetricConfig, metric_motion
 from sst_graph.odometry.relative import DirectionMotion, RelativeConfig, relative_pose

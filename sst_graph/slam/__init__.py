@@ -1,0 +1,1 @@
+"""Alignment terms for a graph of your own."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from sst_graph.config import Settings, setting
-from sst_graph.uncertainty.observability import ObservabilityConfig
+from sst_graph.covariance.observability import ObservabilityConfig
 
 
 @dataclass(frozen=True)

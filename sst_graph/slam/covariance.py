@@ -7,7 +7,7 @@ derivatives, w its weight and sigma its error in the factor, the score of an err
     C = P + P (Var(scores) - sum w J J' / sigma^2) P,
 
 the cluster-robust sandwich about the user's own marginal. The variances are fitted to the residuals as those
-of ``calibrate`` (:func:`sst_graph.uncertainty.covariance.fit_error_model`). They are never below what the
+of ``calibrate`` (:func:`sst_graph.covariance.cluster_robust.fit_error_model`). They are never below what the
 factors claim, for a match, and ``side_sigma_px``, for a side in all images: a short drive shows less than
 there is, for pose and offset are fitted to the same sides.
 
@@ -27,17 +27,17 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.silhouettes import SIDES
+from sst_graph.association.edge_matching import SIDES
+from sst_graph.covariance.cluster_robust import MatchTable, fit_error_model
+from sst_graph.covariance.observability import limits_of_unknowns, weak_directions
 from sst_graph.errors import EstimationError
-from sst_graph.problem.alignment_keys import COLUMNS, AlignmentKeys, bias_column
-from sst_graph.problem.alignment_term import TermMatches, TermRows
-from sst_graph.problem.object_sides import ObjectSides
 from sst_graph.result import WeakDirection
+from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
+from sst_graph.slam.alignment_term import TermMatches, TermRows
 from sst_graph.slam.config import RematchConfig
+from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings
 from sst_graph.types import SemanticClass
-from sst_graph.uncertainty.covariance import MatchTable, fit_error_model
-from sst_graph.uncertainty.observability import limits_of_unknowns, weak_directions
 
 FloatArray = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 At every update the user's factors go in first. Then the terms whose matches have become stale (points moved,
 stamp + offset in another interval, another kernel) are matched again at the new estimate, and their factors
 take the place of the old ones. Kernel, proximal prior and the scale of the information are those of
-:mod:`sst_graph.slam.rematching`.
+:mod:`sst_graph.slam.solving`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
-from sst_graph.problem.alignment_keys import AlignmentKeys
-from sst_graph.problem.alignment_term import AlignmentTerm, TermMatches, TermState
-from sst_graph.problem.object_sides import ObjectSides
+from sst_graph.slam.alignment_keys import AlignmentKeys
+from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.covariance import (
     Robust,
@@ -32,7 +31,8 @@ from sst_graph.slam.covariance import (
     told,
     total,
 )
-from sst_graph.slam.rematching import moved_px, proximal
+from sst_graph.slam.object_sides import ObjectSides
+from sst_graph.slam.solving import moved_px, proximal
 from sst_graph.slam.term_warnings import TermWarning, last_warnings, wide_uncertainty
 
 FloatArray = NDArray[np.float64]

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.problem.alignment_term import TermMatches
+from sst_graph.slam.alignment_term import TermMatches
 from sst_graph.slam.config import RematchConfig
 
 FloatArray = NDArray[np.float64]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sst_graph.uncertainty.inspection import Inspection
+from sst_graph.inspect.inspection import Inspection
 
 MOST_FRAMES = 6
 """Frames drawn; of a longer record the first ones and the last."""

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import MissingDependencyError
-from sst_graph.uncertainty.inspection import HUMAN, NAMES, UNITS, Inspection
-from sst_graph.uncertainty.planning import AT_REST_MPS, Plan
+from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Inspection
+from sst_graph.inspect.planning import AT_REST_MPS, Plan
 from sst_graph.viz.graph_plot import draw_graph
 
 FloatArray = NDArray[np.float64]

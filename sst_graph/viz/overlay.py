@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from factors.camera import PinholeCamera
-from sst_graph.association.contour import ContourMap
 from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.mask_contour import ContourMap
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]

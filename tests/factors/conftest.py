@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Alignment, PinholeCamera
+from sst_graph.factors import Alignment, PinholeCamera
 
 KITTI = PinholeCamera(718.0, 700.0, 607.0, 185.0, 1242, 375)
 # LiDAR x forward, y left, z up -> camera x right, y down, z forward

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import (
+from sst_graph.factors import (
     FactorError,
     GroupedBias,
     RobustKernel,

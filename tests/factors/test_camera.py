@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from factors import PinholeCamera
+from sst_graph.factors import PinholeCamera
 
 CAMERA = PinholeCamera(700.0, 710.0, 600.0, 180.0, 1242, 375)
 

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Between, FactorError, camera_motion_factor, check_jacobians, hand_eye_factor
+from sst_graph.factors import Between, FactorError, camera_motion_factor, check_jacobians, hand_eye_factor
 
 E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)
 X = [gtsam.symbol("x", k) for k in range(8)]

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, check_gradient, check_jacobians, custom_factor
+from sst_graph.factors import FactorError, check_gradient, check_jacobians, custom_factor
 
 KEYS = [gtsam.symbol("x", 0), gtsam.symbol("e", 3)]
 

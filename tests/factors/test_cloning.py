@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from factor_bench import NAMES, Bench, D, E, X
 
-from factors import (
+from sst_graph.factors import (
     FactorError,
     GncParams,
     PackedGraph,
     clone_factor,
     clone_graph,
     custom_factor,
-    delay_prior,
     gnc,
     point_to_pixel_factor,
     recipe_of,
     rekeyed,
+    time_offset_prior,
 )
 
 
@@ -39,7 +39,7 @@ def graph(bench):
     whole = gtsam.NonlinearFactorGraph()
     for name in NAMES:
         whole.add(bench.makers()[name](E, D))
-    whole.add(delay_prior(D, 0.1, 0.05))
+    whole.add(time_offset_prior(D, 0.1, 0.05))
     whole.add(gtsam.PriorFactorPose3(E, bench.cTl, gtsam.noiseModel.Isotropic.Sigma(6, 0.1)))
     whole.remove(1)
     return whole
@@ -101,7 +101,7 @@ def test_a_recipe_names_the_factor(bench):
     recipe = recipe_of(bench.makers()["pose_alignment_factor"](E, D))
     assert recipe is not None and recipe.name == "pose_alignment_factor"
     assert recipe.keys == {X[0]: "X_a", X[1]: "X_b", E: "cTl", D: "offset_s"}
-    assert recipe_of(delay_prior(D, 0.0, 1.0)) is None
+    assert recipe_of(time_offset_prior(D, 0.0, 1.0)) is None
 
 
 def test_the_factor_of_another_is_refused():

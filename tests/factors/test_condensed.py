@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import RobustKernel, condense, delay_prior, frame_factor, velocity_factor
-from factors.condensed import gram
+from sst_graph.factors import RobustKernel, condense, frame_factor, time_offset_prior, velocity_factor
+from sst_graph.factors.condensed import gram
 
 E, D, B = (gtsam.symbol(letter, 0) for letter in "edb")
 
@@ -59,7 +59,7 @@ def graph_of(scenes, bias, condensed):
         values.insert(V, twist + 0.05)
         graph.add(frame_factor([points, contour], E, D, V, [None, B], condensed=condensed))
         graph.add(velocity_factor(V, twist, 0.01 * np.eye(6)))
-    graph.add(delay_prior(D, offset_s, 0.05))
+    graph.add(time_offset_prior(D, offset_s, 0.05))
     return graph, values
 
 

@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, custom_factor
+from sst_graph.factors import FactorError, custom_factor
 
 UNIT2 = gtsam.noiseModel.Unit.Create(2)
 GOOD_H = np.array([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0]])

@@ -6,7 +6,13 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, check_jacobians, delay_drift, delay_prior, extrinsic_drift
+from sst_graph.factors import (
+    FactorError,
+    check_jacobians,
+    extrinsic_drift,
+    time_offset_drift,
+    time_offset_prior,
+)
 
 D = [gtsam.symbol("d", k) for k in range(11)]
 E = [gtsam.symbol("e", k) for k in range(2)]
@@ -15,7 +21,7 @@ E = [gtsam.symbol("e", k) for k in range(2)]
 def test_prior_by_hand():
     values = gtsam.Values()
     values.insert(D[0], np.array([0.13]))
-    factor = delay_prior(D[0], 0.10, 0.01)
+    factor = time_offset_prior(D[0], 0.10, 0.01)
     np.testing.assert_allclose(factor.unwhitenedError(values), [0.03], atol=1e-15)
     assert factor.error(values) == pytest.approx(0.5 * 3.0**2)
 
@@ -25,16 +31,16 @@ def test_later_less_earlier():
     values.insert(D[0], np.array([0.10]))
     values.insert(D[1], np.array([0.13]))
     # 4 s of 0.005 s / sqrt(s): sigma 0.01 s
-    np.testing.assert_allclose(delay_drift(D[0], D[1], 4.0, 0.005).whitenedError(values), [3.0])
+    np.testing.assert_allclose(time_offset_drift(D[0], D[1], 4.0, 0.005).whitenedError(values), [3.0])
 
 
 def test_a_walk_of_many_steps_is_a_walk_of_one():
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    graph.add(delay_prior(D[0], 0.1, 0.02))
+    graph.add(time_offset_prior(D[0], 0.1, 0.02))
     for k, key in enumerate(D):
         values.insert(key, np.array([0.1]))
         if k:
-            graph.add(delay_drift(D[k - 1], key, 0.3, 0.005))
+            graph.add(time_offset_drift(D[k - 1], key, 0.3, 0.005))
     variance = gtsam.Marginals(graph, values).marginalCovariance(D[-1])[0, 0]
     assert variance == pytest.approx(0.02**2 + 10 * 0.3 * 0.005**2, rel=1e-9)
 
@@ -55,15 +61,15 @@ def test_jacobians_at_100_states():
         for k in range(2):
             values.insert(D[k], rng.normal(0.0, 0.2, 1))
             values.insert(E[k], gtsam.Pose3.Expmap(rng.normal(0.0, 0.7, 6)))
-        check_jacobians(delay_prior(D[0], 0.1, 0.01), values, 1e-6)
-        check_jacobians(delay_drift(D[0], D[1], 0.1, 0.01), values, 1e-6)
+        check_jacobians(time_offset_prior(D[0], 0.1, 0.01), values, 1e-6)
+        check_jacobians(time_offset_drift(D[0], D[1], 0.1, 0.01), values, 1e-6)
         check_jacobians(extrinsic_drift(E[0], E[1], 0.1, 0.01, 0.02), values, 1e-6)
 
 
 def test_they_serialize():
     graph = gtsam.NonlinearFactorGraph()
-    graph.add(delay_prior(D[0], 0.1, 0.01))
-    graph.add(delay_drift(D[0], D[1], 0.1, 0.01))
+    graph.add(time_offset_prior(D[0], 0.1, 0.01))
+    graph.add(time_offset_drift(D[0], D[1], 0.1, 0.01))
     graph.add(extrinsic_drift(E[0], E[1], 0.1, 0.01, 0.02))
     copy = gtsam.NonlinearFactorGraph()
     copy.deserialize(graph.serialize())
@@ -73,6 +79,6 @@ def test_they_serialize():
 @pytest.mark.parametrize("seconds", [0.0, -1.0, np.inf])
 def test_time_must_pass(seconds):
     with pytest.raises(FactorError, match="seconds"):
-        delay_drift(D[0], D[1], seconds, 0.01)
+        time_offset_drift(D[0], D[1], seconds, 0.01)
     with pytest.raises(FactorError, match="seconds"):
         extrinsic_drift(E[0], E[1], seconds, 0.01, 0.01)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from factors.errors import FactorError, checked_covariance
+from sst_graph.factors.errors import FactorError, checked_covariance
 
 
 def test_rounding_is_no_asymmetry() -> None:

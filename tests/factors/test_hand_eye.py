@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, check_jacobians, hand_eye_factor, rotation_hand_eye
+from sst_graph.factors import FactorError, check_jacobians, hand_eye_factor, rotation_hand_eye
 
 E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)
 TRUE = gtsam.Pose3(

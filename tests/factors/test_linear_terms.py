@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Alignment, FactorError, LinearTerm, PinholeCamera, RobustKernel, frame_factor
+from sst_graph.factors import Alignment, FactorError, LinearTerm, PinholeCamera, RobustKernel, frame_factor
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 AXES = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))

@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
-from factors import Alignment, FactorError, PinholeCamera
+from sst_graph.factors import Alignment, FactorError, PinholeCamera
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 GOOD = {

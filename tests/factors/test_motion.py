@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import move_points
-from factors.motion import exponential_coefficients, se3_left_jacobian
+from sst_graph.factors import move_points
+from sst_graph.factors.motion import exponential_coefficients, se3_left_jacobian
 
 STILL = np.zeros(6)
 

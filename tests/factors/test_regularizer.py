@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, beta_regularizer, check_jacobians
+from sst_graph.factors import FactorError, beta_regularizer, check_jacobians
 
 E = gtsam.symbol("e", 0)
 STATIC = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.3, -0.2, 1.1), np.array([0.1, -0.2, 0.3]))

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import FactorError, RobustKernel
+from sst_graph.factors import FactorError, RobustKernel
 
 X = np.linspace(-12.0, 12.0, 401)
 ESTIMATORS = {

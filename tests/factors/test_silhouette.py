@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Alignment, FactorError, PinholeCamera, check_jacobians, silhouette_factor
+from sst_graph.factors import Alignment, FactorError, PinholeCamera, check_jacobians, silhouette_factor
 
 E, D, V, B = (gtsam.symbol(letter, 0) for letter in "edvb")
 CAMERA = PinholeCamera(100.0, 100.0, 50.0, 40.0, 101, 81)

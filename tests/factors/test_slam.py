@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import (
+from sst_graph.factors import (
     Alignment,
     FactorError,
     PinholeCamera,

@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import Between, camera_motion_factor, pose_alignment_factor
+from sst_graph.factors import Between, camera_motion_factor, pose_alignment_factor
 
 E, D, IMU_BIAS = gtsam.symbol("E", 0), gtsam.symbol("D", 0), gtsam.symbol("b", 0)
 BTL = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from factor_bench import COVARIANCE, NAMES, NEAR, POSE, TWIST, B, Bench, D, E, V, X
 
-from factors import (
+from sst_graph.factors import (
     Between,
     FactorError,
     GroupedBias,
@@ -15,13 +15,13 @@ from factors import (
     beta_regularizer,
     check_jacobians,
     custom_factor,
-    delay_drift,
-    delay_prior,
     extrinsic_drift,
     frame_factor,
     mean_velocity_factor,
     pose_alignment_factor,
     silhouette_factor,
+    time_offset_drift,
+    time_offset_prior,
     twist_jerk_factor,
     twist_smoothness_factor,
     velocity_direction_factor,
@@ -52,7 +52,7 @@ def test_a_graph_with_a_double_offset_is_solved(bench):
     for double in (False, True):
         graph = gtsam.NonlinearFactorGraph()
         graph.add(factor)
-        graph.add(delay_prior(D, 0.1, 0.05, double=double))
+        graph.add(time_offset_prior(D, 0.1, 0.05, double=double))
         graph.add(gtsam.PriorFactorPose3(E, bench.cTl, gtsam.noiseModel.Isotropic.Sigma(6, 0.01)))
         for k in range(3):
             pose = gtsam.Pose3.Expmap(0.1 * k * TWIST)
@@ -67,7 +67,7 @@ def test_drift_of_a_double():
     values = gtsam.Values()
     values.insert(1, 0.3)
     values.insert(2, 0.5)
-    assert delay_drift(1, 2, 4.0, 0.1, double=True).error(values) == pytest.approx(0.5)
+    assert time_offset_drift(1, 2, 4.0, 0.1, double=True).error(values) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -179,8 +179,8 @@ def test_a_twist_must_be_a_vector(bench):
         lambda key: twist_smoothness_factor(V[1], key, 0.1, 1.0, 1.0),
         lambda key: twist_jerk_factor(V[1], V[2], key, 0.1, 0.1, 1.0, 1.0),
         lambda key: beta_regularizer(key, POSE, 1.0, 1.0),
-        lambda key: delay_prior(key, 0.0, 0.1),
-        lambda key: delay_drift(V[1], key, 1.0, 0.1),
+        lambda key: time_offset_prior(key, 0.0, 0.1),
+        lambda key: time_offset_drift(V[1], key, 1.0, 0.1),
         lambda key: extrinsic_drift(V[1], key, 1.0, 0.1, 0.1),
         lambda key: Between(V[1], key, 0.1, 0.0),
         lambda key: custom_factor(

@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from factors import (
+from sst_graph.factors import (
     FactorError,
     check_jacobians,
     mean_velocity_factor,

@@ -8,9 +8,9 @@ from typing import Any
 
 import gtsam
 
-from factors.camera import PinholeCamera
+from sst_graph.data.frame_parts import AheadReader, image_at, number_at, scan_at
 from sst_graph.errors import ConfigError
-from sst_graph.frame_parts import AheadReader, image_at, number_at, scan_at
+from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep.decision import SweepConfig, SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from sst_graph.config import Settings, setting
 from sst_graph.odometry.cloud import compensate_sweep, usable_points
 from sst_graph.odometry.lidar import MOVABLE_CLASSES, LidarOdometry, LidarOdometryConfig
-from sst_graph.odometry.movers import MoverConfig, standing
+from sst_graph.odometry.stationary_objects import MoverConfig, standing
 from sst_graph.sweep_timing import turned
 from sst_graph.types import Scan
 

@@ -1,0 +1,1 @@
+"""SST-Calib as printed, SemAlign, and the nearest-pixel matching they share."""

@@ -1,0 +1,94 @@
+"""A second opinion on an answer: does the global search, begun there, explain the labels better elsewhere?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, spread
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import Drive
+from sst_graph.initialization.global_search import SearchConfig, search_start
+from sst_graph.initialization.label_agreement import CELLS, SearchFrame, States, Votes
+from sst_graph.types import SemanticClass
+
+
+@dataclass(frozen=True)
+class ChallengeConfig(Settings):
+    """When an answer is believed.
+
+    Attributes:
+        min_ratio: its score, at least, as a fraction of the best that the search finds around it.
+    """
+
+    min_ratio: float = setting(0.9, at_least=0.0, at_most=1.0)
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """Scores of a start, of an answer, and of the best pose that the search finds around the answer.
+
+    All in the units of :class:`~sst_graph.initialization.global_search.Candidate`: 0 is chance.
+    """
+
+    start: float
+    answer: float
+    best: float
+
+    def doubts(self, config: ChallengeConfig) -> list[str]:
+        """Why the answer is not to be believed, in sentences; none for one that stands."""
+        found = []
+        if self.answer < self.start:
+            found.append(
+                f"the labels agree less than at the start (score {self.answer:.3f} against {self.start:.3f})"
+            )
+        if self.answer < config.min_ratio * self.best or self.best <= 0.0:
+            found.append(
+                f"another pose nearby explains the labels better (score {self.best:.3f} against "
+                f"{self.answer:.3f}): give a closer start, or use method joint"
+            )
+        return found
+
+
+def challenge(
+    frames: Sequence[MatchFrame],
+    drives: Sequence[Drive],
+    classes: Sequence[SemanticClass],
+    start: Calibration,
+    answer: Calibration,
+    config: SearchConfig,
+) -> Challenge:
+    """Search the surroundings of an answer, on the frames of the drive that has most.
+
+    Points of all classes vote on the masks: a score that no nearest-pixel method maximises.
+
+    Raises:
+        EstimationError: no frame has a labelled point.
+    """
+    numbers = [frame.pair.drive for frame in frames]
+    richest = max(set(numbers), key=numbers.count)
+    own = spread([frame for frame in frames if frame.pair.drive == richest], config.frames)
+    looked_at = [_search_frame(frame, answer) for frame in own]
+    camera = drives[richest].camera
+    best = search_start(looked_at, camera, classes, answer.cTl, answer.offset_s, config)[0]
+    rng = np.random.default_rng(config.seed)
+    votes = Votes.gather(looked_at, camera, classes, config.points_per_class, rng)
+    scores = votes.level(config.blurs_px[-1], config.shares[-1]).score(_states([start, answer]))
+    cells = len(looked_at) * CELLS[0] * CELLS[1]
+    return Challenge(float(scores[0]) / cells, float(scores[1]) / cells, best.score)
+
+
+def _states(calibrations: Sequence[Calibration]) -> States:
+    return States(
+        np.stack([c.cTl.rotation().matrix() for c in calibrations]),
+        np.stack([c.cTl.translation() for c in calibrations]),
+        np.array([c.offset_s for c in calibrations]),
+    )
+
+
+def _search_frame(frame: MatchFrame, at: Calibration) -> SearchFrame:
+    scan, image = frame.pair.scan, frame.pair.image
+    l_twist = np.asarray(at.cTl.inverse().AdjointMap()) @ frame.c_twist
+    return SearchFrame(scan.lPs, scan.classes, image.mask, frame.pair.base_tau_s, l_twist)

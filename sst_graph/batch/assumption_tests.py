@@ -1,0 +1,306 @@
+"""Do the data contradict what is taken for granted? Each assumption's parameter is let free and looked at.
+
+The problem is solved again with the parameters of all assumptions as variables, from matches far away to
+near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
+parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
+others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
+contradicted most is solved for once more, alone and from where that step leads, to state its estimate.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+from scipy.stats import t as student_t
+
+from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
+from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
+from sst_graph.covariance.cluster_robust import (
+    MatchTable,
+    RobustCovariance,
+    covariance_of,
+    fit_error_model,
+    match_table,
+    robust_covariance,
+)
+from sst_graph.covariance.considered import AssumptionConfig, Considered
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import EstimationError
+from sst_graph.graph.building import Tracks, state_from
+from sst_graph.graph.elimination import Unknowns, marginal_covariance, scaled_inverse
+from sst_graph.graph.outer_loop import JointConfig, JointSolution, solve_joint
+from sst_graph.graph.state import State, nuisance_key
+from sst_graph.objects.tracks import ObjectId
+
+FloatArray = NDArray[np.float64]
+_LOG = logging.getLogger(__name__)
+
+_LEAST_FREEDOM = 8
+"""Degrees of freedom that few objects have: each has several sides, and the error model a floor."""
+_ALL_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
+"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. That it
+still moves after them does not matter: the linear step to one parameter's estimate goes the rest of the way.
+"""
+_ALONE_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
+"""... and of the solution with one of them free, which starts near its end [px]."""
+_SETTLING = 4
+"""Most further outer iterations of the latter at the last scale."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What the data say of one assumption's parameter while all other assumptions hold.
+
+    Attributes:
+        assumption: which.
+        value, sigma: estimate and its deviation, in the parameter's unit.
+        contradicted: whether the assumption is.
+    """
+
+    assumption: Assumption
+    value: float
+    sigma: float
+    contradicted: bool
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        return {**vars(self), "assumption": self.assumption.name}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        for name, value in {**state, "assumption": ASSUMPTIONS[state["assumption"]]}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def score(self) -> float:
+        """Distance of the estimate from zero in deviations."""
+        return abs(self.value) / self.sigma
+
+    @property
+    def sentence(self) -> str:
+        """What it means, and what to do about it."""
+        figure = self.assumption.figure(self.value, self.sigma)
+        return f"{self.assumption.finding}: {figure}; {self.assumption.remedy}"
+
+
+@dataclass(frozen=True)
+class SolvedProblem:
+    """A solved problem whose assumptions are to be tested.
+
+    Attributes:
+        drives, tracks, objects: its data: twists and moving objects, and object tracks by drive.
+        solution: its answer.
+        config: what it was solved with.
+        guess: what its weak priors are centred on.
+    """
+
+    drives: Sequence[Drive]
+    tracks: Tracks
+    objects: Sequence[dict[ObjectId, int]]
+    solution: JointSolution
+    config: JointConfig
+    guess: State
+
+    def solve_with(
+        self, names: Sequence[str], start: State, kernel_px: tuple[float, ...], most_outer: int
+    ) -> JointSolution:
+        """The problem with the parameters of some assumptions as variables, their spans as priors.
+
+        Raises:
+            EstimationError: too few matches at any step.
+        """
+        graph = replace(self.config.graph, estimate=(*self.config.graph.estimate, *names))
+        free = replace(self.config, kernel_px=kernel_px, max_outer=most_outer, graph=graph)
+        return solve_joint(self.drives, start, free, None, self.guess, self.tracks)
+
+
+def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
+    """What the data say of every assumption that the matches test, the most contradicted first."""
+    if not config.test:
+        return ()
+    estimated = dict(named_sigmas(problem.config.graph.estimate))
+    names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
+    try:
+        linear = LinearProblem.of(problem, names)
+        findings = sorted((linear.alone(name, config) for name in names), key=lambda f: -f.score)
+        if findings and findings[0].contradicted:
+            findings[0] = _solved_alone(problem, findings[0], linear.start_of(findings[0]), config)
+        return tuple(findings)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        _LOG.info("assumptions not tested: %s", error)
+        return ()
+
+
+@dataclass(frozen=True)
+class LinearProblem:
+    """The problem with many parameters free, linear about its optimum.
+
+    Attributes:
+        table: its matches.
+        unknowns: columns of the table.
+        information: (n, n) of the unknowns, motion marginalised out, priors included.
+        values: of the free parameters at the optimum, by name.
+        state: the optimum.
+    """
+
+    table: MatchTable
+    unknowns: Unknowns
+    information: FloatArray
+    values: dict[str, float]
+    state: State
+
+    @classmethod
+    def of(cls, problem: SolvedProblem, names: Sequence[str]) -> LinearProblem:
+        """The problem with these parameters free."""
+        before = problem.solution.state
+        start = replace(before, nuisances={**before.nuisances, **dict.fromkeys(names, 0.0)})
+        solution = problem.solve_with(names, start, _ALL_PX, len(_ALL_PX))
+        graph, at, pairs = solution.graph, solution.values, solution.pairs
+        unknowns = Unknowns.of(solution.state, pairs)
+        table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
+        information = scaled_inverse(marginal_covariance(graph, at, unknowns))
+        state = state_from(at, solution.state, pairs)
+        return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
+
+    def alone(self, name: str, config: AssumptionConfig) -> Finding:
+        """Estimate of one parameter while the others of them are zero."""
+        step, kept, bread = self._step_to(name)
+        moved = self.table.moved(step)
+        table = _centred(replace(moved, J=moved.J[:, kept]), bread)
+        covariance = covariance_of(bread, table, fit_error_model(table))
+        column = self.unknowns.column(nuisance_key(name))
+        place = int(np.searchsorted(kept, column))
+        sigma = float(np.sqrt(covariance[place, place]))
+        sigma *= few_objects(int(table.objects.max()) + 1, config.threshold)
+        value = self.values[name] + float(step[column])
+        return Finding(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
+
+    def start_of(self, finding: Finding) -> State:
+        """Where a solution with a finding's parameter alone is to be expected."""
+        step, _, _ = self._step_to(finding.assumption.name)
+        offsets = step[6 : 6 + len(self.state.offsets_s)]
+        return replace(
+            self.state,
+            cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
+            offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
+            nuisances={
+                name: value for name, value in self.state.nuisances.items() if name not in self.values
+            }
+            | {finding.assumption.name: finding.value},
+        )
+
+    def _step_to(self, name: str) -> tuple[FloatArray, NDArray[np.intp], FloatArray]:
+        """Step (n,) of all unknowns to where the other parameters are zero, columns of those that stay
+        unknown, and the inverse of their information.
+
+        With the steps d_o of the others given, the rest moves by d = -Λ_dd^-1 Λ_do d_o.
+        """
+        columns = {each: self.unknowns.column(nuisance_key(each)) for each in self.values}
+        fixed = np.array([column for each, column in columns.items() if each != name], dtype=np.intp)
+        kept = np.setdiff1d(np.arange(self.unknowns.size), fixed)
+        step = np.zeros(self.unknowns.size)
+        step[fixed] = [-value for each, value in self.values.items() if each != name]
+        bread = scaled_inverse(self.information[np.ix_(kept, kept)])
+        step[kept] = -bread @ (self.information[np.ix_(kept, fixed)] @ step[fixed])
+        return step, kept, bread
+
+
+def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
+    """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
+    zero, and the jackknife over objects would take that for a disagreement among them."""
+    return table.moved(-bread @ (table.J.T @ (table.root_weights * table.r)))
+
+
+def _solved_alone(
+    problem: SolvedProblem, finding: Finding, start: State, config: AssumptionConfig
+) -> Finding:
+    """The finding by a solution with its parameter alone; as it was where that ends somewhere else."""
+    name = finding.assumption.name
+    try:
+        solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _SETTLING)
+    except EstimationError as error:
+        _LOG.info("assumption %s: %s", name, error)
+        return finding
+    robust = robust_covariance(
+        solution.graph, solution.values, solution.pairs, solution.state, problem.objects
+    )
+    column = robust.unknowns.column(nuisance_key(name))
+    value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
+    sigma *= few_objects(int(robust.table.objects.max()) + 1, config.threshold)
+    alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
+    same = alike and abs(value) > config.threshold * sigma
+    return replace(finding, value=value, sigma=sigma) if same else finding
+
+
+def few_objects(objects: int, threshold: float) -> float:
+    """By how much a deviation from few objects is to be larger for the same false alarms at a threshold.
+
+    Errors of one object go together for a whole drive, so that there are as many of them as objects, and the
+    estimate over its deviation follows Student's t rather than the normal distribution (Cameron and Miller, A
+    practitioner's guide to cluster-robust inference, 2015).
+    """
+    tail = float(norm.sf(threshold))
+    return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
+
+
+def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
+    """What is considered, with the deviations of the parameters that the data leave open."""
+    evidence = {
+        f.assumption.name: Evidence(
+            f.value,
+            f.sigma,
+            considered.sigmas[f.assumption.name],
+            f.assumption.span,
+            f.assumption.prevalence,
+        )
+        for f in findings
+        if f.assumption.name in considered.sigmas
+    }
+    return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
+
+
+def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """The reason that the data contradict assumptions: the most likely one, and which others would do.
+
+    Args:
+        findings: the most contradicted first.
+    """
+    against = [finding for finding in findings if finding.contradicted]
+    if not against:
+        return ()
+    others = ", ".join(f.assumption.figure(f.value, f.sigma) for f in against[1:])
+    return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
+
+
+def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
+    """JSON-able: what each assumption adds to the covariance, and what the data say of it.
+
+    By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the answer
+    [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.
+    """
+    said = {finding.assumption.name: finding for finding in findings}
+    report: dict[str, Any] = {}
+    for name, sigma in considered.sigmas.items():
+        sensitivity = considered.sensitivities[name][:7]
+        report[name] = {"sigma": sigma, "sensitivity": [float(f"{value:.6g}") for value in sensitivity]}
+        if name in said:
+            finding = said[name]
+            report[name]["estimate"] = float(f"{finding.value:.6g}")
+            report[name]["estimate_sigma"] = float(f"{finding.sigma:.6g}")
+            report[name]["contradicted"] = finding.contradicted
+    return report
+
+
+def estimated_report(robust: RobustCovariance, state: State) -> dict[str, Any]:
+    """JSON-able: value and deviation of the parameters that are unknowns of an answer, by name."""
+    report = {}
+    for name, value in state.nuisances.items():
+        column = robust.unknowns.column(nuisance_key(name))
+        report[name] = {"value": value, "sigma": float(np.sqrt(robust.matrix[column, column]))}
+    return report

@@ -1,0 +1,84 @@
+"""The likely causes of a result that is not to be trusted, for its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gtsam
+
+from sst_graph.batch.answer import Guess
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, other_camera, preflight
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import EstimationError
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.outer_loop import concentration, explained, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.initialization.selection import choose_start, narrowed, prior_centre
+from sst_graph.result import CalibrationResult
+
+_AGREED = 0.3
+"""Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
+streets have 0.1 to 0.2."""
+_SCANS, _CONTENDERS = 6, 160
+"""Scans and candidates of the search in a comparison: one that agrees need not be exact."""
+
+
+def with_causes(
+    result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+) -> CalibrationResult:
+    """The result with what is probably wrong with the data as its first reasons; with any, it is not ok."""
+    by_labels = config.method != "motion"
+    found = preflight(drives, guess.cTl, config.classes if by_labels else ())
+    answered = bool(result.frames_used)
+    if not found and answered:
+        camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
+        found = () if camera is None else (camera,)
+    if not found and config.find_causes and config.method == "joint":
+        found = _suspected(result, drives, guess, config)
+    if not found:
+        return result
+    reasons = (*(finding.sentence for finding in found), *result.reasons)
+    return replace(result, status="not_converged" if answered else result.status, reasons=reasons)
+
+
+def _suspected(
+    result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+) -> tuple[Finding, ...]:
+    """What explains a result that is missing, doubted, or agreed with by few of the labels."""
+    fit = fit_labels(config)
+    if not result.frames_used or result.status == "not_converged":
+        return likely_causes(drives, guess.cTl, guess.offset_s, fit)
+    explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
+    if explained * concentration < _AGREED:
+        answer = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
+        return mirror(drives, guess.cTl, guess.offset_s, fit, answer)
+    return ()
+
+
+def fit_labels(config: CalibrationConfig) -> Fitter:
+    """Search and short solution on a few scans of one drive, with a calibration's own settings."""
+
+    def fit(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit | None:
+        step = -(-len(drive.scans) // _SCANS)
+        search = replace(config.start, contest_scans=_SCANS, contenders=_CONTENDERS)
+        tracks = Tracks([drive])
+        few = [replace(drive, scans=drive.scans[::step])]
+        joint = narrowed(config.joint)
+        joint = replace(joint, max_outer=len(joint.kernel_px))
+        try:
+            contest = choose_start(few, tracks, config.classes, guess, offset_s, joint, search)
+            cTl, found_s = contest.finalists[0]
+            start = State(cTl, (found_s,))
+            solution = solve_joint(few, start, joint, None, prior_centre(start, guess, offset_s), tracks)
+        except EstimationError:
+            return None
+        return Fit(
+            solution.state.cTl,
+            solution.state.offsets_s[0],
+            explained(solution),
+            concentration(solution, few, tracks, joint),
+        )
+
+    return fit

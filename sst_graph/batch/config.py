@@ -1,0 +1,86 @@
+"""Settings of a calibration, stage by stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from sst_graph.baselines.second_search import ChallengeConfig
+from sst_graph.baselines.semalign import SemAlignConfig
+from sst_graph.baselines.sst_calib import PaperConfig
+from sst_graph.batch.contradictions import ContradictionConfig
+from sst_graph.batch.lower_edges import UndersideConfig
+from sst_graph.config import Settings
+from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.covariance.observability import ObservabilityConfig
+from sst_graph.covariance.unknown_motion import UnknownMotionConfig
+from sst_graph.drive.preparation import PrepareConfig
+from sst_graph.graph.outer_loop import JointConfig
+from sst_graph.hand_eye.solution import MotionConfig
+from sst_graph.initialization.candidates import StartConfig
+from sst_graph.odometry.sweep import SweepConfig
+from sst_graph.types import SemanticClass
+
+Method = Literal["joint", "paper", "static", "semalign", "motion"]
+UseMotion = Literal["auto", "always", "never"]
+
+
+@dataclass(frozen=True)
+class CalibrationConfig(Settings):
+    """What to do and how; one part a stage, written beside every result.
+
+    Attributes:
+        method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage),
+            ``semalign`` (sampled starts, points to pixels), ``motion`` (LiDAR odometry
+            against visual odometry).
+        classes: semantic classes to align.
+        delay_per_drive: each drive has a time offset of its own, instead of one for all.
+        use_motion: whether method joint also hears what camera and LiDAR motion say (hand-eye), as a factor
+            and as a check. ``auto``: where the labels alone tell all seven unknowns (a direction that only
+            the motion tells stays reported as unobservable), and the points of a scan share one time (a
+            rolling sweep is compensated by the very motion, which then lags a few milliseconds behind).
+        sweep: how the times of the points are decided where the data bring none.
+        prepare: what is taken from every frame.
+        start: the search for a start.
+        joint: the outer and inner loop.
+        undersides: when method joint matches edges towards the ground.
+        paper: both stages of the paper.
+        semalign: sampled starts.
+        motion: hand-eye calibration.
+        challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
+        assumptions: what is taken for granted: considered in the covariance, tested, or estimated.
+        unknown_motion: what the covariance has beside that of the matches where a single scan tells no
+            motion; both 0 where the vehicle stood.
+        observability: when a direction counts as unobservable.
+        contradictions: when method joint finds that drives, or parts of one, contradict each other.
+        check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
+            no one time offset; not for sensors whose rate goes up and down.
+        find_causes: where a result of method joint is doubted or missing, try changes of the data that would
+            make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
+    """
+
+    method: Method = "joint"
+    classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
+    delay_per_drive: bool = False
+    use_motion: UseMotion = "auto"
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    prepare: PrepareConfig = field(default_factory=PrepareConfig)
+    start: StartConfig = field(default_factory=StartConfig)
+    joint: JointConfig = field(default_factory=JointConfig)
+    undersides: UndersideConfig = field(default_factory=UndersideConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
+    assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
+    unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
+    observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
+    contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
+    check_stamps: bool = True
+    find_causes: bool = True
+
+    @property
+    def estimating(self) -> CalibrationConfig:
+        """The same with a variable in method joint's graph for each assumption that is to be estimated."""
+        graph = replace(self.joint.graph, estimate=self.assumptions.estimate)
+        return replace(self, joint=replace(self.joint, graph=graph))

@@ -1,0 +1,279 @@
+"""Which parts of the data contradict the rest: drives among each other, stretches of time within a drive.
+
+A result assumes one extrinsic for all drives and one time offset (or one a drive), from the first frame to
+the last. Each drive, and each stretch of a drive, is solved by itself, and the answers are compared
+(:mod:`sst_graph.covariance.contradiction`). Matches frozen at the joint answer would not show a large
+step: those beyond the kernel are gone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.parts import Part, Parts, SolvedPart
+from sst_graph.config import Settings, setting
+from sst_graph.covariance.contradiction import Difference, combined, name_step
+from sst_graph.graph.state import State
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ContradictionConfig(Settings):
+    """When parts of the data contradict one another.
+
+    Attributes:
+        check: look for it at all.
+        false_alarm: probability that any part of a calibration seems to contradict the rest where none does,
+            as far as the covariances hold.
+        hint: the same for one drive by its stretches alone, before both sides are solved to be sure.
+        most_stretches: stretches that a drive is cut into.
+        least_scans: fewest scans of a stretch.
+    """
+
+    check: bool = True
+    false_alarm: float = setting(1e-3, at_least=1e-12, at_most=0.5)
+    hint: float = setting(1e-2, at_least=1e-12, at_most=0.5)
+    most_stretches: int = setting(8, at_least=1, at_most=100)
+    least_scans: int = setting(4, at_least=1, at_most=100_000)
+
+
+@dataclass(frozen=True)
+class Contradictions:
+    """What contradicts what.
+
+    Attributes:
+        sentences: one for each contradiction.
+        stretches: what was solved by itself.
+        diagnostics: JSON-able numbers.
+    """
+
+    sentences: tuple[str, ...] = ()
+    stretches: tuple[SolvedPart, ...] = ()
+    diagnostics: dict[str, Any] = field(default_factory=dict)
+
+
+def find_contradictions(parts: Parts, config: ContradictionConfig) -> Contradictions:
+    """Drives against the other drives, and within each drive the run of stretches that differs most."""
+    if not config.check:
+        return Contradictions()
+    # 1. Every stretch of every drive by itself.
+    stretches = [
+        _solved(parts, [Part(number, scans) for scans in _cut(len(drive.scans), config)])
+        for number, drive in enumerate(parts.drives)
+    ]
+    # 2. Within each drive.
+    tests = len(parts.drives) + (len(parts.drives) > 1)
+    false_alarm = config.false_alarm / tests
+    steps = [
+        step
+        for of_drive in stretches
+        if (step := _within(parts, of_drive, config.hint, false_alarm)) is not None
+    ]
+    sentences = [_step_sentence(parts, step) for step in steps]
+    # 3. Each drive against the others.
+    against = _between(parts, stretches)
+    sentences += [
+        _drive_sentence(parts, number, difference)
+        for number, difference in against.items()
+        if difference.p_value * len(against) < false_alarm
+    ]
+    diagnostics = {
+        "within": [_step_document(parts, step) for step in steps],
+        "between": {parts.drives[n].name: _difference_document(d) for n, d in against.items()},
+    }
+    return Contradictions(tuple(sentences), tuple(s for own in stretches for s in own), diagnostics)
+
+
+def _cut(scans: int, config: ContradictionConfig) -> list[tuple[int, ...]]:
+    """Positions of the scans of each stretch, evenly many."""
+    count = max(1, min(config.most_stretches, scans // config.least_scans))
+    return [tuple(stretch.tolist()) for stretch in np.array_split(np.arange(scans), count)]
+
+
+def _solved(parts: Parts, wanted: Sequence[Part]) -> list[SolvedPart]:
+    return [solved for part in wanted if (solved := parts.solve(part)) is not None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A run of scans of a drive that contradicts the others.
+
+    Attributes:
+        drive: number of the drive.
+        scans: first scan of the run and the one after its last, by position.
+        difference: from the others to the run.
+    """
+
+    drive: int
+    scans: tuple[int, int]
+    difference: Difference
+
+
+def _within(parts: Parts, stretches: Sequence[SolvedPart], hint: float, false_alarm: float) -> Step | None:
+    """The run of scans of one drive that contradicts the others most, where one does."""
+    if len(stretches) < 2:
+        return None
+    # 1. The run of stretches that differs most from the rest, as if all stretches were independent.
+    runs = _runs(len(stretches))
+    differences = {run: _of_run(stretches, run) for run in runs}
+    run = min(runs, key=lambda run: differences[run].rank)
+    if differences[run].p_value * len(runs) > hint:
+        return None
+    # 2. Where exactly it begins and ends, and both sides by themselves.
+    inside, outside = ([s.state for s in side] for side in _sides(stretches, run))
+    number, last = stretches[0].part.drive, len(parts.drives[stretches[0].part.drive].scans)
+    first, end = stretches[run[0]].part.scans[0], stretches[run[1] - 1].part.scans[-1] + 1
+    bounds = (0 if run[0] == 0 else first, last if run[1] == len(stretches) else end)
+    states = [
+        parts.best_start(part, starts)
+        for part, starts in zip(_parts_of(number, bounds, last), (inside, outside), strict=True)
+    ]
+    difference = differences[run]
+    for _ in range(_REFINEMENTS):
+        bounds, states = _located(parts, number, states)
+        own, rest = (
+            parts.solve_from(part, state)
+            for part, state in zip(_parts_of(number, bounds, last), states, strict=True)
+        )
+        if own is None or rest is None:
+            return None
+        states, difference = [own.state, rest.state], Difference.of(rest.answer, own.answer)
+        if _located(parts, number, states)[0] == bounds:
+            break
+    # 3. Sure?
+    return Step(number, bounds, difference) if difference.p_value * len(runs) < false_alarm else None
+
+
+_REFINEMENTS = 2
+"""Most times that a step's place is found and both sides of it are solved."""
+
+
+def _runs(stretches: int) -> list[tuple[int, int]]:
+    """(first, one after the last) of all runs of stretches that leave others, each split of a drive once."""
+    return [
+        (i, j)
+        for i in range(stretches)
+        for j in range(i + 1, stretches + 1)
+        if not (i == 0 and j < stretches) and (i, j) != (0, stretches)
+    ]
+
+
+def _sides(
+    stretches: Sequence[SolvedPart], run: tuple[int, int]
+) -> tuple[list[SolvedPart], list[SolvedPart]]:
+    return [*stretches[run[0] : run[1]]], [*stretches[: run[0]], *stretches[run[1] :]]
+
+
+def _of_run(stretches: Sequence[SolvedPart], run: tuple[int, int]) -> Difference:
+    inside, outside = _sides(stretches, run)
+    return Difference.of(combined([s.answer for s in outside]), combined([s.answer for s in inside]))
+
+
+def _parts_of(drive: int, bounds: tuple[int, int], scans: int) -> tuple[Part, Part]:
+    """The run and all other scans."""
+    inside = range(*bounds)
+    return Part(drive, tuple(inside)), Part(drive, tuple(k for k in range(scans) if k not in inside))
+
+
+def _located(parts: Parts, drive: int, states: Sequence[State]) -> tuple[tuple[int, int], list[State]]:
+    """Where a run begins and ends by which of two states each scan agrees with; the run's state first.
+
+    A run that ends with the drive (a split in two) is preferred to one that the same state is resumed after.
+    """
+    scans = len(parts.drives[drive].scans)
+    everything = Part(drive, tuple(range(scans)))
+    own, rest = (parts.support(everything, state) for state in states)
+    gain = np.concatenate([[0.0], np.cumsum(own - rest)])
+    # 1. The best split: the later scans are the run.
+    places = np.arange(_LEAST_SIDE, scans - _LEAST_SIDE + 1)
+    later = gain[-1] - 2.0 * gain[places]
+    split = int(places[np.abs(later).argmax()])
+    swapped = bool(gain[-1] - 2.0 * gain[split] < 0.0)
+    # 2. The best run in the middle.
+    ends = [(a, b) for a in places for b in places if b - a >= _LEAST_SIDE]
+    values = [2.0 * (gain[b] - gain[a]) - gain[-1] for a, b in ends]
+    if values and max(values) > (1.0 + _SECOND_STEP) * float(np.abs(later).max()):
+        first, end = ends[int(np.argmax(values))]
+        return (int(first), int(end)), [*states]
+    return (split, scans), [*states[::-1]] if swapped else [*states]
+
+
+_LEAST_SIDE = 2
+"""Fewest scans on either side of a step."""
+_SECOND_STEP = 0.1
+"""A second step back must raise what agrees with the two answers by this share."""
+
+
+def _between(parts: Parts, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, Difference]:
+    """Each drive against the others together, by the drive's number; those without an answer are left out."""
+    if len(parts.drives) < 2:
+        return {}
+    solved = {}
+    for number, (drive, own) in enumerate(zip(parts.drives, stretches, strict=True)):
+        whole = Part(number, tuple(range(len(drive.scans))))
+        answer = parts.solve_from(whole, parts.best_start(whole, [s.state for s in own]))
+        if answer is not None:
+            solved[number] = answer.answer
+    own_offsets = len(parts.reference.offsets_s) > 1
+    judged = {2: [*solved][1:]}.get(len(solved), [*solved])  # of two, either contradicts the other
+    return {
+        number: Difference.of(
+            combined([solved[k] for k in solved if k != number]), solved[number], own_offsets
+        )
+        for number in judged
+        if len(solved) > 1
+    }
+
+
+def _step_sentence(parts: Parts, step: Step) -> str:
+    drive = parts.drives[step.drive]
+    first, end = step.scans
+    named = name_step(step.difference, parts.reference.cTl)
+    at = drive.scans[first].index
+    if end == len(drive.scans):
+        where = f"frames {drive.scans[0].index} to {drive.scans[first - 1].index} and those from {at} on"
+        what = "the later ones differ"
+    else:
+        where = f"frames {at} to {drive.scans[end - 1].index} and the others"
+        what = "they differ"
+    return f"{drive.name}: {where} contradict each other: {what} in {named.sentence}; {_advice(named.kinds)}"
+
+
+def _advice(kinds: Sequence[str]) -> str:
+    causes = {
+        "rotation": ("the mount was moved", "the masks slide"),
+        "translation": ("the mount was moved",),
+        "offset": ("an image or a scan was lost", "a clock was set"),
+    }
+    likely = " or ".join(dict.fromkeys(cause for kind in kinds for cause in causes[kind]))
+    return f"check whether {likely}, and calibrate the frames before and after apart"
+
+
+def _drive_sentence(parts: Parts, number: int, difference: Difference) -> str:
+    named = name_step(difference, parts.reference.cTl)
+    others = f"drive {parts.drives[0].name!r}" if len(parts.drives) == 2 else "the others"
+    return (
+        f"drive {parts.drives[number].name!r} contradicts {others}: it differs in {named.sentence}; "
+        "calibrate the drives apart, or check whether the mount was moved or a clock was set between them"
+    )
+
+
+def _step_document(parts: Parts, step: Step) -> dict[str, Any]:
+    drive = parts.drives[step.drive]
+    frames = [drive.scans[step.scans[0]].index, drive.scans[step.scans[1] - 1].index]
+    return {"drive": drive.name, "frames": frames, **_difference_document(step.difference)}
+
+
+def _difference_document(difference: Difference) -> dict[str, Any]:
+    return {
+        "step": difference.step.tolist(),
+        "chi2": difference.chi2,
+        "degrees_of_freedom": difference.freedom,
+        "p_value": difference.p_value,
+    }

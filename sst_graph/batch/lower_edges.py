@@ -1,0 +1,153 @@
+"""Edges towards the ground: matched only where image and LiDAR labels mean the same by them.
+
+They tell roll and height better than any other edge. But some labels end an object at its body, others
+at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Nothing but
+the data tells which: where the two sorts of labels agree, most undersides lie within the narrow kernel of
+the last iterations; where they do not, distances are spread as widely as a kernel can see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from sst_graph.association.edge_matching import BOTTOM
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import match_all, outlines_of
+from sst_graph.graph.outer_loop import (
+    CONCENTRATION_SCALES,
+    JointConfig,
+    JointSolution,
+    support_of,
+)
+from sst_graph.graph.state import State
+from sst_graph.initialization.selection import solve_all
+from sst_graph.types import SemanticClass
+
+
+@dataclass(frozen=True)
+class UndersideConfig(Settings):
+    """When edges towards the ground are matched.
+
+    Attributes:
+        use: ``auto`` where the labels agree about them, class by class.
+        min_concentration: ... which is so where this share of what a kernel five times as wide matches
+            remains under the last one.
+        min_support: ... and so many matches remain, each counted by its robust weight.
+        kernel_px: scales of the robust kernel, outer iteration by outer iteration [px].
+    """
+
+    use: Literal["auto", "always", "never"] = "auto"
+    min_concentration: float = setting(0.7, at_least=0.0, at_most=1.0)
+    min_support: float = setting(30.0, at_least=0.001, at_most=1e9)
+    kernel_px: tuple[float, ...] = setting((5.0, 4.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100))
+
+
+def without_undersides(prepare: PrepareConfig) -> PrepareConfig:
+    """Settings for those who never match edges towards the ground: they are not looked for."""
+    return replace(prepare, boundary=replace(prepare.boundary, bottom_edges=False))
+
+
+@dataclass(frozen=True)
+class WithUndersides:
+    """Joint solutions after their undersides were looked at.
+
+    Attributes:
+        solutions: with them among the matches, or as they were; the one that agrees best first.
+        joint: settings that lead to it.
+        concentration: of the undersides of each class that has any.
+    """
+
+    solutions: Sequence[JointSolution]
+    joint: JointConfig
+    concentration: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+
+def with_undersides(
+    drives: Sequence[Drive],
+    tracks: Tracks,
+    finals: Sequence[tuple[JointSolution, State]],
+    joint: JointConfig,
+    config: UndersideConfig,
+    progress: Progress | None = None,
+) -> WithUndersides:
+    """Joint solutions with the edges towards the ground, of classes whose labels agree about them.
+
+    Args:
+        finals: solutions without them, the best first, and what the weak priors of each are centred on.
+
+    Raises:
+        EstimationError: too few matches at any step.
+    """
+    solutions = [solution for solution, _ in finals]
+    chosen, concentration = agreed_undersides(drives, tracks, solutions[0].state, joint, config)
+    if not chosen:
+        return WithUndersides(solutions, joint, concentration)
+    joint = replace(joint, graph=replace(joint.graph, undersides=chosen))
+    last = replace(joint, kernel_px=config.kernel_px)
+    fuller = solve_all(drives, [(one.state, centre) for one, centre in finals], last, tracks, progress)
+    return WithUndersides(fuller, joint, concentration)
+
+
+def agreed_undersides(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
+) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
+    """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
+    if config.use == "never":
+        return (), {}
+    return underside_support(drives, tracks, state, joint).agreed(config)
+
+
+@dataclass(frozen=True)
+class UndersideSupport:
+    """Support of each class's undersides: the matches, each counted by its robust weight.
+
+    Attributes:
+        narrow, wide: under the last kernel and under a wide one.
+    """
+
+    narrow: Mapping[SemanticClass, float] = field(default_factory=dict)
+    wide: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+    def plus(self, other: UndersideSupport) -> UndersideSupport:
+        """That of these scans and others."""
+        return UndersideSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
+
+    def agreed(self, config: UndersideConfig) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
+        """Classes whose labels agree, and the share of the wide support that remains under the last kernel.
+
+        Classes with too little support under the last kernel are left out.
+        """
+        concentration = {
+            c: self.narrow[c] / self.wide[c]
+            for c in sorted(self.narrow)
+            if self.narrow[c] >= config.min_support
+        }
+        least = config.min_concentration if config.use == "auto" else 0.0
+        return tuple(c for c, share in concentration.items() if share >= least), concentration
+
+
+def _summed(a: Mapping[SemanticClass, float], b: Mapping[SemanticClass, float]) -> dict[SemanticClass, float]:
+    return {c: a.get(c, 0.0) + b.get(c, 0.0) for c in {*a, *b}}
+
+
+def underside_support(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig
+) -> UndersideSupport:
+    """Support of the undersides of some scans at a state."""
+    classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
+    graph = replace(joint.graph, undersides=tuple(sorted(classes)))
+    outlines = outlines_of(drives, tracks, graph)
+    narrow, wide = (
+        support_of(
+            match_all(outlines, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1])),
+            state,
+            BOTTOM,
+        )
+        for scale in CONCENTRATION_SCALES
+    )
+    return UndersideSupport(narrow, wide)

@@ -1,0 +1,67 @@
+"""``--method motion``: the hand-eye solution as an answer of ``calibrate``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+
+from sst_graph.batch.answer import Answer, Guess
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.hand_eye.solution import MotionConfig, MotionSolution, difference, rival, solve_motion
+from sst_graph.inspect.gained import KEY, pair_gains, to_document
+from sst_graph.result import FrameId
+
+
+def answer_motion(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> Answer:
+    """LiDAR odometry against visual odometry; no label is looked at but to leave out what may move.
+
+    Raises:
+        EstimationError: too few consecutive frames with known motion.
+    """
+    solutions = solve_motion(drives, guess.cTl, guess.offset_s, config.motion, progress)
+    best = solutions[0]
+    pairs = [term.pair for term in best.terms]
+    frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)
+    gained = pair_gains(best.terms, frames, best.state, config.motion.priors)
+    return Answer(
+        best.state.cTl,
+        best.state.offsets_s[0],
+        best.covariance,
+        frames,
+        doubts=_doubts(solutions, config.motion),
+        diagnostics={
+            "outer_iterations": best.outer_iterations,
+            "pairs": len(pairs),
+            "directions": sum(term.has_direction for term in best.terms),
+            "noise_scales": {"rotation": best.scales.rotation, "direction": best.scales.direction},
+            "turned_deg": _turned_deg(best),
+            KEY: to_document(gained),
+        },
+    )
+
+
+def _turned_deg(solution: MotionSolution) -> float:
+    """How far the vehicle turned in all, to and fro [deg]."""
+    turns = [np.linalg.norm(gtsam.Rot3.Logmap(term.pair.camera.rotation)) for term in solution.terms]
+    return float(np.degrees(np.sum(turns)))
+
+
+def _doubts(solutions: Sequence[MotionSolution], config: MotionConfig) -> tuple[str, ...]:
+    best = solutions[0]
+    doubts = []
+    if not best.converged:
+        doubts.append(f"the outer loop still moved after {best.outer_iterations} iterations")
+    other = rival(solutions, config)
+    if other is not None:
+        step = difference(best.state, other.state)
+        degrees = np.degrees(np.linalg.norm(step[:3]))
+        doubts.append(
+            f"another solution, {degrees:.1f} deg and {1e3 * step[6]:+.0f} ms away, explains the motion "
+            "almost as well: record more turns and changes of speed"
+        )
+    return tuple(doubts)

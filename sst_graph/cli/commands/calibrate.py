@@ -1,0 +1,65 @@
+"""``sst-graph calibrate``: from drives on disk to a calibration."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import logging
+from collections.abc import Sequence
+
+import gtsam
+
+from sst_graph.batch import CalibrationConfig, calibrate
+from sst_graph.cli.inputs import chosen_classes, open_drives, settings, starting_point
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, verdict, write_calibration
+from sst_graph.cli.progress import ProgressBar
+from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.files import atomic_directory
+from sst_graph.inspect.report import Comparison, summary
+from sst_graph.result import WALL_CLOCK, CalibrationResult
+from sst_graph.types import Source
+
+logger = logging.getLogger(__name__)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate ``args.data``, print the summary of the result, write it."""
+    flags = {
+        "method": args.method,
+        "classes": chosen_classes(args.classes),
+        "delay_per_drive": args.delay_per_drive,
+        "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
+    }
+    config = settings(CalibrationConfig(), args, flags)
+    inputs = {"DATA": None, "--init": args.init, "--config": args.config}
+    for path in args.data:
+        check_apart({**inputs, "DATA": path}, {"--out": args.out})
+    with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
+        read_as = options_of(args)
+        sources = open_drives(args)
+        warn_of_other_pairs(args.init, read_as)
+        initial, offset_s = starting_point(args.init, sources[0], args.camera)
+        result, against = calibrate_drives(sources, initial, offset_s, config, args.camera)
+        result = dataclasses.replace(result, read_as=read_as)
+        # The numbers first: what follows may find the disk full.
+        mention(summary(result, against))
+        names = write_calibration(folder, result, sources, against)
+    mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
+    return verdict(result)
+
+
+def calibrate_drives(
+    sources: Sequence[Source],
+    initial: gtsam.Pose3 | None,
+    initial_offset_s: float,
+    config: CalibrationConfig,
+    camera: str,
+) -> tuple[CalibrationResult, Comparison | None]:
+    """The calibration of ``sources``, with progress on stderr, and its errors where they can be known."""
+    with ProgressBar() as progress:
+        result = calibrate(sources, initial, config, initial_offset_s=initial_offset_s, progress=progress)
+    for stage, seconds in result.diagnostics.get(WALL_CLOCK, {}).items():
+        logger.info("%s took %.1f s", stage, seconds)
+    result = dataclasses.replace(result, camera_name=camera)
+    return result, comparison(result, sources)

@@ -1,0 +1,45 @@
+"""``sst-graph evaluate``: a result against the truth."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+
+from sst_graph.cli.inputs import result_at
+from sst_graph.cli.messages import complain, say
+from sst_graph.cli.reading import reading_words
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.inspect.report import error_lines
+from sst_graph.metrics import TruthSigma, calibration_errors
+from sst_graph.reference import read_reference
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print the errors of ``args.result`` against ``args.truth``."""
+    result = result_at(args.result)
+    truth = read_reference(args.truth, result.camera_name)
+    if result.read_as.get("image_shift"):
+        complain(
+            f"warning: {args.result} was made with {reading_words(result.read_as)}: "
+            "the truth's time offset must be that of the same pairs"
+        )
+    sigma = None if args.truth_sigma is None else _truth_sigma(args.truth_sigma)
+    estimate = result.T_camera_lidar, result.time_offset_s
+    errors = calibration_errors(*estimate, truth, result.covariance, sigma)
+    if args.json:
+        say(json.dumps({**dataclasses.asdict(errors), "status": result.status}, allow_nan=False))
+    else:
+        say("\n".join([*error_lines(errors), f"status       {result.status}"]))
+    return 0
+
+
+def _truth_sigma(text: str) -> TruthSigma:
+    """The reference's sigmas from degrees, centimetres and milliseconds."""
+    try:
+        rotation_deg, translation_cm, offset_ms = (float(part) for part in text.split(","))
+        return TruthSigma(rotation_deg, 0.01 * translation_cm, 1e-3 * offset_ms)
+    except (ValueError, DataError):
+        raise ConfigError(
+            f"--truth-sigma {text!r:.60}: expected three numbers of 0 or more: ROT_DEG,TRANS_CM,MS"
+        ) from None

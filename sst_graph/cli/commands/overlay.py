@@ -1,0 +1,51 @@
+"""``sst-graph overlay``: the LiDAR in the image, before and after."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sst_graph.cli.inputs import result_at, result_file
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import PNG_FILE, check_apart
+from sst_graph.cli.pictures import overlay, png, position_of
+from sst_graph.cli.reading import open_drive_of
+from sst_graph.data.frame_parts import RecentReader
+from sst_graph.errors import ConfigError
+from sst_graph.files import output_file
+from sst_graph.odometry.sweep import with_sweep_of
+from sst_graph.reference import load_initial
+from sst_graph.result import CalibrationResult
+from sst_graph.types import Source
+from sst_graph.viz import Placement
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the picture of one frame to ``args.out``."""
+    if args.out.suffix.lower() != ".png":
+        raise ConfigError(f"--out {args.out}: expected a name that ends in .png")
+    inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
+    check_apart(inputs, {"--out": args.out})
+    with output_file(args.out, args.overwrite, PNG_FILE) as out:
+        result = result_at(args.result)
+        source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
+        drive = RecentReader(source)
+        position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
+        before = _before(args.before, result, source)
+        out.write_bytes(png(overlay(drive, position, result, before)))
+    mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
+    return 0
+
+
+def _before(choice: str, result: CalibrationResult, source: Source) -> Placement | None:
+    """What to compare with; None for a result that had no start."""
+    if choice == "initial":
+        if result.initial is None:
+            return None
+        return Placement(result.initial, result.initial_offset_s, "before (start)")
+    if choice == "dataset":
+        if source.nominal is None:
+            raise ConfigError(f"{source.name} brings no nominal calibration to compare with")
+        return Placement(source.nominal, 0.0, "before (nominal)")
+    cTl, offset_s = load_initial(Path(choice), result.camera_name)
+    return Placement(cTl, offset_s, f"before ({Path(choice).name})")

@@ -1,0 +1,173 @@
+"""``sst-graph track``: calibration frame by frame, one JSON line a frame."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.messages import complain, say
+from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
+from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
+from sst_graph.errors import ConfigError
+from sst_graph.files import output_file
+from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
+from sst_graph.result import CalibrationResult, Status
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
+from sst_graph.tracker.storage.resume import Setup, check_setup, frames_to_come
+from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.tracker import Tracker
+from sst_graph.types import Frame, Source
+
+_OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
+
+
+def run(args: argparse.Namespace) -> int:
+    """Track ``args.data``; 0 if the last estimate may be trusted, else 3."""
+    _check(args)
+    with ExitStack() as outputs:
+        out = None
+        if args.out is not None:
+            out = outputs.enter_context(output_file(args.out, args.overwrite, RESULT_FILE))
+        if args.checkpoint is not None:
+            # Taken for the whole run: no other tracker may save there.
+            replace = args.resume or args.overwrite
+            outputs.enter_context(output_file(args.checkpoint, replace, CHECKPOINT_FILE))
+        read_as = options_of(args)
+        tracker, source, frames = _begun(args, open_drive(args, args.data))
+        tracker, last = _track(args, source, tracker, frames)
+        result = _with_decision(tracker_result(tracker, source.name, args.camera), source)
+        result = dataclasses.replace(result, read_as=read_as)
+        if out is not None:
+            out.write_text(result.to_json())
+    return _verdict(last, result)
+
+
+def _track(
+    args: argparse.Namespace, source: SweptSource, tracker: Tracker, frames: Iterator[Frame]
+) -> tuple[Tracker, TrackUpdate]:
+    """Add the frames, and save the tracker as it goes; the settled tracker after the last, and its answer.
+
+    What the last line says is what is written. With a checkpoint the tracker that settles is the one that the
+    file holds, its arrays laid out as in the file: the result is the same to the last bit whether the run was
+    broken off and resumed or not.
+    """
+    update = None
+    with ExitStack() as outputs:
+        saver = None if args.checkpoint is None else outputs.enter_context(Saver(args.checkpoint))
+        for number, (frame, is_last) in enumerate(_with_last(frames), 1):
+            if saver is not None:
+                saver.follow(tracker)
+            update = tracker.add(frame)
+            if saver is not None and (is_last or number % args.checkpoint_every == 0):
+                saver.save(tracker)
+            if is_last:
+                tracker, update = _settled(args, source, tracker, update, saver)
+            say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
+        if update is not None:
+            return tracker, update
+        # A save consolidates the tracker: what is saved already is not saved again.
+        if saver is not None and not args.checkpoint.exists():
+            saver.save(tracker)
+        return _settled(args, source, tracker, None, saver)
+
+
+def _settled(
+    args: argparse.Namespace,
+    source: SweptSource,
+    tracker: Tracker,
+    update: TrackUpdate | None,
+    saver: Saver | None,
+) -> tuple[Tracker, TrackUpdate]:
+    """The tracker that is saved, or the one given where none is, settled; and the last answer from it."""
+    if saver is not None:
+        saver.finish()
+        tracker = load_checkpoint(args.checkpoint)
+    tracker.settle()
+    last = tracker.current(update)
+    if last.status == "ok" and _is_open(source):
+        last = dataclasses.replace(last, status="unconfirmed", doubt=_OPEN_SWEEP)
+    return tracker, last
+
+
+def _check(args: argparse.Namespace) -> None:
+    if args.resume and args.checkpoint is None:
+        raise ConfigError("--resume needs --checkpoint FILE")
+    if args.checkpoint_every < 1:
+        raise ConfigError(f"--checkpoint-every {args.checkpoint_every}: expected 1 or more")
+    if args.checkpoint is not None and args.checkpoint.exists() and not (args.resume or args.overwrite):
+        raise ConfigError(f"{args.checkpoint}: found a file, expected none (or --resume, or --overwrite)")
+    check_apart(
+        {"DATA": args.data, "--init": args.init, "--config": args.config},
+        {"--out": args.out, "--checkpoint": args.checkpoint},
+    )
+
+
+def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSource, Iterator[Frame]]:
+    """The tracker of the checkpoint where one is resumed and exists, else a new one; its drive and frames.
+
+    Raises:
+        DataError: the checkpoint is of another drive, other sensors, settings or another guess.
+    """
+    flags = {
+        "calibration.classes": chosen_classes(args.classes),
+        "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
+    }
+    config = settings(TrackerConfig(), args, flags)
+    if args.init is not None:
+        warn_of_other_pairs(args.init, options_of(args))
+    if not (args.resume and args.checkpoint.exists()):
+        initial, offset_s = starting_point(args.init or "dataset", source, args.camera)
+        tracker = Tracker(source.camera, config, initial, offset_s)
+        swept = with_sweep(source, config.calibration.sweep)
+        return tracker, swept, iter(swept)
+    tracker = load_checkpoint(args.checkpoint)
+    made = tracker.setup
+    initial, offset_s = made.initial, made.initial_offset_s
+    if args.init is not None:
+        initial, offset_s = starting_point(args.init, source, args.camera)
+    # What is not asked for is the checkpoint's.
+    asked = settings(made.config, args, flags)
+    check_setup(tracker, Setup(source.camera, asked, initial, offset_s), args.checkpoint)
+    swept = with_sweep(source, made.config.calibration.sweep)
+    return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
+
+
+def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:
+    """Each frame, and whether it is the last; it is given before an error of the one behind it is raised."""
+    waiting = next(frames, None)
+    while waiting is not None:
+        try:
+            following = next(frames, None)
+        except Exception:
+            yield waiting, False
+            raise
+        yield waiting, following is None
+        waiting = following
+
+
+def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
+    """The result with what was decided of the sweep; not to be trusted where the scans did not tell it."""
+    diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: source.sweep_decision.to_dict()}}
+    result = dataclasses.replace(result, diagnostics=diagnostics)
+    if not _is_open(source):
+        return result
+    status: Status = "not_converged" if result.status == "ok" else result.status
+    return dataclasses.replace(result, status=status, reasons=(*result.reasons, _OPEN_SWEEP))
+
+
+def _is_open(source: SweptSource) -> bool:
+    """Whether the scans leave it open, and it makes a difference."""
+    return source.sweep_decision.kind == "undecided" and bool(source.sweep_decision.others)
+
+
+def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
+    if last.status == "ok":
+        return 0
+    complain(f"{last.status}: {'; '.join(result.reasons)}")
+    return 3

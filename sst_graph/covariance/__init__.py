@@ -1,0 +1,1 @@
+"""How sure an estimate is: cluster-robust, assumptions considered, weak directions named."""

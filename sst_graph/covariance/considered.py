@@ -1,0 +1,213 @@
+"""How an answer follows the assumptions it rests on, and what that adds to its covariance.
+
+A parameter theta that is held at 0 but has deviation sigma moves the answer by (dx/dtheta) theta: Schmidt's
+considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
+the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the covariance that
+the solve itself claims,
+
+    dx/dtheta = -P J'c,      P_considered = sum sigma^2 (dx/dtheta)(dx/dtheta)'.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, make_dataclass, replace
+from typing import TYPE_CHECKING
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
+from sst_graph.config import Settings, setting
+from sst_graph.covariance.cluster_robust import MatchTable, RobustCovariance
+from sst_graph.graph.building import GraphConfig, PairMatches, joint_graph
+from sst_graph.graph.elimination import marginal_covariance
+from sst_graph.graph.nuisances import residual_columns
+from sst_graph.graph.state import State, twist_key
+
+FloatArray = NDArray[np.float64]
+
+BUDGET = "sigma_budget"
+"""Key of :func:`budget` among a result's diagnostics."""
+
+
+_Sigmas = make_dataclass(
+    "AssumptionSigmas",
+    [
+        (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
+        for name, each in ASSUMPTIONS.items()
+    ],
+    bases=(Settings,),
+    namespace={"__module__": __name__},
+    frozen=True,
+)
+if TYPE_CHECKING:
+
+    class AssumptionSigmas(Settings):
+        """Deviation of each assumption's parameter, by its name, in its unit; 0: it holds exactly."""
+else:
+    AssumptionSigmas = _Sigmas
+
+
+@dataclass(frozen=True)
+class AssumptionConfig(Settings):
+    """What is taken for granted, and how far it may be wrong.
+
+    Attributes:
+        sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
+            what a careful set-up leaves (``sst_graph.assumptions`` names their sources).
+        estimate: assumptions whose parameters are variables of the answer: ``name``, or ``name=sigma`` with
+            the deviation from 0 beforehand, in its unit.
+        test: test the assumptions against the data.
+        threshold: an estimate of a parameter farther from 0 than this many of its deviations contradicts
+            the assumption; with ten tests, 3.3 gives one false alarm in a hundred drives.
+    """
+
+    sigmas: AssumptionSigmas = field(default_factory=AssumptionSigmas)
+    estimate: tuple[str, ...] = ()
+    test: bool = True
+    threshold: float = setting(3.3, at_least=1.0, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        named_sigmas(self.estimate)
+
+    def sigma(self, name: str) -> float:
+        """Deviation of an assumption's parameter."""
+        return float(getattr(self.sigmas, name))
+
+    @property
+    def estimated(self) -> tuple[tuple[str, float], ...]:
+        """Assumptions whose parameters are variables, with the deviation of each beforehand."""
+        return named_sigmas(self.estimate)
+
+
+@dataclass(frozen=True)
+class Considered:
+    """What the assumptions add to a covariance.
+
+    Attributes:
+        sensitivities: how extrinsic and offsets (n,) follow each parameter, by name [rad, m, s per unit].
+        sigmas: deviations of the parameters.
+    """
+
+    sensitivities: Mapping[str, FloatArray]
+    sigmas: Mapping[str, float]
+
+    def part(self, name: str) -> FloatArray:
+        """(n, n) covariance by one assumption."""
+        step = self.sigmas[name] * self.sensitivities[name]
+        return np.outer(step, step)
+
+    def covariance(self, size: int) -> FloatArray:
+        """(size, size) covariance by all of them."""
+        return np.asarray(sum((self.part(name) for name in self.sigmas), np.zeros((size, size))))
+
+
+def columns_of(
+    pairs: Sequence[PairMatches], values: gtsam.Values, state: State, names: Sequence[str]
+) -> FloatArray:
+    """(m, k) derivatives of all matches' residuals by assumptions' parameters [px per unit], unweighted.
+
+    In the order of :func:`~sst_graph.covariance.cluster_robust.match_table`.
+    """
+    blocks = [np.zeros((0, len(names)))]
+    for pair in pairs:
+        assert pair.scene is not None
+        c_twist = values.atVector(twist_key(pair.drive, pair.pair.image))
+        at = state.cTl, state.offset_s(pair.drive), c_twist
+        for matches in pair.matches.values():
+            found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
+            blocks.append(np.stack([found[name] for name in names], axis=1))
+    return np.concatenate(blocks)
+
+
+def weighted_columns(table: MatchTable, pairs: Sequence[PairMatches], columns: FloatArray) -> FloatArray:
+    """Columns (m, k) multiplied by sqrt(weight) / sigma, as the table's rows are."""
+    sigmas = np.concatenate([m.alignment.sigmas_px for pair in pairs for m in pair.matches.values()])
+    return np.asarray(columns * (table.root_weights / sigmas)[:, None])
+
+
+def consider(
+    robust: RobustCovariance,
+    pairs: Sequence[PairMatches],
+    values: gtsam.Values,
+    state: State,
+    config: AssumptionConfig,
+) -> Considered:
+    """How an answer follows every assumption that is not estimated beside it.
+
+    Args:
+        robust: its covariance and matches.
+        pairs, values, state: its last frozen problem.
+    """
+    names = held_at_zero(config.estimate)
+    columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
+    size = 6 + len(state.offsets_s)
+    steps = steps_by(names, robust.bread, robust.table.J.T @ columns, size)
+    return considered(steps, config)
+
+
+def steps_by(
+    names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int
+) -> dict[str, FloatArray]:
+    """How the first ``size`` unknowns follow parameters that are held at 0: (size,) each, by name.
+
+    Args:
+        bread: (n, n) inverse of the information of the unknowns, motion marginalised out.
+        shared: (n, k) information that the unknowns share with the parameters.
+    """
+    return dict(zip(names, -(bread @ shared)[:size].T, strict=True))
+
+
+def considered(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
+    """What parameters that are held at 0 add to a covariance.
+
+    Args:
+        steps: by :func:`steps_by`.
+    """
+    return Considered(steps, {name: config.sigma(name) for name in steps})
+
+
+def motion_covariance(
+    robust: RobustCovariance, pairs: Sequence[PairMatches], state: State, config: GraphConfig
+) -> FloatArray:
+    """(n, n) part of the covariance that is there because the LiDAR's motion is measured, not known.
+
+    The difference to the same problem with a motion a thousand times as well known.
+    """
+    known = [
+        replace(pair, l_twist=replace(pair.l_twist, covariance=1e-6 * pair.l_twist.covariance))
+        if pair.l_twist is not None
+        else pair
+        for pair in pairs
+    ]
+    graph, values = joint_graph(known, state, config)
+    return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
+
+
+def budget(
+    covariance: FloatArray, motion: FloatArray, considered: Considered
+) -> dict[str, list[float]]:
+    """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
+
+    Args:
+        covariance: (n, n) of matches and motion.
+        motion: (n, n) part of it, by :func:`motion_covariance`.
+        considered: by the assumptions.
+    """
+    moved = np.clip(np.diag(motion)[:7], 0.0, np.diag(covariance)[:7])
+    parts = {"matches": np.diag(covariance)[:7] - moved, "motion": moved}
+    parts |= {name: np.diag(considered.part(name))[:7] for name in considered.sigmas}
+    return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}
+
+
+def remainder(total: FloatArray, told: FloatArray) -> dict[str, list[float]]:
+    """JSON-able part of a budget: what a covariance (7, 7) has beyond another (n, n), where there is any.
+
+    The motion around single scans that nothing measures, and sweeps that nothing tells.
+    """
+    left = np.clip(np.diag(total) - np.diag(told)[:7], 0.0, None)
+    if not left.any():
+        return {}
+    return {"unmeasured motion and sweep": [float(f"{value:.6g}") for value in np.sqrt(left)]}

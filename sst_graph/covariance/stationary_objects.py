@@ -1,0 +1,50 @@
+"""What is known by objects that stand alone.
+
+An oncoming vehicle whose velocity is known may tell the time offset from the translation where nothing that
+stands does: on a straight road at one speed. Its velocity was estimated along the way, and what that alone
+tells is not called known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, gram
+from sst_graph.graph.building import PairMatches
+
+FloatArray = NDArray[np.float64]
+
+_ALL = 1.0 - 1e-6
+"""Largest share of what is known of a direction that is taken away."""
+
+
+def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) -> FloatArray:
+    """(n, n) covariance of the unknowns without the matches of objects that move with a known velocity.
+
+    Args:
+        robust: with all of them.
+        pairs: its matches.
+    """
+    moves = np.concatenate([moving_matches(pair) for pair in pairs])
+    if not moves.any():
+        return robust.matrix
+    if moves.all():
+        return np.asarray(robust.matrix / (1.0 - _ALL))
+    J = robust.table.J[np.flatnonzero(moves)]
+    root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
+    shares, axes = np.linalg.eigh(root.T @ gram(J) @ root)
+    wider = root @ (axes / np.sqrt(1.0 - np.minimum(shares, _ALL)))
+    return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
+
+
+def moving_matches(pair: PairMatches) -> NDArray[np.bool_]:
+    """(m,) whether the object of each match moves with a known velocity, class by class."""
+    found = []
+    for matches in pair.matches.values():
+        velocities = matches.alignment.l_velocities
+        none = np.zeros(len(matches), np.bool_)
+        found.append(none if velocities is None else np.asarray(velocities.any(axis=1), np.bool_))
+    return np.concatenate(found)

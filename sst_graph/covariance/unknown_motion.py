@@ -1,0 +1,58 @@
+"""What a scan without neighbours leaves open: how the vehicle moved between it and its image.
+
+The scan is taken as standing, and no residual shows that it was not: the answer takes up speed times interval
+whole. The interval is known as well as the time offset, so this is a product of two unknowns, which no
+linearization about standing sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.graph.building import PairMatches
+from sst_graph.graph.state import State
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class UnknownMotionConfig(Settings):
+    """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood.
+
+    Attributes:
+        speed_mps: deviation of its speed along each axis [m/s].
+        turn_deg_per_s: of its rate of turning about each axis [deg/s].
+    """
+
+    speed_mps: float = setting(10.0, at_least=0.0, at_most=200.0)
+    turn_deg_per_s: float = setting(6.0, at_least=0.0, at_most=360.0)
+
+
+def unknown_motion_covariance(
+    pairs: Sequence[PairMatches], state: State, variance_s2: float, config: UnknownMotionConfig
+) -> FloatArray:
+    """(7, 7) covariance of extrinsic and offset by motion that nothing measures, to be added to the matches'.
+
+    In the LiDAR's frame the scan lies ``twist * interval`` beside where it is taken to be: a step of the
+    extrinsic's tangent (right perturbation: rotation [rad], translation [m]) of this variance.
+
+    Args:
+        pairs: matches of an answer.
+        state: the answer, for its time offsets.
+        variance_s2: of the time offset [s^2].
+    """
+    covariance = np.zeros((7, 7))
+    alone = [pair for pair in pairs if pair.l_twist is None]
+    if not alone:
+        return covariance
+    share = sum(len(pair) for pair in alone) / sum(len(pair) for pair in pairs)
+    intervals = [pair.pair.base_tau_s + state.offset_s(pair.drive) for pair in alone]
+    square_s2 = variance_s2 + float(np.square(intervals).max())
+    rates = np.repeat([np.radians(config.turn_deg_per_s), config.speed_mps], 3)
+    covariance[:6, :6] = np.diag((share * rates) ** 2 * square_s2)
+    return covariance

@@ -1,0 +1,1 @@
+"""What is kept of a drive: features, motion, and what its raw frames show."""

@@ -1,0 +1,371 @@
+"""What the estimators keep of a drive: boundary points, contours, a few points, motion; in one pass."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.drive.survey import Survey, Surveyor
+from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
+from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.image_edges import PictureConfig
+from sst_graph.features.lidar_edges import Boundaries, BoundaryConfig, Edge, find_boundaries
+from sst_graph.features.mask_contour import ContourMap
+from sst_graph.files.array_store import Shelf, shelvable
+from sst_graph.files.object_store import PackedArray
+from sst_graph.odometry.features import FeatureTracker
+from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
+from sst_graph.odometry.relative import relative_pose
+from sst_graph.odometry.sweep import SweepDecision, SweptSource
+from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
+from sst_graph.validation import checked_image, checked_scan
+
+_LOG = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+"""Called with (stage, steps done, steps in all)."""
+
+
+@dataclass(frozen=True)
+class PrepareConfig(Settings):
+    """What is taken from every frame.
+
+    Attributes:
+        boundary: boundary points.
+        picture: how the masks' contours follow the picture.
+        lidar_odometry: motion between scans.
+        visual_odometry: motion between images.
+        use_visual_odometry: track image features at all.
+        sample_points: most labelled points of a scan kept for search and checks, of each class.
+    """
+
+    boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
+    picture: PictureConfig = field(default_factory=PictureConfig)
+    lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
+    visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
+    use_visual_odometry: bool = True
+    sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
+
+
+@shelvable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
+@dataclass(frozen=True)
+class ScanFeatures:
+    """What is kept of a scan.
+
+    Attributes:
+        index: of its frame in the drive.
+        stamp_ns: LiDAR-clock stamp.
+        boundaries: boundary points of each class, without those towards the ground.
+        lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
+        depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
+            features are not tracked [m], [s].
+        undersides: boundary points of each class towards the ground, of objects that have others too.
+    """
+
+    stored_apart: ClassVar[bool] = True
+
+    index: int
+    stamp_ns: int
+    boundaries: dict[SemanticClass, Boundaries]
+    lPs: FloatArray
+    classes: NDArray[np.uint8]
+    offsets_s: FloatArray
+    depth_lPs: NDArray[np.float32]
+    depth_offsets_s: NDArray[np.float32]
+    undersides: dict[SemanticClass, Boundaries] = field(default_factory=dict)
+
+    def on(self, shelf: Shelf) -> ScanFeatures:
+        """The same with its points on a shelf, in the precision of the scan's."""
+        return replace(
+            self,
+            lPs=shelf.put(self.lPs.astype(np.float32), np.float64),
+            classes=shelf.put(self.classes),
+            offsets_s=shelf.put(self.offsets_s.astype(np.float32), np.float64),
+            depth_lPs=shelf.put(self.depth_lPs),
+            depth_offsets_s=shelf.put(self.depth_offsets_s),
+        )
+
+
+@shelvable("mask")
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What is kept of an image: its mask and the signed distance to each class's contour.
+
+    Of the picture no more is kept than what it shows along the contours.
+    """
+
+    stored_apart: ClassVar[bool] = True
+
+    index: int
+    stamp_ns: int
+    mask: NDArray[np.uint8]
+    contours: dict[SemanticClass, ContourMap]
+
+    def on(self, shelf: Shelf) -> ImageFeatures:
+        """The same with mask and distances on a shelf."""
+        contours = {c: contour.on(shelf) for c, contour in self.contours.items()}
+        return replace(self, mask=shelf.put(self.mask), contours=contours)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The mask, packed, and the picture's edges, not the distances that follow from them."""
+        edges = {c: contour.edges for c, contour in self.contours.items()}
+        return {"index": self.index, "stamp_ns": self.stamp_ns, "mask": self.packed, "contours": edges}
+
+    @cached_property
+    def packed(self) -> PackedArray:
+        """The mask, compressed once: that takes longer than all else of storing an image."""
+        return PackedArray.of(self.mask)
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        mask = state["mask"]
+        if isinstance(mask, PackedArray):
+            mask = mask.array()
+        fields = {c: ContourMap.of(mask, c, edges=edges) for c, edges in state["contours"].items()}
+        contours = {c: field for c, field in fields.items() if field is not None}
+        for name, value in {**state, "mask": mask, "contours": contours}.items():
+            object.__setattr__(self, name, value)
+
+
+@dataclass
+class LeftOut:
+    """What a drive lacked, counted while it was read; the rest of it was used.
+
+    Attributes:
+        points: that were NaN or inf.
+        scans_with_such_points: scans that held some.
+        scans_without_labels: these show motion only.
+        images_without_mask: nothing is associated with these.
+        images_without_picture: these have no image features, and contours that follow the mask alone.
+    """
+
+    points: int = 0
+    scans_with_such_points: int = 0
+    scans_without_labels: int = 0
+    images_without_mask: int = 0
+    images_without_picture: int = 0
+
+    def add(self, frame: Frame) -> None:
+        """Count what a frame lacks; a scan without points lacks nothing."""
+        if frame.scan is not None:
+            self.points += frame.scan.left_out
+            self.scans_with_such_points += frame.scan.left_out > 0
+            self.scans_without_labels += len(frame.scan.points) > 0 and not frame.scan.has_labels
+        if frame.image is not None:
+            self.images_without_mask += not frame.image.has_mask
+            self.images_without_picture += not frame.image.has_picture
+
+    def counts(self) -> dict[str, int]:
+        """What was found missing at least once, by name."""
+        return {name: int(count) for name, count in vars(self).items() if count}
+
+    def __str__(self) -> str:
+        return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items())
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive, reduced to what calibration needs.
+
+    Attributes:
+        name: of the source.
+        camera: of all images.
+        scans, images: in the order of their stamps.
+        lidar_motions: between consecutive scans; empty for a single scan.
+        image_pairs: tracks between consecutive images; empty for a single image.
+        left_out: what the data lacked.
+        survey: what the raw frames show, for the search for causes; None where nobody looked.
+        sweep: what was decided of the times of the points, or None where nobody asked.
+        origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
+    """
+
+    name: str
+    camera: PinholeCamera
+    scans: tuple[ScanFeatures, ...]
+    images: tuple[ImageFeatures, ...]
+    lidar_motions: tuple[RelativeMotion, ...]
+    image_pairs: tuple[ImagePair, ...]
+    left_out: LeftOut = field(default_factory=LeftOut)
+    survey: Survey | None = None
+    sweep: SweepDecision | None = None
+    origin_ns: int | None = None
+
+    @property
+    def scan_stamps_ns(self) -> list[int]:
+        return [scan.stamp_ns for scan in self.scans]
+
+    @property
+    def image_stamps_ns(self) -> list[int]:
+        return [image.stamp_ns for image in self.images]
+
+    @cached_property
+    def image_period_s(self) -> float:
+        """Median interval between images [s]; 0.1 for a single one."""
+        stamps = self.image_stamps_ns
+        return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def part(self, scans: Sequence[int]) -> Drive:
+        """The drive with some of its scans only, by position, rising; all images and motions stay."""
+        return replace(self, scans=tuple(self.scans[position] for position in scans))
+
+    @cached_property
+    def scan_period_s(self) -> float:
+        """Median interval between scans [s]; 0.1 for a single one."""
+        stamps = self.scan_stamps_ns
+        return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
+
+    def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
+        """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
+
+        Args:
+            growing: has seen most of the motions before.
+        """
+        return (growing or GrowingTrack()).of(self.lidar_motions)
+
+
+def prepare_drive(
+    source: Source,
+    classes: Sequence[SemanticClass],
+    config: PrepareConfig | None = None,
+    progress: Progress | None = None,
+    depth: bool = True,
+) -> Drive:
+    """Read every frame of a source once and keep what calibration needs, most of it on a shelf.
+
+    Args:
+        depth: keep points for the depth of image features, where these are tracked.
+
+    Raises:
+        DataError: the source has no scan or no image, its stamps do not rise, or the arrays of one are not
+            what they must be (:mod:`sst_graph.validation`).
+    """
+    config = config or PrepareConfig()
+    odometry = LidarOdometry(config.lidar_odometry)
+    tracker = FeatureTracker(config.visual_odometry.features)
+    scans, images, motions, pairs = [], [], [], []
+    total = len(source)
+    left_out, surveyor, shelf = LeftOut(), Surveyor(total), Shelf()
+    for position, frame in enumerate(source):
+        frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
+        left_out.add(frame)
+        surveyor.add(frame)
+        if frame.scan is not None:
+            motion = odometry.add(frame.scan)
+            if motion is not None:
+                motions.append(motion)
+            scans.append(scan_features(frame.index, frame.scan, classes, config, depth).on(shelf))
+        if frame.image is not None:
+            if config.use_visual_odometry:
+                tracks = tracker.add(frame.image)
+                if tracks is not None:
+                    direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
+                    pairs.append(ImagePair(tracks, direction))
+            images.append(image_features(frame.index, frame.image, classes, config.picture).on(shelf))
+        if progress is not None:
+            progress(f"reading {source.name}", position + 1, total)
+    if not scans or not images:
+        missing = "scan" if not scans else "image"
+        raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
+    if left_out.counts():
+        _LOG.warning("%s: left out: %s", source.name, left_out)
+    sweep = source.sweep_decision if isinstance(source, SweptSource) else None
+    return Drive(
+        source.name,
+        source.camera,
+        tuple(scans),
+        tuple(images),
+        tuple(motions),
+        tuple(pairs),
+        left_out,
+        surveyor.survey(),
+        sweep,
+    )
+
+
+def _checked(frame: Frame, camera: PinholeCamera, place: str) -> Frame:
+    """The frame with checked arrays; odometry bridges a scan without points."""
+    scan = None if frame.scan is None else checked_scan(frame.scan, place, fewest=0)
+    image = None if frame.image is None else checked_image(frame.image, camera, place)
+    return Frame(frame.index, scan, image)
+
+
+def scan_features(
+    index: int, scan: Scan, classes: Sequence[SemanticClass], config: PrepareConfig, depth: bool = True
+) -> ScanFeatures:
+    """Boundaries of a scan and a sample of its points."""
+    offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
+    chosen = _sample(scan, config.sample_points)
+    deep = np.zeros(0, dtype=np.intp)
+    if depth and config.use_visual_odometry:
+        near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
+        deep = near[:: max(1, len(scan.points) // 30_000)]
+    boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary))
+    return ScanFeatures(
+        index,
+        scan.stamp_ns,
+        boundaries,
+        scan.points[chosen].astype(np.float64),
+        scan.classes[chosen],
+        offsets[chosen].astype(np.float64),
+        scan.points[deep],
+        offsets[deep],
+        undersides,
+    )
+
+
+def apart(
+    found: dict[SemanticClass, Boundaries],
+) -> tuple[dict[SemanticClass, Boundaries], dict[SemanticClass, Boundaries]]:
+    """Boundary points, and apart from them those towards the ground."""
+    boundaries, undersides = {}, {}
+    for c, points in found.items():
+        down = points.edges == Edge.BOTTOM
+        boundaries[c] = points.take(np.flatnonzero(~down))
+        known = np.isin(points.objects, boundaries[c].objects)
+        undersides[c] = points.take(np.flatnonzero(down & known))
+    return (
+        {c: points for c, points in boundaries.items() if len(points)},
+        {c: points for c, points in undersides.items() if len(points)},
+    )
+
+
+def outlines(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
+    """A scan's boundary points, of some classes with those towards the ground."""
+    some = {c: scan.undersides[c] for c in undersides if c in scan.undersides}
+    return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
+
+
+def outline_size(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> int:
+    """Number of the points of :func:`outlines`."""
+    below = sum(len(points) for c, points in scan.undersides.items() if c in undersides)
+    return below + sum(map(len, scan.boundaries.values()))
+
+
+def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
+    """Evenly spread indices of at most ``most`` points of every known class, 2 to 60 m away."""
+    square = np.einsum("ij,ij->i", scan.points, scan.points)
+    usable = (square > 2.0**2) & (square < 60.0**2) & (scan.classes != SemanticClass.IGNORE)
+    parts = [np.zeros(0, dtype=np.intp)]
+    # Compared with plain ints, for those of NumPy make all classes int64.
+    for c in np.flatnonzero(np.bincount(scan.classes[usable])).tolist():
+        members = np.flatnonzero(usable & (scan.classes == c))
+        parts.append(members[:: max(1, -(-len(members) // most))])
+    return np.concatenate(parts)
+
+
+def image_features(
+    index: int, image: CameraImage, classes: Sequence[SemanticClass], config: PictureConfig | None = None
+) -> ImageFeatures:
+    """Mask and contours of an image; the contours follow its picture."""
+    fields = {c: ContourMap.of(image.mask, c, image.pixels, config) for c in classes}
+    contours = {c: field for c, field in fields.items() if field is not None}
+    return ImageFeatures(index, image.stamp_ns, image.mask, contours)

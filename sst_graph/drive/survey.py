@@ -1,0 +1,233 @@
+"""What the raw frames of a drive show before anything is assumed about them: sizes, the ground, repeats.
+
+Everything here is in the data's own units and axes, so that wrong units and wrong axes can be seen.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.features.mask_shift import ContourProfile, contour_profiles
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+_SCANS, _IMAGES = 12, 12
+"""Scans whose geometry, and images whose contours are looked at, spread over the drive."""
+_LEAST_POINTS = 200
+"""Labelled points of the ground from which a plane is fitted."""
+_GROUND_TOLERANCE = 0.02
+"""Distance from the plane, as a share of the median range of the points, within which a point lies on it."""
+_OBJECT_POINTS = 60
+"""Points of a vehicle from which its size is taken."""
+_CELL = 0.02
+"""Grid cell that splits points into objects, as a share of their median range: free of the unit."""
+_GROUND = (int(SemanticClass.GROUND), int(SemanticClass.TERRAIN))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane of the points labelled ground: up . p + height = 0, in the cloud's axes and unit.
+
+    Attributes:
+        up: (3,) unit normal, from the ground towards the LiDAR.
+        height: of the LiDAR above it.
+        share: of the points that lie on it.
+    """
+
+    up: FloatArray
+    height: float
+    share: float
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """Of a scan.
+
+    Attributes:
+        index: of its frame.
+        digest: of its points: equal ones are the same scan.
+        sweep_s: between its first and last point [s]; 0 where the points carry no times.
+        labelled: number of points by class.
+        median_range: of all points.
+        ground: None where too few points are labelled so, or the scan is not one of the few looked at.
+        vehicle_heights: (k,) from the ground to the top of its vehicles.
+    """
+
+    index: int
+    digest: int
+    sweep_s: float
+    labelled: Mapping[int, int]
+    median_range: float
+    ground: Ground | None = None
+    vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class ImageFacts:
+    """Of an image.
+
+    Attributes:
+        index: of its frame.
+        picture_digest, mask_digest: equal ones are the same; a picture that is missing or of a single colour
+            shows nothing, and has that of the mask.
+        labelled: number of pixels by class.
+        rows: mean row of each class's pixels, as a share of the image's height.
+        profiles: what the picture shows along the mask's contours, and beside them.
+    """
+
+    index: int
+    picture_digest: int
+    mask_digest: int
+    labelled: Mapping[int, int]
+    rows: Mapping[int, float]
+    profiles: tuple[ContourProfile, ...] = ()
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Of a whole drive, in the order of its scans and images."""
+
+    scans: tuple[ScanFacts, ...]
+    images: tuple[ImageFacts, ...]
+
+
+class Surveyor:
+    """Looks at every frame once and keeps a few numbers of it.
+
+    Args:
+        total: number of frames to come; the dearer looks are spread over them.
+    """
+
+    def __init__(self, total: int) -> None:
+        self._scans: list[ScanFacts] = []
+        self._images: list[ImageFacts] = []
+        self._every_scan, self._every_image = -(-total // _SCANS), -(-total // _IMAGES)
+
+    def add(self, frame: Frame) -> None:
+        """Look at one frame, checked by :mod:`sst_graph.validation`."""
+        if frame.scan is not None:
+            closely = len(self._scans) % self._every_scan == 0
+            self._scans.append(scan_facts(frame.index, frame.scan, closely))
+        if frame.image is not None:
+            closely = len(self._images) % self._every_image == 0
+            self._images.append(image_facts(frame.index, frame.image, closely))
+
+    def survey(self) -> Survey:
+        return Survey(tuple(self._scans), tuple(self._images))
+
+
+def scan_facts(index: int, scan: Scan, closely: bool = True) -> ScanFacts:
+    """Facts of a scan; the ground and the vehicles only where it is looked at closely."""
+    points = np.asarray(scan.points, np.float64)
+    ranges = np.linalg.norm(points, axis=1)
+    median_range = float(np.median(ranges)) if len(ranges) else 0.0
+    sweep = 0.0
+    if scan.offsets_s is not None and len(scan.offsets_s):
+        sweep = float(np.ptp(np.asarray(scan.offsets_s, np.float64)))
+    ground, heights = None, np.zeros(0)
+    if closely:
+        ground = _ground(points[np.isin(scan.classes, _GROUND)])
+        member = (scan.classes == int(SemanticClass.VEHICLE)) & (ranges < 2.0 * median_range)
+        instances = None if scan.instances is None else scan.instances[member]
+        heights = _heights(points[member], instances, ground)
+    labelled = _counts(scan.classes)
+    digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
+    return ScanFacts(index, digest, sweep, labelled, median_range, ground, heights)
+
+
+def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFacts:
+    """Facts of an image; the picture along the contours only where it is looked at closely."""
+    labelled = _counts(image.mask)
+    height, width = image.mask.shape
+    # Sums of the places of each class's pixels: whole numbers below 2^53, which are exact.
+    places = np.bincount(image.mask.ravel(), _places(image.mask.size), minlength=1)
+    rows = {c: float(places[c] / count // width) for c, count in labelled.items()}
+    shows = image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
+    mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
+    return ImageFacts(
+        index,
+        zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
+        mask_digest,
+        labelled,
+        {c: row / height for c, row in rows.items()},
+        contour_profiles(image.mask, image.pixels, SemanticClass.VEHICLE) if closely and shows else (),
+    )
+
+
+_FEW = 16
+"""One of so many rows and columns tells of nearly every picture that it shows something."""
+
+
+def _varies(pixels: NDArray[np.uint8]) -> bool:
+    return bool((pixels != pixels[0, 0]).any())
+
+
+@lru_cache(maxsize=1)
+def _places(count: int) -> FloatArray:
+    return np.arange(float(count))
+
+
+def _counts(classes: NDArray[np.uint8]) -> dict[int, int]:
+    counts = np.bincount(classes.ravel(), minlength=1)
+    return {int(c): int(counts[c]) for c in np.flatnonzero(counts)}
+
+
+def _ground(points: FloatArray) -> Ground | None:
+    """The plane that most of the points (n, 3) lie on (RANSAC, then least squares)."""
+    if len(points) < _LEAST_POINTS:
+        return None
+    points = points[:: max(1, len(points) // 2000)]
+    tolerance = _GROUND_TOLERANCE * float(np.median(np.linalg.norm(points, axis=1)))
+    rng = np.random.default_rng(0)
+    triples = points[rng.integers(0, len(points), (100, 3))]
+    normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    levels = np.einsum("ij,ij->i", normals, triples[:, 0])
+    near = np.abs(normals @ points.T - levels[:, None]) < tolerance
+    on = near[int(near.sum(axis=1).argmax())]
+    for _ in range(2):
+        if np.count_nonzero(on) < 3:
+            return None
+        centre = points[on].mean(axis=0)
+        normal = np.linalg.svd(points[on] - centre, full_matrices=False)[2][2]
+        on = np.abs((points - centre) @ normal) < tolerance
+    height = -float(normal @ centre)
+    up = normal if height >= 0.0 else -normal
+    return Ground(up, abs(height), float(on.mean()))
+
+
+def _heights(points: FloatArray, instances: NDArray[np.uint16] | None, ground: Ground | None) -> FloatArray:
+    """(k,) heights of the objects that many of the points (n, 3) belong to, above the ground where known."""
+    if len(points) < _OBJECT_POINTS:
+        return np.zeros(0)
+    up = np.array([0.0, 0.0, 1.0]) if ground is None else ground.up
+    numbers = _objects(points, up, instances)
+    found = []
+    for number in np.flatnonzero(np.bincount(numbers) >= _OBJECT_POINTS):
+        levels = points[numbers == number] @ up
+        bottom, top = np.quantile(levels, (0.02, 0.98))
+        # The ground where the object stands may be some way off the plane: the lower of the two counts.
+        found.append(top - (bottom if ground is None else max(bottom - 0.3 * (top - bottom), -ground.height)))
+    return np.array(found)
+
+
+def _objects(points: FloatArray, up: FloatArray, instances: NDArray[np.uint16] | None) -> NDArray[np.intp]:
+    """(n,) number of each point's object: instances, else connected cells of a grid seen from above."""
+    if instances is not None and bool((instances > 0).all()):
+        return instances.astype(np.intp)
+    across = np.linalg.svd(up[None])[2][1:]
+    flat = points @ across.T
+    cells = np.floor(flat / (_CELL * max(float(np.median(np.linalg.norm(flat, axis=1))), 1e-9)))
+    cells = np.clip(cells - np.quantile(cells, 0.001, axis=0) + 1, 0, 1000).astype(np.intp)
+    grid = np.zeros(cells.max(axis=0) + 2, np.uint8)
+    grid[cells[:, 0], cells[:, 1]] = 1
+    regions = cv2.connectedComponents(cv2.dilate(grid, np.ones((3, 3), np.uint8)), connectivity=4)[1]
+    return np.asarray(regions[cells[:, 0], cells[:, 1]], np.intp)

@@ -1,0 +1,188 @@
+"""What the picture shows along a mask's contour: where the object's edge is, and where none can be seen.
+
+Networks and people put a contour a pixel or three beside the edge, all along one side of an object, and
+where the picture is too dark to see an edge they draw what they think is there. The picture tells both:
+colours change most across the edge. One pixel's profile is noise, so profiles are averaged along the
+contour. The contour moves to an edge that has no rival within reach; where hardly any change of colour goes
+with it, it is not asked at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sst_graph.config import Settings, setting
+from sst_graph.features.sampling import sampled
+
+FloatArray = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
+Picture = NDArray[np.uint8]
+
+_STEP_PX = 0.5
+_BLUR_PX = 0.8
+_RIVAL_PX = 1.3
+"""What is this close to an edge is part of it [px]."""
+_NEARBY = np.arange(-2, 3)
+"""In steps around the likeliest place: the same edge."""
+_SLOPE, _BEND = _NEARBY / 10.0, (_NEARBY**2 - 2.0) / 14.0
+_OWN_PX = 0.7
+"""A place belongs to a contour pixel if its distance to the contour is what it would be by this much [px]."""
+_AROUND_PX = 2
+"""How far around a contour pixel it is not asked, either."""
+_SMOOTHING_PX = 1.0
+"""Gaussian smoothing of the shifts across the field, in pixels of the image [px]."""
+_EVERY = 2
+"""One of so many contour pixels is asked: neighbours show the same."""
+
+
+@dataclass(frozen=True)
+class PictureConfig(Settings):
+    """How contours follow the picture.
+
+    Attributes:
+        use: ask the picture at all; False takes the masks' contours as they are.
+        reach_px: farthest that a contour is moved [px].
+        mask_sigma_px: deviation of the masks' contours from the objects': of two edges within reach the
+            closer one is the likelier [px].
+        along_px: length of contour to either side of a pixel that decides with it [px].
+        min_contrast: least ratio of an edge to the mean change of colour within reach.
+        max_rival: an edge is not followed if another within reach has more than this share of its weight.
+        min_share: where the likeliest edge has less than this share of the weight that it has in the median
+            along all contours, the contour is taken for guessed, and nothing is matched to it.
+    """
+
+    use: bool = True
+    reach_px: float = setting(3.0, at_least=1.0, at_most=20.0)
+    mask_sigma_px: float = setting(1.4, at_least=0.1, at_most=100.0)
+    along_px: int = setting(4, at_least=2, at_most=64)
+    min_contrast: float = setting(1.5, at_least=0.0, at_most=100.0)
+    max_rival: float = setting(0.6, at_least=0.0, at_most=1.0)
+    min_share: float = setting(0.2, at_least=0.0, at_most=1.0)
+
+
+@dataclass(frozen=True)
+class PictureEdges:
+    """What the picture shows at each pixel of a mask's contours, in the order of :func:`contour_pixels`.
+
+    Attributes:
+        shifts: (n,) how far outside of the mask's contour the edge is [px].
+        seen: (n,) False where there is none to be seen.
+    """
+
+    shifts: FloatMap
+    seen: NDArray[np.bool_]
+
+    def fields(self, inside: NDArray[np.uint8]) -> tuple[FloatMap, NDArray[np.uint8]]:
+        """Shift at the contour pixel nearest to each pixel (h, w), smoothed [px]; (h, w) 1 near what is not
+        seen."""
+        u, v = np.concatenate(contour_pixels(inside)).T
+        height, width = (side // 2 + side % 2 for side in inside.shape)
+        # Of half the size: shifts vary slowly along a contour, and this is what costs.
+        cells = (v // 2) * width + u // 2
+        counts = np.bincount(cells, minlength=height * width).reshape(height, width)
+        sums = np.bincount(cells, self.shifts, minlength=height * width).reshape(height, width)
+        away = (counts == 0).view(np.uint8)
+        labels = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+        by_label = np.zeros(int(labels.max()) + 1, np.float32)
+        on = counts > 0
+        by_label[labels[on]] = sums[on] / counts[on]
+        smooth = cv2.GaussianBlur(by_label[labels], (0, 0), 0.5 * _SMOOTHING_PX)
+        shifts = cv2.resize(smooth, (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
+        unseen = np.zeros(inside.shape, np.uint8)
+        unseen[v[~self.seen], u[~self.seen]] = 1
+        around = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
+        return np.asarray(shifts, np.float32), np.asarray(cv2.dilate(unseen, around), np.uint8)
+
+
+def contour_pixels(inside: NDArray[np.uint8]) -> list[NDArray[np.intp]]:
+    """(k, 2) every second pixel of a region's outermost ring in order, columns and rows, of each contour."""
+    outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    return [outline[::_EVERY, 0].astype(np.intp) for outline in outlines]
+
+
+def find_picture_edges(
+    inside: NDArray[np.uint8], distance: FloatMap, picture: Picture, config: PictureConfig
+) -> PictureEdges:
+    """What the picture shows along the contours of a region.
+
+    Args:
+        inside: (h, w) 1 in the region, 0 elsewhere.
+        distance: (h, w) signed distance to its contour, negative inside, lightly smoothed [px].
+        picture: (h, w, 3) BGR.
+    """
+    along = config.along_px // _EVERY
+    pixels, own = _closed(contour_pixels(inside), 3 * along)
+    ts = np.arange(-config.reach_px, config.reach_px + 1e-9, _STEP_PX)
+    strength = _strength(pixels, ts, distance, picture, along)
+    likely = strength * np.exp(-0.5 * (ts / config.mask_sigma_px) ** 2).astype(np.float32)[:, None]
+    shifts, clear = _best_edges(strength, likely, ts, config)
+    size = 2 * along + 1
+    shifts = ndimage.median_filter(np.where(clear, shifts, 0.0), size, mode="nearest")
+    shifts = ndimage.uniform_filter1d(shifts, size, mode="nearest")
+    strongest = likely.max(axis=0)
+    # Where the picture cuts the object there is no edge of its own.
+    cut = (pixels == 0).any(axis=1) | (pixels == np.array(inside.shape[::-1]) - 1).any(axis=1)
+    whole = own[~cut[own]]
+    usual = np.median(strongest[whole]) if len(whole) else 0.0
+    seen = ndimage.median_filter(strongest >= config.min_share * usual, size, mode="nearest")
+    return PictureEdges(shifts[own].astype(np.float32), np.asarray(seen[own], np.bool_))
+
+
+def _closed(outlines: Sequence[NDArray[np.intp]], pad: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(n, 2) pixels of all contours, each with ``pad`` more before its first and behind its last, for it is
+    closed; and which of them are the contours' own."""
+    rounds = [np.arange(-pad, len(outline) + pad) % len(outline) for outline in outlines]
+    starts = np.cumsum([0] + [len(order) for order in rounds[:-1]])
+    own = [start + pad + np.arange(len(outline)) for start, outline in zip(starts, outlines, strict=True)]
+    pixels = [outline[order] for outline, order in zip(outlines, rounds, strict=True)]
+    return np.concatenate(pixels), np.concatenate(own)
+
+
+def _strength(
+    pixels: NDArray[np.intp], ts: FloatArray, distance: FloatMap, picture: Picture, along: int
+) -> FloatMap:
+    """(m, n) change of colour at m distances outside of n contour pixels' contour, averaged along it, in
+    grey levels a pixel (root of the sum of squares over the channels)."""
+    beside = pixels[None] + np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])[:, None]
+    around = sampled(distance, beside[..., 0], beside[..., 1])
+    normals = np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-6)[:, None]
+    feet = pixels - around[0][:, None] * normals
+    # Colours half a pixel to either side of the places asked.
+    asked = np.concatenate([[ts[0] - _STEP_PX], ts, [ts[-1] + _STEP_PX]])
+    u, v = (feet[:, k] + asked[:, None] * normals[:, k] for k in (0, 1))
+    blurred = np.asarray(cv2.GaussianBlur(picture, (3, 3), _BLUR_PX), np.uint8)
+    colours = sampled(blurred, u, v).astype(np.float32)
+    change = (colours[2:] - colours[:-2]) / np.float32(2.0 * _STEP_PX)
+    # First with its sign, which holds along an edge and not in a texture; then its size.
+    size = along + 1
+    steady = cv2.blur(change, (size, 1), borderType=cv2.BORDER_REPLICATE)
+    strength = np.sqrt(np.einsum("ijk,ijk->ij", steady, steady))
+    strength *= np.abs(sampled(distance, u[1:-1], v[1:-1]) - ts[:, None]) < _OWN_PX
+    size = 2 * along + 1
+    return np.asarray(cv2.blur(strength, (size, 1), borderType=cv2.BORDER_REPLICATE), np.float32)
+
+
+def _best_edges(
+    strength: FloatMap, likely: FloatMap, ts: FloatArray, config: PictureConfig
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(n,) distances of the likeliest edges [px], and whether they are beyond doubt."""
+    # Which edge is a question of likelihood; where it is, of the picture alone.
+    column = np.arange(strength.shape[1])
+    likeliest = likely.argmax(axis=0)
+    nearby = np.clip(likeliest + _NEARBY[:, None], 2, len(ts) - 3)
+    best = nearby[strength[nearby, column].argmax(axis=0), column]
+    # The top of a parabola through five places: an edge within a pixel has a flat one.
+    slope, bend = (weights @ strength[best + _NEARBY[:, None], column] for weights in (_SLOPE, _BEND))
+    shifts = ts[best] + np.clip(-0.5 * slope / np.minimum(bend, -1e-9), -2.0, 2.0) * _STEP_PX
+    top = strength[best, column]
+    clear = top > config.min_contrast * strength.mean(axis=0)
+    rival = np.where(np.abs(ts[:, None] - shifts) > _RIVAL_PX, likely, 0.0).max(axis=0)
+    clear &= rival < config.max_rival * likely[likeliest, column]
+    return np.asarray(shifts), np.asarray(clear)

@@ -1,0 +1,362 @@
+"""Boundary points of a scan: where a scan line leaves an object for what is behind it.
+
+The edge lies between the last return on the object and the next beam, so the direction half way is
+unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
+to the neighbour and is skipped. The range is carried on over the half step with the slope of the last
+two returns, and along a roof that is seen from above: at a grazing angle it ends well behind the last
+return, and a camera beside the LiDAR sees the difference.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.features.lidar_beams import Beams, arrange_beams
+from sst_graph.types import Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+_AMID = 2
+"""Beams to either side of a point on a roof that meet the object, too."""
+
+
+class Edge(IntEnum):
+    """On which side of the object the scan leaves it."""
+
+    SIDE = 0
+    TOP = 1
+    BOTTOM = 2
+
+
+@dataclass(frozen=True)
+class BoundaryConfig(Settings):
+    """Which returns make a boundary.
+
+    Attributes:
+        behind_m: the neighbour must be farther by this much [m] ...
+        behind_ratio: ... plus this fraction of the range.
+        max_steps: largest azimuth gap between neighbours, in beam steps.
+        max_elevation_gap_deg: largest gap between neighbouring rings [deg].
+        max_range_m: farthest object [m].
+        min_points: objects with fewer points are left out.
+        bottom_edges: find edges towards the ground too.
+        ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
+        max_slope_m: most that the range is carried on by the slope of the last two returns [m].
+        max_roof_m: most that it is carried on along a roof, from a return anywhere on it to where a camera a
+            little lower loses sight of it [m].
+        cell_m: grid cell for splitting a class into objects where instances are missing [m].
+    """
+
+    behind_m: float = setting(0.5, at_least=0.0, at_most=100.0)
+    behind_ratio: float = setting(0.0, at_least=0.0, at_most=10.0)
+    max_steps: float = setting(1.6, at_least=0.1, at_most=1000.0)
+    max_elevation_gap_deg: float = setting(0.9, at_least=0.01, at_most=90.0)
+    max_range_m: float = setting(60.0, at_least=1.0, at_most=1000.0)
+    min_points: int = setting(15, at_least=1, at_most=1_000_000)
+    bottom_edges: bool = True
+    ground_margin_m: float = setting(0.3, at_least=0.0, at_most=10.0)
+    max_slope_m: float = setting(1.0, at_least=0.0, at_most=100.0)
+    max_roof_m: float = setting(0.6, at_least=0.0, at_most=100.0)
+    cell_m: float = setting(0.3, at_least=0.05, at_most=10.0)
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """Boundary points of one class in one scan.
+
+    Attributes:
+        lPs: (m, 3) points in the LiDAR frame [m].
+        outward: (m, 3) a point farther out across the edge at the same range [m]: its direction in the
+            image tells on which side the background lies.
+        half_gaps_m: (m,) half the gap between the two beams at the object's range [m].
+        offsets_s: (m,) time of each point relative to the scan's stamp [s].
+        edges: (m,) of :class:`Edge`.
+        objects: (m,) number of the object within the scan.
+    """
+
+    lPs: FloatArray
+    outward: FloatArray
+    half_gaps_m: FloatArray
+    offsets_s: FloatArray
+    edges: NDArray[np.uint8]
+    objects: IntArray
+
+    def __len__(self) -> int:
+        return len(self.lPs)
+
+    def joined(self, other: Boundaries) -> Boundaries:
+        """These points and others of the same scan."""
+        return joined([self, other])
+
+    def take(self, index: IntArray) -> Boundaries:
+        """Some of the points, by position."""
+        return Boundaries(
+            self.lPs[index],
+            self.outward[index],
+            self.half_gaps_m[index],
+            self.offsets_s[index],
+            self.edges[index],
+            self.objects[index],
+        )
+
+
+def joined(parts: Sequence[Boundaries]) -> Boundaries:
+    """The points of one or more, one after the other; objects keep their numbers."""
+    if len(parts) == 1:
+        return parts[0]
+    names = [field.name for field in fields(Boundaries)]
+    return Boundaries(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def find_boundaries(
+    scan: Scan, classes: Sequence[SemanticClass], config: BoundaryConfig | None = None
+) -> dict[SemanticClass, Boundaries]:
+    """Boundary points of each class in a scan; a class without any has no entry."""
+    config = config or BoundaryConfig()
+    points = scan.points.astype(np.float64)
+    apart = np.einsum("ij,ij->i", points, points) > 0.25
+    usable = slice(None) if apart.all() else apart
+    points, labels = points[usable], scan.classes[usable]
+    # Compared with plain ints, for an enum makes all labels int64.
+    members = {c: labels == int(c) for c in classes}
+    present = [c for c in classes if np.count_nonzero(members[c]) >= config.min_points]
+    if not present:
+        return {}
+    beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
+    offsets = np.zeros(len(points)) if scan.offsets_s is None else scan.offsets_s[usable].astype(float)
+    instances = None if scan.instances is None else scan.instances[usable]
+    found = {}
+    for c in present:
+        mask = members[c]
+        objects = split_objects(points, mask, instances, config)
+        parts = [
+            _side_edges(points, mask, beams, config, +1),
+            _side_edges(points, mask, beams, config, -1),
+            _ring_edges(points, mask, beams, config, roofs=c == SemanticClass.VEHICLE),
+        ]
+        if config.bottom_edges:
+            parts.append(_ring_edges(points, mask, beams, config, _ground_heights(points, objects)))
+        found[c] = _collect(parts, offsets, objects, config)
+    return {c: b for c, b in found.items() if len(b)}
+
+
+@dataclass(frozen=True)
+class _Edges:
+    """Edges of one side: index of the object's point, the boundary point, the point across it."""
+
+    index: IntArray
+    lPs: FloatArray
+    outward: FloatArray
+    edge: Edge
+
+
+def _side_edges(
+    points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config: BoundaryConfig, side: int
+) -> _Edges:
+    """Edges towards rising (side = 1) or falling azimuth, half a beam step from the last return.
+
+    The half step, not the middle of the two azimuths: a laser mounted off the axis shows a near and a
+    far return of neighbouring firings under azimuths that differ by more, or less, than the step.
+    """
+    member = mask[beams.order]
+    here, there = (member[:-1], member[1:]) if side > 0 else (member[1:], member[:-1])
+    # Few points are the last of a class: all that follows is asked of these alone.
+    place = np.flatnonzero(here & ~there) + (side < 0)
+    last, following = beams.order[place], beams.order[place + side]
+    before = beams.order[np.clip(place - side, 0, len(beams.order) - 1)]
+    gap = side * (beams.azimuth[following] - beams.azimuth[last])
+    parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
+    ok = (beams.ring[last] == beams.ring[following]) & (gap < config.max_steps * beams.step + parallax)
+    ok &= _is_behind(beams.rho, last, following, config)
+    last, before = last[ok], before[ok]
+    steps = side * (beams.azimuth[last] - beams.azimuth[before])
+    known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
+    known &= steps < config.max_steps * beams.step
+    edge = _along_rays(points, beams, last, _carried_on(beams, last, before, known, config))
+    half = 0.5 * side * beams.step
+    return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), Edge.SIDE)
+
+
+def _carried_on(
+    beams: Beams, last: IntArray, before: IntArray, known: NDArray[np.bool_], config: BoundaryConfig
+) -> FloatArray:
+    """(n,) half the range step to last returns from those before, where these are known [m]."""
+    step = beams.rho[last] - beams.rho[before]
+    push = np.clip(0.5 * step, -config.max_slope_m, config.max_slope_m)
+    return np.where(known & (np.abs(step) < 2.0 * config.max_slope_m), push, 0.0)
+
+
+def _along_rays(points: FloatArray, beams: Beams, index: IntArray, push: FloatArray) -> FloatArray:
+    """Some points pushed along their rays, which leave the tip of their ring's cone [m]."""
+    farther = 1.0 + push / beams.rho[index]
+    tips = beams.height[beams.ring[index]]
+    moved = points[index] * farther[:, None]
+    moved[:, 2] = tips + (points[index, 2] - tips) * farther
+    return np.asarray(moved)
+
+
+def _turn(points: FloatArray, angle: float) -> FloatArray:
+    """Points turned about the z axis by an angle [rad]."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = points[:, 0], points[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y, points[:, 2]], axis=1)
+
+
+def _ring_edges(
+    points: FloatArray,
+    mask: NDArray[np.bool_],
+    beams: Beams,
+    config: BoundaryConfig,
+    ground: FloatArray | None = None,
+    roofs: bool = False,
+) -> _Edges:
+    """Edges towards the ring above: half way, at the object's range, to that ring's cone.
+
+    The one return of that ring that is nearest in azimuth decides. To ask two of them to miss the
+    object would prefer edges far from that ring, and so shift the mean by a tenth of the gap.
+
+    With the height (n,) [m] of the ground that each point's object stands on, edges towards the ring
+    below: the object ends where that ring meets the ground, no matter how far before or behind.
+
+    Args:
+        roofs: whether objects of the class have one: seen from above, they end at its far end.
+    """
+    up = 1 if ground is None else -1
+    ring = beams.ring + up
+    i = np.flatnonzero(mask & (ring >= 0) & (ring < len(beams.height)))
+    following, near = _nearest_in_ring(beams, i, ring[i])
+    ok = near & ~mask[following]
+    if ground is None:
+        ok &= _is_behind(beams.rho, i, following, config)
+    else:
+        ok &= points[following, 2] < ground[i] + config.ground_margin_m
+    i, following = i[ok], following[ok]
+    # The two rays: height over range, from their cones' tips.
+    rho, tip, tip_there = beams.rho[i], beams.height[beams.ring[i]], beams.height[ring[i]]
+    slope = (points[i, 2] - tip) / rho
+    slope_there = (points[following, 2] - tip_there) / beams.rho[following]
+    gap = tip_there + slope_there * rho - points[i, 2]
+    ok = (up * gap > 0.0) & (up * gap < np.radians(config.max_elevation_gap_deg) * rho)
+    i, rho, gap, slope, slope_there = (a[ok] for a in (i, rho, gap, slope, slope_there))
+    before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
+    push = _carried_on(beams, i, before, known & mask[before], config)
+    if roofs:
+        along = _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope, config)
+        push = np.maximum(push, np.where(_amid(mask, beams, i), along, 0.0))
+    edge = _along_rays(points, beams, i, push)
+    half = 0.5 * (gap + push * (slope_there - slope))
+    lPs, outward = edge.copy(), edge.copy()
+    lPs[:, 2] += half
+    outward[:, 2] += 3.0 * half
+    return _Edges(i, lPs, outward, Edge.TOP if up > 0 else Edge.BOTTOM)
+
+
+def _along_roof(
+    half: FloatArray, middle: FloatArray, slope: FloatArray, config: BoundaryConfig
+) -> FloatArray:
+    """(n,) how far behind the last return the ray half way to the ring above comes down to its height [m].
+
+    A roof seen from above at a grazing angle ends somewhere between the returns of two rings that are metres
+    apart on it, and the upper one misses it; the slope of the last two returns is that of the rear window.
+
+    Args:
+        half: (n,) height of that ray above the last return, at its range [m].
+        middle, slope: (n,) slopes of that ray and of the last return's.
+    """
+    down = np.where(middle < 0.0, half / np.maximum(-middle, 1e-9), np.inf)
+    return np.where(slope < 0.0, np.minimum(down, config.max_roof_m), 0.0)
+
+
+def _amid(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:
+    """(n,) whether the class goes on in the ring to both sides of a point: where it does not, the edge above
+    may well be that of a slanting pillar, not of a roof."""
+    place = np.searchsorted(beams.keys, Beams.key(beams.ring[index], beams.azimuth[index]))
+    amid = np.ones(len(index), np.bool_)
+    for steps in (-_AMID, _AMID):
+        beside = beams.order[np.clip(place + steps, 0, len(beams.order) - 1)]
+        gap = np.abs(beams.azimuth[beside] - beams.azimuth[index])
+        amid &= mask[beside] & (beams.ring[beside] == beams.ring[index]) & (gap < (_AMID + 1) * beams.step)
+    return amid
+
+
+def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:
+    """(n,) height of the lowest points of each point's object [m], few stray ones aside; -inf without one."""
+    heights = np.full(len(points), -np.inf)
+    some = np.flatnonzero(objects >= 0)
+    if len(some) == 0:
+        return heights
+    z = points[some, 2]
+    # By object, then by height: one key is sorted much faster than two.
+    order = some[np.argsort(objects[some] * (np.ptp(z) + 1.0) + z)]
+    first = np.flatnonzero(np.diff(objects[order], prepend=-1))
+    counts = np.diff(first, append=len(order))
+    lowest = points[order[first + (0.03 * counts).astype(np.intp)], 2]
+    heights[order] = np.repeat(lowest, counts)
+    return heights
+
+
+def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[IntArray, NDArray[np.bool_]]:
+    """The point of a ring nearest in azimuth to each of ``index``, and whether it is within a step or so."""
+    keys, wanted = beams.keys, Beams.key(ring, beams.azimuth[index])
+    place = np.clip(np.searchsorted(keys, wanted), 1, len(keys) - 1)
+    place = np.where(keys[place] - wanted < wanted - keys[place - 1], place, place - 1)
+    found = beams.order[place]
+    return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < beams.step)
+
+
+def _is_behind(
+    rho: FloatArray, last: IntArray, following: IntArray, config: BoundaryConfig
+) -> NDArray[np.bool_]:
+    return np.asarray(rho[following] > rho[last] * (1.0 + config.behind_ratio) + config.behind_m)
+
+
+def _collect(
+    parts: Sequence[_Edges], offsets: FloatArray, objects: IntArray, config: BoundaryConfig
+) -> Boundaries:
+    index = np.concatenate([part.index for part in parts])
+    lPs = np.concatenate([part.lPs for part in parts])
+    outward = np.concatenate([part.outward for part in parts])
+    edges = np.concatenate([np.full(len(part.index), part.edge, dtype=np.uint8) for part in parts])
+    keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < config.max_range_m)
+    half_gaps = 0.5 * np.linalg.norm(outward - lPs, axis=1)
+    return Boundaries(
+        lPs[keep], outward[keep], half_gaps[keep], offsets[index][keep], edges[keep], objects[index][keep]
+    )
+
+
+def split_objects(
+    points: FloatArray,
+    mask: NDArray[np.bool_],
+    instances: NDArray[np.uint16] | None,
+    config: BoundaryConfig,
+) -> IntArray:
+    """(n,) number of the object that each point of a class belongs to; -1 for none or too small a one.
+
+    The data's instances where all points carry one, else connected cells of a grid seen from above.
+    """
+    objects = np.full(len(points), -1, dtype=np.intp)
+    members = points[mask, :2]
+    if instances is not None and bool((instances[mask] > 0).all()):
+        numbers = instances[mask].astype(np.intp)
+    else:
+        cells = np.floor(members / config.cell_m).astype(np.intp)
+        cells -= cells.min(axis=0) - 1
+        size = np.minimum(cells.max(axis=0) + 2, 4000)
+        grid = np.zeros(size, dtype=np.uint8)
+        cells = np.minimum(cells, size - 1)
+        grid[cells[:, 0], cells[:, 1]] = 1
+        grown = cv2.dilate(grid, np.ones((3, 3), np.uint8))
+        _, regions = cv2.connectedComponents(grown, connectivity=4)
+        numbers = regions[cells[:, 0], cells[:, 1]].astype(np.intp)
+    counts = np.bincount(numbers)
+    objects[mask] = np.where(counts[numbers] >= config.min_points, numbers, -1)
+    return objects

@@ -1,0 +1,206 @@
+"""Signed distance to the contour of a class in an image mask, below a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.features.image_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
+from sst_graph.features.sampling import sampled
+from sst_graph.files.array_store import Shelf, shape_of, shelvable
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+FloatMap = NDArray[np.float32]
+
+_SMOOTHING_PX = 1.0
+BORDER_PX = 3.0
+"""Nothing is matched this close to the image's border [px]: objects are cut there."""
+REACH_PX = 64
+"""The field ends this far around the class [px]: beyond every gate (``gate`` times the widest kernel)."""
+MIN_GRADIENT = 0.3
+"""A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
+_CROSS = np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])[:, :, None]
+"""A pixel and its neighbours: columns and rows, (2, 5, 1)."""
+
+
+@dataclass(frozen=True)
+class ContourFeet:
+    """Nearest contour of each queried pixel.
+
+    Attributes:
+        distances: (n,) signed distance, negative inside the mask [px].
+        normals: (n, 2) unit normal of the contour, towards the outside.
+        feet: (n, 2) nearest point of the contour [px].
+        valid: (n,) False at ridges of the distance, beside ``IGNORE`` pixels and off the image.
+    """
+
+    distances: FloatArray
+    normals: FloatArray
+    feet: FloatArray
+    valid: NDArray[np.bool_]
+
+
+@shelvable("distance", "unknown")
+@dataclass(frozen=True)
+class ContourMap:
+    """Signed distance field of one class in one mask; on a shelf, it is read whenever it is asked for.
+
+    Attributes:
+        distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
+            the class that reaches :data:`REACH_PX` beyond it; as at the box's border farther out [px].
+        left, top: the box's first column and row in the image.
+        width, height: of the image.
+        unknown: 1 near ``IGNORE`` pixels, where a contour is not the object's, and where the picture shows no
+            edge along it; in the same box.
+        edges: what the picture shows along the contour, if it was asked; in ``distance`` already.
+    """
+
+    distance: FloatMap
+    left: int
+    top: int
+    width: int
+    height: int
+    unknown: NDArray[np.uint8]
+    edges: PictureEdges | None = None
+
+    @classmethod
+    def of(
+        cls,
+        mask: NDArray[np.uint8],
+        semantic_class: SemanticClass,
+        picture: Picture | None = None,
+        config: PictureConfig | None = None,
+        edges: PictureEdges | None = None,
+    ) -> ContourMap | None:
+        """The field of a class in a mask (h, w); None where the class is absent or fills the image.
+
+        Args:
+            picture: (h, w, 3) BGR that the contour follows; by default, or where it has another size, none.
+            config: how it does.
+            edges: what was found in the picture before; it is not asked again.
+        """
+        # Compared with a plain int, for an enum makes all pixels int64.
+        inside = (mask == int(semantic_class)).view(np.uint8)
+        if cv2.countNonZero(inside) in (0, inside.size):
+            return None
+        # Only near the class: elsewhere nothing is matched, and the field is what an image costs.
+        x, y, width, height = cv2.boundingRect(inside)
+        top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
+        part = slice(top, y + height + REACH_PX), slice(left, x + width + REACH_PX)
+        box = np.ascontiguousarray(inside[part])
+        distance = np.asarray(cv2.GaussianBlur(signed_distance(box), (0, 0), _SMOOTHING_PX), np.float32)
+        ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
+        unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.uint8)
+        config = config or PictureConfig()
+        if edges is None and picture is not None and config.use and picture.shape[:2] == mask.shape:
+            edges = find_picture_edges(box, distance, picture[part], config)
+        if edges is not None:
+            shifts, unseen = edges.fields(box)
+            distance -= shifts
+            unknown |= unseen
+        return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
+
+    @property
+    def box(self) -> tuple[int, int]:
+        """Columns and rows of the box."""
+        rows, columns = shape_of(self, "distance")
+        return columns, rows
+
+    def on(self, shelf: Shelf) -> ContourMap:
+        """The same with its fields on a shelf."""
+        return replace(self, distance=shelf.put(self.distance), unknown=shelf.put(self.unknown))
+
+    def look_up(self, uvs: FloatArray) -> ContourFeet:
+        """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""
+        return nearest_contours([self], [(0, len(uvs))], uvs)
+
+
+def nearest_contours(
+    contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], uvs: FloatArray
+) -> ContourFeet:
+    """Nearest contour of pixels uvs (n, 2) of several images; rows with NaN are not valid.
+
+    Args:
+        contours: at least one.
+        spans: where the pixels of each begin and end, one after the other.
+    """
+    n, counts = len(uvs), [b - a for a, b in spans]
+    if n == 0:
+        return ContourFeet(np.zeros(0), uvs, uvs, np.zeros(0, np.bool_))
+    # All at once: with few points a call costs more than what it does.
+    sizes = {(contour.width, contour.height) for contour in contours}
+    width, height = (
+        next(iter(sizes))
+        if len(sizes) == 1
+        else np.repeat([(contour.width, contour.height) for contour in contours], counts, axis=0).T
+    )
+    valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
+    corners = np.array([(contour.left, contour.top) for contour in contours])
+    corner = corners.T if len(contours) == 1 else np.repeat(corners, counts, axis=0).T
+    safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
+    u, v = (safe - corner)[:, None] + _CROSS
+    u, v = u.astype(np.float32), v.astype(np.float32)
+    samples = np.empty((5, n), np.float32)
+    for contour, (a, b) in zip(contours, spans, strict=True):
+        if b > a:
+            samples[:, a:b] = sampled(contour.distance, u[:, a:b], v[:, a:b])
+    centre, right, left, below, above = samples.astype(np.float64)
+    gradient = 0.5 * np.stack([right - left, below - above])
+    length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
+    steep = length > 1e-6
+    normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
+    feet = safe - centre * normals
+    valid &= length > MIN_GRADIENT
+    valid &= ~are_unknown(contours, spans, feet - corner)
+    return ContourFeet(centre, normals.T, feet.T, valid)
+
+
+def are_unknown(
+    contours: Sequence[ContourMap], spans: Sequence[tuple[int, int]], places: FloatArray
+) -> NDArray[np.bool_]:
+    """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
+    :func:`nearest_contours`."""
+    column, row = np.maximum(np.rint(places).astype(np.intp), 0)
+    found = np.empty(places.shape[1], np.uint8)
+    for contour, (a, b) in zip(contours, spans, strict=True):
+        if b > a:
+            unknown = contour.unknown
+            rows, columns = unknown.shape
+            at = np.minimum(row[a:b], rows - 1) * columns + np.minimum(column[a:b], columns - 1)
+            found[a:b] = unknown.reshape(-1)[at]
+    return found > 0
+
+
+def well_inside(
+    u: FloatArray, v: FloatArray, width: IntArray | int, height: IntArray | int
+) -> NDArray[np.bool_]:
+    """Whether columns u and rows v are on an image and not close to its border; False for NaN."""
+    with np.errstate(invalid="ignore"):
+        inside = (u > BORDER_PX) & (u < width - 1 - BORDER_PX)
+        inside &= (v > BORDER_PX) & (v < height - 1 - BORDER_PX)
+    return np.asarray(inside)
+
+
+def signed_distance(inside: NDArray[np.uint8]) -> FloatMap:
+    """(h, w) distance of pixel centres to the border of the region [px], negative inside.
+
+    The border runs half way between an inside pixel's centre and its outside neighbour's.
+    """
+    distance = np.asarray(cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_5), np.float32)
+    distance -= 0.5
+    # The nearest pixel outside touches the same part of the region: each stretch of columns on its own.
+    occupied = np.concatenate([[False], inside.any(axis=0), [False]])
+    for start, end in np.flatnonzero(occupied[1:] != occupied[:-1]).reshape(-1, 2).tolist():
+        left = max(0, start - 1)
+        _, y, _, height = cv2.boundingRect(np.ascontiguousarray(inside[:, start:end]))
+        box = (slice(max(0, y - 1), y + height + 1), slice(left, end + 1))
+        region = np.ascontiguousarray(inside[box])
+        inner = cv2.distanceTransform(region, cv2.DIST_L2, cv2.DIST_MASK_5)
+        np.subtract(0.5, inner, out=distance[box], where=region.view(np.bool_))
+    return distance

@@ -1,0 +1,396 @@
+"""The problem of :func:`~sst_graph.graph.building.joint_graph`, optimised without building its graph.
+
+The factors are the same, and so are their formulas (:func:`sst_graph.factors.reprojection.evaluate`,
+:func:`sst_graph.factors.twist_transfer.transferred`), but those of all images are worked out at once: with
+the few hundred matches of one image a call costs more than what it does. Each twist meets the matches of its
+own image and one measurement, so it is eliminated there (Schur complement), and what is left is a small
+dense system in the extrinsic, the clocks, the parameters of assumptions and the mask biases. Their priors
+are a gtsam graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import named_sigmas
+from sst_graph.drive.trajectory import camera_covariances
+from sst_graph.factors.matches import Alignment
+from sst_graph.factors.reprojection import evaluate, weigh
+from sst_graph.factors.twist_transfer import transferred
+from sst_graph.graph.building import prior_graph
+from sst_graph.graph.matching import DriveMatches, GraphConfig
+from sst_graph.graph.state import (
+    EXTRINSIC,
+    State,
+    bias_key,
+    nuisance_key,
+    object_bias_key,
+    time_offset_key,
+    twist_key,
+)
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e5
+"""Of a Levenberg-Marquardt step: at first, and its bounds."""
+_SMALL = 1e-7
+"""A step that changes the cost by a smaller share is the last one."""
+
+
+@dataclass(frozen=True)
+class FrozenPoint:
+    """Values of all unknowns.
+
+    Attributes:
+        cTl: extrinsic.
+        scalars: (k,) values of the other unknowns that are not twists, the time offsets first.
+        twists: (f, 6) of the camera at each image [rad/s, m/s].
+    """
+
+    cTl: gtsam.Pose3
+    scalars: FloatArray
+    twists: FloatArray
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """The linearized problem, H x = -g with x over the extrinsic (right perturbation), scalars and twists.
+
+    Attributes:
+        cost: at the point.
+        H, g: (n, n), (n,) of all unknowns but the twists.
+        H_twists, g_twists: (f, 6, 6), (f, 6) of the twists; no two of them meet.
+        H_mixed: (f, 6, n) of each twist with the others.
+    """
+
+    cost: float
+    H: FloatArray
+    g: FloatArray
+    H_twists: FloatArray
+    g_twists: FloatArray
+    H_mixed: FloatArray
+
+    def step(self, damping: float) -> tuple[FloatArray, FloatArray]:
+        """(n,) and (f, 6): the step with ``damping`` added to the diagonal of the whole H."""
+        inverse, H, g = self._reduced(damping)
+        x = np.asarray(-np.linalg.solve(H, g), np.float64)
+        followed = self.g_twists + self.H_mixed @ x
+        return x, -(inverse @ followed[:, :, None])[:, :, 0]
+
+    def covariance(self) -> FloatArray:
+        """(n, n) of all unknowns but the twists."""
+        _, H, _ = self._reduced(0.0)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+        scaled = np.linalg.inv(H * np.outer(scale, scale) + 1e-14 * np.eye(len(H)))
+        return np.asarray(scaled * np.outer(scale, scale))
+
+    def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Inverse of the twists' blocks, and H and g with the twists eliminated."""
+        inverse = np.asarray(np.linalg.inv(self.H_twists + damping * np.eye(6)), np.float64)
+        n = len(self.g)
+        mixed = self.H_mixed.reshape(-1, n)
+        H = self.H + damping * np.eye(n) - mixed.T @ (inverse @ self.H_mixed).reshape(-1, n)
+        g = self.g - mixed.T @ (inverse @ self.g_twists[:, :, None]).reshape(-1)
+        return inverse, H, g
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The twists of all images that have matches, and what odometry says of them.
+
+    Attributes:
+        keys: of the twists.
+        twists: (f, 6) of the camera where the matches were made [rad/s, m/s].
+        l_twists, l_accelerations: (f, 6) of the LiDAR; 0 where no odometry tells them.
+        information: (f, 6, 6) inverse covariance of the camera's.
+        clocks: (f,) column of the time offset.
+        offsets_s: (f,) under which they were looked up [s].
+    """
+
+    keys: tuple[int, ...]
+    twists: FloatArray
+    l_twists: FloatArray
+    l_accelerations: FloatArray
+    information: FloatArray
+    clocks: IntArray
+    offsets_s: FloatArray
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The matches of one drive, ordered by image and within it by mask bias.
+
+    Attributes:
+        alignment: all m matches.
+        images: (m,) number of the image of each.
+        biases: (m,) column of its mask bias.
+        clock: column of the drive's time offset.
+        terms: (t, m) derivatives of the residuals by the parameters that are estimated.
+        terms_at: (t,) where they were made.
+        spans: number, first match and end of each image.
+        cells: first match of each image's matches that share a bias.
+    """
+
+    alignment: Alignment
+    images: IntArray
+    biases: IntArray
+    clock: int
+    terms: FloatArray
+    terms_at: FloatArray
+    spans: list[tuple[int, int, int]]
+    cells: IntArray
+
+
+class FrozenProblem:
+    """Matches of all drives, and the optimum of everything under them."""
+
+    def __init__(
+        self,
+        matches: Sequence[DriveMatches],
+        state: State,
+        config: GraphConfig,
+        guess: State | None = None,
+        belief: gtsam.NonlinearFactor | None = None,
+    ) -> None:
+        """
+        Args:
+            matches: by drive, made at ``state``.
+            guess: what the weak priors are centred on; by default the state.
+            belief: what else is known of the extrinsic and the first clock's offset.
+        """
+        self.state = state
+        self._classes = sorted({(own.number, c) for own in matches for c in own.classes})
+        self._objects = sorted({each for own in matches for each in own.tracked})
+        self._priors, values = prior_graph(self._classes, self._objects, state, config, guess)
+        if belief is not None:
+            self._priors.add(belief)
+        # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
+        self._names = [name for name, _ in named_sigmas(config.estimate)]
+        delays = [time_offset_key(clock) for clock in range(len(state.offsets_s))]
+        biases = [bias_key(drive, c) for drive, c in self._classes]
+        biases += [object_bias_key(drive, track) for drive, _, track in self._objects]
+        self._keys = (*delays, *map(nuisance_key, self._names), *biases)
+        self._columns = {key: 6 + place for place, key in enumerate(self._keys)}
+        self._terms = [self._columns[nuisance_key(name)] for name in self._names]
+        self._shared = _ordered((EXTRINSIC, *self._keys))
+        # 2. Images and matches.
+        self._images = _images(matches, state, self._columns, config)
+        places = {key: number for number, key in enumerate(self._images.keys)}
+        self._frames = [self._frames_of(own, places) for own in matches]
+        scalars = [float(values.atVector(key)[0]) for key in self._keys]
+        self.start = FrozenPoint(state.cTl, np.array(scalars), self._images.twists)
+
+    @property
+    def ordering(self) -> gtsam.Ordering:
+        """Of all unknowns, as they stand in the normal equations, the twists last."""
+        return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
+
+    def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:
+        """By at most so many Levenberg-Marquardt steps from the start; and the problem linearized there."""
+        point, damping = self.start, _DAMPING
+        system = self.linearized(point)
+        for _ in range(iterations):
+            while True:
+                moved = self.moved(point, *system.step(damping))
+                there = self.linearized(moved)
+                gain = system.cost - there.cost
+                if gain >= 0.0 or abs(gain) < _SMALL * system.cost or damping >= _MOST_DAMPING:
+                    break
+                damping *= 10.0
+            if not gain >= 0.0:
+                break
+            last, damping = gain < _SMALL * system.cost, max(damping / 10.0, _LEAST_DAMPING)
+            point, system = moved, there
+            if last:
+                break
+        return point, system
+
+    def moved(self, point: FrozenPoint, x: FloatArray, twists: FloatArray) -> FrozenPoint:
+        """A point after a step, as :meth:`NormalEquations.step` gives it."""
+        return FrozenPoint(point.cTl.retract(x[:6]), point.scalars + x[6:], point.twists + twists)
+
+    def state_at(self, point: FrozenPoint) -> State:
+        """The state of a point; mask biases of classes and objects that had no match stay."""
+        value = dict(zip(self._keys, point.scalars.tolist(), strict=True))
+        state = self.state
+        return State(
+            point.cTl,
+            tuple(value[time_offset_key(clock)] for clock in range(len(state.offsets_s))),
+            {**state.biases_px, **{(d, c): value[bias_key(d, c)] for d, c in self._classes}},
+            {**state.object_biases_px, **{(d, t): value[object_bias_key(d, t)] for d, _, t in self._objects}},
+            {**state.nuisances, **{name: value[nuisance_key(name)] for name in self._names}},
+        )
+
+    def values_at(self, point: FrozenPoint) -> gtsam.Values:
+        """A point as values of the graph's variables."""
+        values = self._prior_values(point)
+        for key, twist in zip(self._images.keys, point.twists, strict=True):
+            values.insert(key, twist)
+        return values
+
+    def step_sigmas(self, point: FrozenPoint, system: NormalEquations) -> float:
+        """Length of the step from the state to a point in extrinsic and offsets, in standard deviations of
+        the problem linearized there."""
+        clocks = len(self.state.offsets_s)
+        turned = gtsam.Pose3.Logmap(self.state.cTl.between(point.cTl))
+        step = np.concatenate([turned, point.scalars[:clocks] - np.array(self.state.offsets_s)])
+        covariance = system.covariance()[: 6 + clocks, : 6 + clocks]
+        return float(np.sqrt(step @ np.linalg.solve(covariance, step)))
+
+    def linearized(self, point: FrozenPoint) -> NormalEquations:
+        """The normal equations at a point, those of the graph of
+        :func:`~sst_graph.graph.building.joint_graph`."""
+        values = self._prior_values(point)
+        H, b = self._priors.linearize(values).hessian(self._shared)
+        count, n = len(self._images.keys), len(H)
+        system = NormalEquations(
+            self._priors.error(values),
+            np.array(H),
+            -np.asarray(b).reshape(-1),
+            np.zeros((count, 6, 6)),
+            np.zeros((count, 6)),
+            np.zeros((count, 6, n)),
+        )
+        cost = system.cost + self._add_motion(system, point)
+        return replace(system, cost=cost + sum(self._add(frames, system, point) for frames in self._frames))
+
+    def _prior_values(self, point: FrozenPoint) -> gtsam.Values:
+        values = gtsam.Values()
+        values.insert(EXTRINSIC, point.cTl)
+        for key, value in zip(self._keys, point.scalars.reshape(-1, 1), strict=True):
+            values.insert(key, value)
+        return values
+
+    def _add_motion(self, system: NormalEquations, point: FrozenPoint) -> float:
+        """Add the measured twists to the normal equations; their cost."""
+        images = self._images
+        since_s = point.scalars[images.clocks - 6] - images.offsets_s
+        error, by_cTl, by_offset = transferred(
+            images.l_twists, images.l_accelerations, since_s[:, None], point.twists, point.cTl, True
+        )
+        assert by_cTl is not None and by_offset is not None
+        weighted = (images.information @ error[:, :, None])[:, :, 0]
+        J = np.concatenate([by_cTl, by_offset[:, :, None]], axis=2)
+        WJ = images.information @ J
+        system.H_twists[:] += images.information
+        system.g_twists[:] += weighted
+        for clock in np.unique(images.clocks).tolist():
+            own, columns = images.clocks == clock, [*range(6), clock]
+            system.H[np.ix_(columns, columns)] += np.einsum("fij,fik->jk", J[own], WJ[own])
+            system.g[columns] += np.einsum("fij,fi->j", J[own], weighted[own])
+            system.H_mixed[np.ix_(own, range(6), columns)] += WJ[own]
+        return 0.5 * float((error * weighted).sum())
+
+    def _add(self, frames: _Frames, system: NormalEquations, point: FrozenPoint) -> float:
+        """Add the matches of a drive to the normal equations; their cost."""
+        # 1. Weighted rows: 13 of the motion, the parameters that are estimated, bias, residual.
+        alignment = frames.alignment
+        offset_s, biases_px = point.scalars[frames.clock - 6], point.scalars[frames.biases - 6]
+        twists = point.twists[frames.images].T
+        evaluated = evaluate(alignment, point.cTl, float(offset_s), twists, biases_px, True)
+        if self._terms:
+            steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
+            evaluated = evaluated.with_terms(frames.terms, steps, True)
+        constant = weigh(alignment, evaluated)
+        rows = evaluated.rows[:, 0]
+        # 2. Of each image the sums of the products of its rows.
+        products = np.empty((len(frames.spans), len(rows), len(rows)))
+        for G, (_, start, end) in zip(products, frames.spans, strict=True):
+            own = rows[:, start:end]
+            np.matmul(own, own.T, out=G)
+        places = [image for image, _, _ in frames.spans]
+        columns = [*range(6), frames.clock, *self._terms]
+        shared, twist = [*range(7), *range(13, 13 + len(frames.terms))], slice(7, 13)
+        total = products.sum(axis=0)
+        system.H[np.ix_(columns, columns)] += total[np.ix_(shared, shared)]
+        system.g[columns] += total[shared, -1]
+        system.H_twists[places] += products[:, twist, twist]
+        system.g_twists[places] += products[:, twist, -1]
+        system.H_mixed[np.ix_(places, range(6), columns)] += products[:, twist][:, :, shared]
+        # 3. The same of the matches of an image that share a bias, with the bias.
+        cells = np.add.reduceat(rows * rows[-2], frames.cells, axis=1)
+        bias, image_of = frames.biases[frames.cells], frames.images[frames.cells]
+        by_bias = np.zeros((len(system.g), len(cells)))
+        np.add.at(by_bias, bias, cells.T)
+        system.H[columns] += by_bias[:, shared].T
+        system.H[:, columns] += by_bias[:, shared]
+        system.H[np.diag_indices(len(by_bias))] += by_bias[:, -2]
+        system.g[...] += by_bias[:, -1]
+        system.H_mixed[image_of, :, bias] += cells[twist].T
+        return 0.5 * (float(rows[-1] @ rows[-1]) + constant)
+
+    def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> _Frames:
+        number = matches.number
+        pairs = [twist_key(number, pair.image) for pair in matches.pairs]
+        images = np.array([places.get(key, -1) for key in pairs])[matches.pair_of]
+        biases = _bias_columns(matches, self._columns)
+        order = np.lexsort((biases, images))
+        images, biases = images[order], biases[order]
+        terms = (
+            np.stack([matches.terms[name] for name in self._names])
+            if self._names
+            else np.zeros((0, len(order)))
+        )
+        starts = np.flatnonzero(np.diff(images, prepend=-1))
+        ends = [*starts[1:].tolist(), len(images)]
+        return _Frames(
+            matches.alignment.take(order),
+            images,
+            biases,
+            self._columns[time_offset_key(self.state.clock(number))],
+            terms[:, order],
+            np.array([self.state.nuisances.get(name, 0.0) for name in self._names]),
+            list(zip(images[starts].tolist(), starts.tolist(), ends, strict=True)),
+            np.flatnonzero((np.diff(images, prepend=-1) != 0) | (np.diff(biases, prepend=-1) != 0)),
+        )
+
+
+def _ordered(keys: Sequence[int]) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in keys:
+        ordering.push_back(key)
+    return ordering
+
+
+def _bias_columns(matches: DriveMatches, columns: dict[int, int]) -> IntArray:
+    """(m,) column of the mask bias of each match."""
+    number = matches.number
+    if matches.tracks is None:
+        of_groups = [columns[bias_key(number, c)] for c in matches.group_classes]
+        return np.repeat(of_groups, matches.counts)
+    tracks, which = np.unique(matches.tracks, return_inverse=True)
+    return np.array([columns[object_bias_key(number, track)] for track in tracks.tolist()])[which.reshape(-1)]
+
+
+def _images(
+    matches: Sequence[DriveMatches], state: State, columns: dict[int, int], config: GraphConfig
+) -> _Images:
+    """The images that have matches, drive by drive."""
+    parts = []
+    for own in matches:
+        # Scans that share an image share its twist.
+        first: dict[int, int] = {}
+        for p in own.paired:
+            first.setdefault(own.pairs[p].image, p)
+        pairs, k = list(first.values()), len(first)
+        samples, clock = own.motions.l_twists, columns[time_offset_key(state.clock(own.number))]
+        if samples is None:
+            l_twists = l_accelerations = np.zeros((k, 6))
+            information = np.tile(np.diag(np.repeat(config.still_sigma, 3) ** -2.0), (k, 1, 1))
+        else:
+            l_twists, l_accelerations = samples.twists[pairs], samples.accelerations[pairs]
+            covariances = camera_covariances(samples.covariances[pairs], state.cTl)
+            information = np.asarray(np.linalg.inv(covariances), np.float64)
+        keys = [twist_key(own.number, image) for image in first]
+        offsets_s = np.full(k, own.offset_s)
+        parts.append(
+            (keys, own.c_twists[pairs], l_twists, l_accelerations, information, np.full(k, clock), offsets_s)
+        )
+    keys, *arrays = zip(*parts, strict=True)
+    return _Images(tuple(key for own in keys for key in own), *(np.concatenate(each) for each in arrays))

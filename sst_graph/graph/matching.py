@@ -1,0 +1,561 @@
+"""From a state to matches: a drive's scans and images paired in true time, and matched all at once.
+
+What a scan shows stays the same from one association to the next: :class:`DriveOutlines` gathers it once for
+a whole solution. What a state changes (the pairs, the motion between them, the pixels) is worked out for all
+pairs in the same arrays, for with the few hundred points of one pair a call costs more than what it does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.association.edge_matching import (
+    BOTTOM,
+    Facing,
+    FacingMatches,
+    MatchConfig,
+    Motion,
+    SilhouetteMatches,
+    match_facing,
+    numbered_through,
+)
+from sst_graph.association.time_pairing import Pair, pair_by_time
+from sst_graph.assumptions import named_sigmas
+from sst_graph.assumptions.model import Scene
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import Drive, outlines
+from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
+from sst_graph.errors import ConfigError
+from sst_graph.factors.matches import Alignment
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.features.lidar_edges import Boundaries, joined
+from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
+from sst_graph.graph.state import State, underside_track
+from sst_graph.objects.tracks import (
+    Mover,
+    ObjectId,
+    moving_objects,
+    numbers_in,
+    of_each,
+    standing_shares,
+    tracks_of_scans,
+)
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+Movers = dict[tuple[SemanticClass, int], Mover]
+"""The moving objects of one scan, by class and number within the scan."""
+
+
+@dataclass(frozen=True)
+class GraphConfig(Settings):
+    """Priors and limits of the joint graph.
+
+    Attributes:
+        match: how boundary points meet contours.
+        undersides: classes whose edges towards the ground are matched too. They sharpen roll and height where
+            both sides label the underside alike; hand-drawn outlines often cover the gap above the ground.
+        max_interval_periods: farthest pair in true time, in image periods.
+        bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
+        object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
+            of a class the same bias.
+        underside_bias_sigma_px: deviation of the mask bias that the undersides of a class share from the
+            class's, where objects have biases of their own [px].
+        delay_sigma_s: prior deviation of the time offset from the guess [s].
+        rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
+        rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
+        mover_reach_m: an object that moves so far by itself between its scan and its image, in a way that is
+            not known, keeps half of its weight, one that moves a little farther none [m].
+        still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
+        estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0.
+    """
+
+    match: MatchConfig = field(default_factory=MatchConfig)
+    undersides: tuple[SemanticClass, ...] = ()
+    max_interval_periods: float = setting(1.0, at_least=0.01, at_most=20.0)
+    bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
+    object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
+    underside_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
+    delay_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
+    rest_sigma_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
+    rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
+    mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
+    still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
+    estimate: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if 0.0 < self.object_bias_sigma_px < 0.001:
+            raise ConfigError(
+                f"object_bias_sigma_px: found {self.object_bias_sigma_px:g}, expected 0 or at least 0.001 px"
+            )
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """The matches of one scan and one image.
+
+    Attributes:
+        drive: number of the drive.
+        pair: positions of scan and image.
+        l_twist: the LiDAR's twist at the image's instant, or None where no odometry tells it.
+        motion: the camera's, under the state that the matches were made at.
+        matches: by class.
+        tracks: for each class, the track (n,) of the object that each match lies on; empty where objects
+            share their class's mask bias.
+        scene: what assumptions may depend on.
+        terms: for each class, derivative (n,) of each residual by the parameters that are estimated, by name.
+    """
+
+    drive: int
+    pair: Pair
+    l_twist: TwistSample | None
+    motion: Motion
+    matches: Mapping[SemanticClass, SilhouetteMatches]
+    tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
+    scene: Scene | None = None
+    terms: Mapping[SemanticClass, Mapping[str, FloatArray]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return sum(len(matches) for matches in self.matches.values())
+
+    @cached_property
+    def biased(self) -> Mapping[SemanticClass, tuple[list[int], NDArray[np.intp]]]:
+        """By class of ``tracks``: the tracks that have a mask bias, and which of them (n,) each match has."""
+        found = {}
+        for c, tracks in self.tracks.items():
+            names, groups = np.unique(tracks, return_inverse=True)
+            found[c] = (names.tolist(), groups.reshape(-1))
+        return found
+
+    @property
+    def moved(self) -> bool:
+        """Whether the LiDAR is known to move at the image's instant."""
+        return self.l_twist is not None and bool(self.l_twist.twist.any())
+
+
+class Tracks:
+    """Twist tracks of all drives, and tracks of their objects where those are given; made once."""
+
+    def __init__(
+        self,
+        drives: Sequence[Drive],
+        objects: Sequence[Mapping[ObjectId, int]] | None = None,
+        growing: GrowingTrack | None = None,
+    ) -> None:
+        """growing: of a single drive whose motions grow."""
+        self._tracks: list[TwistTrack | None] = [drive.lidar_track(growing) for drive in drives]
+        self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
+        found = zip(drives, objects, strict=True) if objects is not None else ()
+        self._movers = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
+
+    def seeing(self, objects: Mapping[ObjectId, int], movers: Mapping[ObjectId, Mover]) -> Tracks:
+        """The same twists of one drive, with other object tracks and moving objects."""
+        other = Tracks([])
+        other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
+        return other
+
+    def part(self, drive: int, scans: Sequence[int]) -> Tracks:
+        """Of :meth:`sst_graph.drive.preparation.Drive.part` of one drive, which becomes drive 0."""
+        other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
+        other._tracks = [self._tracks[drive]]
+        if self.objects is not None:
+            other.objects = [tracks_of_scans(self.objects[drive], scans)]
+            moving = self._movers[drive]
+            other._movers = [{place[scan]: own for scan, own in moving.items() if scan in place}]
+        return other
+
+    def movers(self, drive: int, scan: int) -> Movers:
+        """The moving objects of a scan."""
+        return self._movers[drive].get(scan, {}) if self._movers else {}
+
+    def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
+        """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
+        track = self._tracks[drive]
+        return None if track is None else track.at(stamp_ns)
+
+    def at_all(self, drive: int, stamps_ns: Sequence[int]) -> TwistSamples | None:
+        """The LiDAR's twists at stamps of its clock, or None where no odometry tells them."""
+        track = self._tracks[drive]
+        return None if track is None else track.at_all(stamps_ns)
+
+
+@dataclass(frozen=True)
+class DriveOutlines:
+    """The boundary points of a drive, group by group: what one scan shows of one class.
+
+    Attributes:
+        number: of the drive.
+        drive, tracks: where they come from.
+        config: which of them, and how they are matched.
+        scans, classes: scan and class of each group, the scans rising.
+        points, owners, bounds: as in :class:`~sst_graph.association.edge_matching.Facing`.
+        own_tracks: (n,) track of the object of each point, or None where objects have no biases.
+        unknown_mps: (n,) how much of the motion of each point's object is not known, or None where all stand.
+        velocities: (n, 3) of each point's object over ground, in the LiDAR frame, or None where none is known
+            to move [m/s].
+    """
+
+    number: int
+    drive: Drive
+    tracks: Tracks
+    config: GraphConfig
+    scans: tuple[int, ...]
+    classes: tuple[SemanticClass, ...]
+    points: Boundaries
+    owners: IntArray
+    bounds: IntArray
+    own_tracks: IntArray | None
+    unknown_mps: FloatArray | None
+    velocities: FloatArray | None
+
+    @classmethod
+    def of(cls, number: int, drive: Drive, tracks: Tracks, config: GraphConfig) -> DriveOutlines | None:
+        """All of a drive; None where it has no boundary point."""
+        groups = [
+            (k, c, points)
+            for k, scan in enumerate(drive.scans)
+            for c, points in outlines(scan, config.undersides).items()
+            if len(points)
+        ]
+        if not groups:
+            return None
+        parts = [points for _, _, points in groups]
+        own = None
+        if tracks.objects is not None:
+            known = tracks.objects[number]
+            own = np.concatenate(
+                [
+                    of_each(points.objects, {n: known[k, c, n] for n in numbers_in(points.objects)})
+                    for k, c, points in groups
+                ]
+            )
+        unknown_mps, velocities = _own_motion([(tracks.movers(number, k), c, b) for k, c, b in groups])
+        return cls(
+            number,
+            drive,
+            tracks,
+            config,
+            tuple(k for k, _, _ in groups),
+            tuple(c for _, c, _ in groups),
+            joined(parts),
+            numbered_through([points.objects for points in parts]),
+            np.cumsum([0, *map(len, parts)]),
+            own,
+            unknown_mps,
+            velocities,
+        )
+
+    def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
+        """Pair scans with images in true time under a state, and match their silhouettes; None without."""
+        drive, offset_s = self.drive, state.offset_s(self.number)
+        limit = self.config.max_interval_periods * drive.image_period_s
+        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, limit)
+        # 1. The groups that have an image, and in it a contour of their class.
+        numbers = {pair.scan: number for number, pair in enumerate(pairs)}
+        groups = [
+            (g, numbers[k])
+            for g, (k, c) in enumerate(zip(self.scans, self.classes, strict=True))
+            if k in numbers and c in drive.images[pairs[numbers[k]].image].contours
+        ]
+        if not groups:
+            return None
+        chosen = np.array([g for g, _ in groups])
+        # 2. The motion around the images.
+        motions = _Motions.of(self, pairs, state)
+        # 3. The points, without the objects that would keep nothing of their weight.
+        facing, index = self._facing(groups, pairs, motions, state)
+        shares = None
+        if self.unknown_mps is not None:
+            taus_s = offset_s + facing.repeated([pairs[p].base_tau_s for _, p in groups])
+            shares = standing_shares(self.unknown_mps[index], taus_s, self.config.mover_reach_m)
+            if not shares.all():
+                kept = np.flatnonzero(shares)
+                facing, index, shares = facing.take(kept), index[kept], shares[kept]
+        # 4. Their matches.
+        scene = motions.scene(drive, facing.repeated([p for _, p in groups]))
+        deviation = deviation_of(state.nuisances, scene)
+        found = match_facing(facing, state.cTl, offset_s, kernel, self.config.match, deviation)
+        if len(found.index) == 0:
+            return None
+        if shares is not None and not (shares == 1.0).all():
+            weights = shares[found.index] * found.alignment.weights
+            found = replace(found, alignment=replace(found.alignment, weights=weights))
+        firsts = facing.bounds[:-1]
+        return DriveMatches(
+            self,
+            pairs,
+            motions,
+            found,
+            np.array([p for _, p in groups]),
+            [self.classes[g] for g in chosen.tolist()],
+            index[found.index],
+            found.index - np.repeat(firsts, np.diff(found.bounds)),
+            state.cTl,
+            offset_s,
+        )
+
+    def _facing(
+        self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
+    ) -> tuple[Facing, IntArray]:
+        """The points of groups with their pairs' images, and which of all points they are."""
+        drive, biases = self.drive, state.biases_of(self.number)
+        spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
+        bounds = np.cumsum([0, *(b - a for a, b in spans)])
+        whole = len(groups) == len(self.scans)
+        index = np.concatenate([np.arange(a, b) for a, b in spans])
+        points = self.points if whole else self.points.take(index)
+        velocities = self.velocities if whole or self.velocities is None else self.velocities[index]
+        if velocities is not None and not velocities.any():
+            velocities = None
+        classes = [self.classes[g] for g, _ in groups]
+        base_taus_s = np.array([pairs[p].base_tau_s for _, p in groups])
+        facing = Facing(
+            drive.camera,
+            points,
+            self.owners if whole else self.owners[index],
+            bounds,
+            [drive.images[pairs[p].image].contours[c] for (_, p), c in zip(groups, classes, strict=True)],
+            [motions.of_images[p] for _, p in groups],
+            np.repeat(base_taus_s, np.diff(bounds)) - points.offsets_s,
+            np.array([biases.get(c, 0.0) for c in classes]),
+            velocities,
+        )
+        return facing, index
+
+
+@dataclass(frozen=True)
+class _Motions:
+    """The motion around the images of pairs.
+
+    Attributes:
+        of_images: the camera's.
+        l_twists: the LiDAR's, or None where no odometry tells them.
+        measured: (p, 6) the LiDAR's as measured; zeros where no odometry tells it [rad/s, m/s].
+        since_s: (p,) stamps of the images minus that of the drive's first [s].
+    """
+
+    of_images: Sequence[Motion]
+    l_twists: TwistSamples | None
+    measured: FloatArray
+    since_s: FloatArray
+
+    @classmethod
+    def of(cls, outlines: DriveOutlines, pairs: Sequence[Pair], state: State) -> _Motions:
+        """Under a state."""
+        drive, number = outlines.drive, outlines.number
+        stamps = [drive.images[pair.image].stamp_ns for pair in pairs]
+        shift_ns = round(state.offset_s(number) * 1e9)
+        origin_ns = drive.images[0].stamp_ns if drive.origin_ns is None else drive.origin_ns
+        since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
+        l_twists = outlines.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
+        if l_twists is None:
+            rest = Motion(np.zeros(6), np.zeros(6))
+            return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
+        measured = l_twists.twists
+        l_twists = moved_twists(
+            l_twists, state.nuisances, Scene(drive.camera, measured, 0.0, drive.scan_period_s)
+        )
+        Ad = np.asarray(state.cTl.AdjointMap())
+        rows = zip(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, strict=True)
+        return cls([Motion(*row) for row in rows], l_twists, measured, since_s)
+
+    def scene(self, drive: Drive, of: IntArray | int) -> Scene:
+        """What assumptions depend on, of some of the pairs."""
+        since_s = self.since_s[of]
+        return Scene(drive.camera, self.measured[of], since_s, drive.scan_period_s)
+
+
+@dataclass(frozen=True)
+class DriveMatches:
+    """All matches of a drive, pair by pair and class by class.
+
+    Attributes:
+        outlines: of the drive.
+        pairs: all pairs, also those without a match.
+        motions: around their images.
+        found: the matches, group by group.
+        group_pairs, group_classes: pair and class of each group.
+        points: (m,) which of the drive's points each match is, and
+        places: (m,) which of those that were looked at of its scan and class.
+        cTl, offset_s: where they were made.
+    """
+
+    outlines: DriveOutlines
+    pairs: Sequence[Pair]
+    motions: _Motions
+    found: FacingMatches
+    group_pairs: IntArray
+    group_classes: Sequence[SemanticClass]
+    points: IntArray
+    places: IntArray
+    cTl: gtsam.Pose3
+    offset_s: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @property
+    def alignment(self) -> Alignment:
+        """Of all matches."""
+        return self.found.alignment
+
+    @property
+    def number(self) -> int:
+        """Of the drive."""
+        return self.outlines.number
+
+    @cached_property
+    def counts(self) -> IntArray:
+        """(g,) matches of each group."""
+        return np.diff(self.found.bounds)
+
+    @cached_property
+    def pair_of(self) -> IntArray:
+        """(m,) number of each match's pair."""
+        return np.repeat(self.group_pairs, self.counts)
+
+    @cached_property
+    def paired(self) -> list[int]:
+        """Numbers of the pairs that have matches."""
+        return list(np.unique(self.pair_of).tolist())
+
+    @cached_property
+    def c_twists(self) -> FloatArray:
+        """(p, 6) of the camera at the image of each pair [rad/s, m/s]."""
+        return np.stack([motion.c_twist for motion in self.motions.of_images])
+
+    @cached_property
+    def tracks(self) -> IntArray | None:
+        """(m,) track whose mask bias each match has: its object's or the undersides' of its class; None where
+        objects share their class's."""
+        own = self.outlines.own_tracks
+        if own is None:
+            return None
+        below = np.repeat([underside_track(c) for c in self.group_classes], self.counts)
+        return np.where(self.found.sides == BOTTOM, below, own[self.points])
+
+    @property
+    def classes(self) -> list[SemanticClass]:
+        """Those that have matches."""
+        present = {c for c, count in zip(self.group_classes, self.counts.tolist(), strict=True) if count}
+        return sorted(present)
+
+    @property
+    def tracked(self) -> set[tuple[int, SemanticClass, int]]:
+        """(drive, class, track) of every object with a mask bias of its own."""
+        if self.tracks is None:
+            return set()
+        spans = pairwise(self.found.bounds.tolist())
+        return {
+            (self.number, c, track)
+            for c, (a, b) in zip(self.group_classes, spans, strict=True)
+            for track in np.unique(self.tracks[a:b]).tolist()
+        }
+
+    @cached_property
+    def terms(self) -> dict[str, FloatArray]:
+        """(m,) derivative of each residual by the parameters that are estimated, by name."""
+        names = [name for name, _ in named_sigmas(self.outlines.config.estimate)]
+        if not names:
+            return {}
+        pair = self.pair_of
+        base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
+        at = self.cTl, self.offset_s, self.c_twists[pair].T
+        scene = self.motions.scene(self.outlines.drive, pair)
+        return residual_columns(self.alignment, scene, base_taus_s, at, names)
+
+    def by_pair(self) -> list[PairMatches]:
+        """The same pair by pair, of those that have matches."""
+        groups: dict[int, dict[SemanticClass, tuple[slice, int]]] = {}
+        spans = pairwise(self.found.bounds.tolist())
+        for p, c, (a, b), seen in zip(
+            self.group_pairs.tolist(), self.group_classes, spans, self.found.seen.tolist(), strict=True
+        ):
+            if b > a:
+                groups.setdefault(p, {})[c] = slice(a, b), seen
+        return [self._pair(p, own) for p, own in groups.items()]
+
+    def _pair(self, p: int, groups: Mapping[SemanticClass, tuple[slice, int]]) -> PairMatches:
+        objects, motion = self.outlines.points.objects, self.motions.of_images[p]
+        l_twists, tracks = self.motions.l_twists, self.tracks
+        return PairMatches(
+            self.number,
+            self.pairs[p],
+            None if l_twists is None else l_twists[p],
+            motion,
+            {
+                c: SilhouetteMatches(
+                    self._alignment_of(own, motion),
+                    objects[self.points[own]],
+                    self.found.sides[own],
+                    self.places[own],
+                    seen,
+                )
+                for c, (own, seen) in groups.items()
+            },
+            {} if tracks is None else {c: tracks[own] for c, (own, _) in groups.items()},
+            replace(self.motions.scene(self.outlines.drive, p), image_s=float(self.motions.since_s[p])),
+            {
+                c: {name: column[own] for name, column in self.terms.items()}
+                for c, (own, _) in groups.items()
+                if self.terms
+            },
+        )
+
+    def _alignment_of(self, own: slice, motion: Motion) -> Alignment:
+        """Of one group."""
+        alone = own == slice(0, len(self)) and self.alignment.c_acceleration.ndim == 1
+        return self.alignment if alone else self.alignment.of_one_image(own, motion.c_acceleration)
+
+
+def _own_motion(
+    groups: Sequence[tuple[Movers, SemanticClass, Boundaries]],
+) -> tuple[FloatArray | None, FloatArray | None]:
+    """How much of the motion of each point's object is not known (n,), and its velocity (n, 3); None where no
+    object moves."""
+    unknown = [np.zeros(len(points)) for _, _, points in groups]
+    velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
+    for (movers, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
+        for (other, n), mover in movers.items():
+            if other == c:
+                own = points.objects == n
+                slow[own] = mover.unknown_mps
+                if mover.velocity is not None:
+                    known[own] = mover.velocity.l_velocity
+    slow, known = np.concatenate(unknown), np.concatenate(velocities)
+    return slow if slow.any() else None, known if known.any() else None
+
+
+def outlines_of(drives: Sequence[Drive], tracks: Tracks, config: GraphConfig) -> list[DriveOutlines]:
+    """The outlines of drives, to be matched again and again; drives without any are left out."""
+    found = [DriveOutlines.of(number, drive, tracks, config) for number, drive in enumerate(drives)]
+    return [outlines for outlines in found if outlines is not None]
+
+
+def match_all(outlines: Sequence[DriveOutlines], state: State, kernel: RobustKernel) -> list[DriveMatches]:
+    """The matches of each drive under a state; drives without any are left out."""
+    found = [own.match(state, kernel) for own in outlines]
+    return [matches for matches in found if matches is not None]
+
+
+def associate(
+    drives: Sequence[Drive], tracks: Tracks, state: State, kernel: RobustKernel, config: GraphConfig
+) -> list[PairMatches]:
+    """Pair scans with images in true time under a state, and match their silhouettes."""
+    found = match_all(outlines_of(drives, tracks, config), state, kernel)
+    return [pair for matches in found for pair in matches.by_pair()]
+
+
+def _by_scan(movers: Mapping[ObjectId, Mover]) -> dict[int, Movers]:
+    found: dict[int, Movers] = {}
+    for (scan, c, n), mover in movers.items():
+        found.setdefault(scan, {})[c, n] = mover
+    return found

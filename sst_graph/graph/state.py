@@ -1,0 +1,103 @@
+"""The estimate that travels through the outer loop, and its keys in the graph."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import gtsam
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.types import SemanticClass
+
+EXTRINSIC = gtsam.symbol("E", 0)
+"""Key of the extrinsic cTl (Pose3)."""
+
+_IMAGES_PER_DRIVE = 10_000_000
+
+
+def time_offset_key(clock: int = 0) -> int:
+    """Key of the time offset of a clock (``Vector(1)``); drives share clock 0 unless each has its own."""
+    return int(gtsam.symbol("D", clock))
+
+
+def twist_key(drive: int, image: int) -> int:
+    """Key of the camera's twist at an image (``Vector(6)``)."""
+    return int(gtsam.symbol("V", drive * _IMAGES_PER_DRIVE + image))
+
+
+def bias_key(drive: int, semantic_class: SemanticClass) -> int:
+    """Key of the mask bias of a class in a drive (``Vector(1)``, px)."""
+    return int(gtsam.symbol("B", drive * 256 + int(semantic_class)))
+
+
+def underside_track(semantic_class: SemanticClass) -> int:
+    """Stands for the undersides of a class among the tracks of its objects: they share a mask bias."""
+    return _IMAGES_PER_DRIVE - 256 + int(semantic_class)
+
+
+def object_bias_key(drive: int, track: int) -> int:
+    """Key of the mask bias of one object, by its track (``Vector(1)``, px)."""
+    return int(gtsam.symbol("O", drive * _IMAGES_PER_DRIVE + track))
+
+
+_Key = TypeVar("_Key")
+
+
+def nuisance_key(name: str) -> int:
+    """Key of the parameter of an assumption that is estimated (``Vector(1)``)."""
+    return int(gtsam.symbol("N", list(ASSUMPTIONS).index(name)))
+
+
+@dataclass(frozen=True)
+class State:
+    """The current estimate.
+
+    Attributes:
+        cTl: extrinsic.
+        offsets_s: time offset of each clock [s].
+        biases_px: mask bias by (drive, class) [px]; 0 where it is missing.
+        object_biases_px: mask bias by (drive, track of an object) [px]; its class's where it is missing.
+        nuisances: values of the assumptions' parameters, by name; 0 where it is missing.
+    """
+
+    cTl: gtsam.Pose3
+    offsets_s: tuple[float, ...] = (0.0,)
+    biases_px: Mapping[tuple[int, SemanticClass], float] = field(default_factory=dict)
+    object_biases_px: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    nuisances: Mapping[str, float] = field(default_factory=dict)
+
+    def clock(self, drive: int) -> int:
+        """Number of the clock that a drive's time offset belongs to."""
+        return drive if len(self.offsets_s) > 1 else 0
+
+    def offset_s(self, drive: int) -> float:
+        """Time offset of a drive [s]."""
+        return self.offsets_s[self.clock(drive)]
+
+    def object_bias_px(self, drive: int, track: int, semantic_class: SemanticClass) -> float:
+        """Mask bias of one object [px]."""
+        of_class = self.biases_px.get((drive, semantic_class), 0.0)
+        return self.object_biases_px.get((drive, track), of_class)
+
+    def biases_of(self, drive: int) -> dict[SemanticClass, float]:
+        """Mask biases of a drive by class [px]."""
+        return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}
+
+    def towards(self, other: State, share: float) -> State:
+        """The state this share of the way to another one, which knows every bias that this one does."""
+        if share >= 1.0:
+            return other
+        step = share * gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        return State(
+            self.cTl.compose(gtsam.Pose3.Expmap(step)),
+            tuple(a + share * (b - a) for a, b in zip(self.offsets_s, other.offsets_s, strict=True)),
+            _between(self.biases_px, other.biases_px, share),
+            _between(self.object_biases_px, other.object_biases_px, share),
+            _between(self.nuisances, other.nuisances, share),
+        )
+
+
+def _between(mine: Mapping[_Key, float], its: Mapping[_Key, float], share: float) -> dict[_Key, float]:
+    return {key: (1.0 - share) * mine.get(key, value) + share * value for key, value in its.items()}

@@ -1,0 +1,1 @@
+"""Calibration from motion alone: LiDAR odometry against visual odometry."""

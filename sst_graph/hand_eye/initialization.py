@@ -1,0 +1,130 @@
+"""Where hand-eye calibration starts: the rotation in closed form, the time offset by trying all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.drive.path import SensorPath
+from sst_graph.hand_eye.graph import CameraStep, MotionPair, pair_motions
+
+FloatArray = NDArray[np.float64]
+
+_ROUNDS = 6
+_MOST_STEPS = 200
+"""Most offsets tried to either side: each takes some 10 ms."""
+
+
+@dataclass(frozen=True)
+class MotionStartConfig(Settings):
+    """The grid of time offsets and what counts in it.
+
+    Attributes:
+        max_offset_s: farthest time offset tried, either side [s].
+        step_s: between offsets [s].
+        contenders: most offsets, each the best of its neighbourhood, that are refined.
+        max_pairs: most pairs looked at.
+        least_share: an offset for which fewer of the pairs have LiDAR motion is not tried.
+        lever_m: translation of the extrinsic that is left out of the directions, as a sigma [m].
+        truncation: whitened size at which a residual stops to cost more.
+        guess_rad: sigma of the guess's rotation [rad].
+    """
+
+    max_offset_s: float = setting(0.5, at_least=0.0, at_most=10.0)
+    step_s: float = setting(0.02, at_least=0.001, at_most=1.0)
+    contenders: int = setting(4, at_least=1, at_most=100)
+    max_pairs: int = setting(150, at_least=2, at_most=2000)
+    least_share: float = setting(0.4, at_least=0.0, at_most=1.0)
+    lever_m: float = setting(0.4, at_least=0.0, at_most=100.0)
+    truncation: float = setting(5.0, at_least=0.1, at_most=1000.0)
+    guess_rad: float = setting(1.0, at_least=0.001, at_most=100.0)
+
+    def __post_init__(self) -> None:
+        self.expect_at_most("max_offset_s", _MOST_STEPS * self.step_s, f"{_MOST_STEPS} step_s")
+
+
+@dataclass(frozen=True)
+class MotionStart:
+    """A rotation and a time offset to begin with, and what they cost a pair."""
+
+    cRl: gtsam.Rot3
+    offset_s: float
+    cost: float
+
+
+def motion_starts(
+    steps: Sequence[CameraStep],
+    paths: Sequence[SensorPath],
+    guess: gtsam.Rot3 | None,
+    guess_offset_s: float,
+    config: MotionStartConfig,
+) -> list[MotionStart]:
+    """The best starts, one for each minimum over the time offset, cheapest first; none without motion.
+
+    Rotation vectors and directions of travel of the LiDAR are turned into the camera's (Kabsch, robustly
+    weighted) at every time offset of the grid. Directions leave out the lever arm.
+    """
+    chosen = np.unique(np.linspace(0, len(steps) - 1, min(config.max_pairs, len(steps))).astype(int))
+    some = [steps[i] for i in chosen] if steps else []
+    count = int(np.ceil(config.max_offset_s / config.step_s))
+    grid = guess_offset_s + config.step_s * np.arange(-count, count + 1)
+    found: list[MotionStart | None] = []
+    for offset_s in grid:
+        pairs = pair_motions(some, paths, float(offset_s))
+        enough = len(pairs) >= max(2, config.least_share * len(some))
+        found.append(_best_rotation(pairs, float(offset_s), guess, config) if enough else None)
+    return _minima(found)[: config.contenders]
+
+
+def _minima(found: Sequence[MotionStart | None]) -> list[MotionStart]:
+    """Those no dearer than both of their neighbours, cheapest first."""
+    costs = np.array([np.inf if one is None else one.cost for one in found])
+    around = np.concatenate([[np.inf], costs, [np.inf]])
+    lowest = np.isfinite(costs) & (costs <= around[:-2]) & (costs <= around[2:])
+    return sorted((one for one, low in zip(found, lowest, strict=True) if one and low), key=lambda s: s.cost)
+
+
+def _best_rotation(
+    pairs: Sequence[MotionPair], offset_s: float, guess: gtsam.Rot3 | None, config: MotionStartConfig
+) -> MotionStart:
+    """Robust Kabsch over rotation vectors and directions."""
+    l_vectors, c_vectors, sigmas = _vectors(pairs, config)
+    prior = np.zeros((3, 3)) if guess is None else guess.matrix() / config.guess_rad**2
+    weights = np.ones(len(sigmas))
+    R = np.eye(3)
+    for _ in range(_ROUNDS):
+        moment = (c_vectors * (weights / sigmas**2)[:, None]).T @ l_vectors + prior
+        U, _, Vt = np.linalg.svd(moment)
+        R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        size = np.linalg.norm(c_vectors - l_vectors @ R.T, axis=1) / sigmas
+        weights = 1.0 / (1.0 + (size / config.truncation) ** 2) ** 2
+    cost = float(np.minimum(size, config.truncation) @ np.minimum(size, config.truncation)) / len(size)
+    return MotionStart(gtsam.Rot3(R), offset_s, cost)
+
+
+def _vectors(
+    pairs: Sequence[MotionPair], config: MotionStartConfig
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n, 3) vectors in the LiDAR, (n, 3) the same in the camera, (n,) sigmas: rotations, directions."""
+    of_lidar, of_camera, sigmas = [], [], []
+    for pair in pairs:
+        motion, step = pair.camera.motion, pair.lidar
+        turn = gtsam.Rot3.Logmap(step.aTb.rotation())
+        of_lidar.append(turn)
+        of_camera.append(gtsam.Rot3.Logmap(pair.camera.rotation))
+        variance = np.trace(motion.covariance[:3, :3]) + np.trace(step.covariance[:3, :3])
+        sigmas.append(np.sqrt(variance / 3.0))
+        length = float(np.linalg.norm(step.aTb.translation()))
+        lever = config.lever_m * float(np.linalg.norm(turn))
+        if not motion.ok or length < 2.0 * lever or length < 1e-3:
+            continue
+        of_lidar.append(step.aTb.translation() / length)
+        of_camera.append(motion.direction)
+        across = np.trace(step.covariance[3:, 3:]) / 3.0 + lever**2
+        sigmas.append(np.sqrt(np.trace(motion.covariance[3:, 3:]) / 2.0 + across / length**2))
+    return np.array(of_lidar), np.array(of_camera), np.array(sigmas)

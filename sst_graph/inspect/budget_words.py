@@ -1,0 +1,76 @@
+"""Where a result's sigmas come from: matches, motion, and what is taken for granted, as a table."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.covariance.considered import BUDGET
+from sst_graph.errors import printable
+from sst_graph.files.checked_values import MAX_SIGMA
+from sst_graph.result import CalibrationResult
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_SHARE = 0.01
+"""Parts that give less than this share of every variance are not shown."""
+
+
+def budget_lines(result: CalibrationResult) -> list[str]:
+    """A line a part: its largest sigma among the rotations and among the translations, and the offset's."""
+    parts = _parts(result)
+    if not parts:
+        return []
+    total = np.diag(result.covariance)
+    lines = ["where the sigmas come from (largest axis)     rotation  translation  time offset"]
+    for name, sigmas in parts.items():
+        if name in ASSUMPTIONS and (sigmas**2 < _LEAST_SHARE * total).all():
+            continue
+        rotation, translation = np.degrees(sigmas[:3].max()), 100.0 * sigmas[3:6].max()
+        label = printable(name) if name not in ASSUMPTIONS else _label(name, result)
+        lines.append(f"  {label:<44}{rotation:>7.3f} deg {translation:>8.2f} cm {1e3 * sigmas[6]:>9.2f} ms")
+    return lines
+
+
+def estimated_lines(result: CalibrationResult) -> list[str]:
+    """The parameters of assumptions that were estimated with the calibration, with their sigmas."""
+    stored = result.diagnostics.get("estimated")
+    lines = []
+    for name, entry in stored.items() if isinstance(stored, dict) else ():
+        values = [entry.get(key) for key in ("value", "sigma")] if isinstance(entry, dict) else [None]
+        if name in ASSUMPTIONS and all(_is_number(v) for v in values):
+            lines.append(ASSUMPTIONS[name].figure(*values))
+    return lines
+
+
+def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
+    """(7,) sigmas of each part; empty where the result does not tell them."""
+    stored = result.diagnostics.get(BUDGET)
+    if not isinstance(stored, dict):
+        return {}
+    parts = {}
+    for name, sigmas in stored.items():
+        if isinstance(sigmas, list) and len(sigmas) == 7 and all(_is_sigma(s) for s in sigmas):
+            parts[name] = np.array(sigmas, dtype=np.float64)
+    return parts
+
+
+def _is_sigma(value: Any) -> bool:
+    return _is_number(value) and value >= 0.0
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_SIGMA
+
+
+def _label(name: str, result: CalibrationResult) -> str:
+    """An assumption and the deviation of its parameter that was considered."""
+    stored = result.diagnostics.get("assumptions")
+    entry = stored.get(name) if isinstance(stored, dict) else None
+    sigma = entry.get("sigma") if isinstance(entry, dict) else None
+    if not _is_sigma(sigma):
+        return name
+    return f"{name} off by {sigma:.2g} {ASSUMPTIONS[name].unit}".rstrip()

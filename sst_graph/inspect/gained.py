@@ -1,0 +1,125 @@
+"""What methods other than the joint one can say of each frame, as it stands in ``calibration.json``.
+
+Under ``diagnostics.information_gained``: the tracker tells what each scan brought as it came, the hand-eye
+method what each pair of motions adds to the others. Both are less than
+:mod:`sst_graph.inspect.frame_information`: no view is kept, so what to record next cannot be predicted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError, printable
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm, state_values
+from sst_graph.inspect.frame_information import MAX_NUMBER
+from sst_graph.result import CalibrationResult, FrameId
+
+FloatArray = NDArray[np.float64]
+
+KEY = "information_gained"
+"""Where it stands in the diagnostics of a result."""
+
+Kind = Literal["as they came", "beside the others"]
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What one frame, or one pair of motions, brought. Order of seven: the covariance's.
+
+    Attributes:
+        frame: which frame; of a pair, the image that begins it.
+        bits: information on extrinsic and offset [bit]: that the covariance gained with the frame, or that
+            the pair adds to all others; None where there was nothing before.
+        values: (7,) sigmas after the frame [rad, m, s], or sigmas without the pair over those with it.
+    """
+
+    frame: FrameId
+    bits: float | None
+    values: FloatArray
+
+
+@dataclass(frozen=True)
+class Gained:
+    """All of them, in their order; ``kind`` tells what bits and values mean."""
+
+    kind: Kind
+    gains: tuple[Gain, ...]
+
+
+def bits_between(before: FloatArray, after: FloatArray) -> float:
+    """Information gained from one covariance (n, n) to another [bit]; negative where it grew."""
+    return 0.5 * (_log_det(before) - _log_det(after)) / float(np.log(2.0))
+
+
+def pair_gains(
+    terms: Sequence[HandEyeTerm], frames: Sequence[FrameId], state: State, priors: HandEyePriors
+) -> Gained:
+    """What each pair of motions adds to all others, the pairs counted as independent."""
+    values = state_values(state)
+    sigmas = np.append(np.repeat([priors.rotation_rad, priors.translation_m], 3), priors.offset_s)
+    both = np.outer(sigmas, sigmas)
+    parts = [both * term.factor.linearize(values).information() for term in terms]
+    total = np.eye(7) + np.sum(parts, axis=0)
+    covariance, gains = np.linalg.inv(total), []
+    for frame, part in zip(frames, parts, strict=True):
+        without = np.linalg.inv(total - part)
+        ratios = np.sqrt(np.diag(without) / np.diag(covariance))
+        gains.append(Gain(frame, bits_between(without, covariance), ratios))
+    return Gained("beside the others", tuple(gains))
+
+
+def to_document(gained: Gained) -> dict[str, Any]:
+    """JSON-able columns, four significant digits."""
+    gains = gained.gains
+    return {
+        "kind": gained.kind,
+        "drive": [gain.frame.drive for gain in gains],
+        "frame": [gain.frame.frame for gain in gains],
+        "bits": [None if gain.bits is None else _rounded(gain.bits) for gain in gains],
+        "values": [[_rounded(float(value)) for value in gain.values] for gain in gains],
+    }
+
+
+def gained_of(result: CalibrationResult) -> Gained | None:
+    """What a result says of each frame, or None.
+
+    Raises:
+        DataError: the entry is there, and is not such columns.
+    """
+    document, place = result.diagnostics.get(KEY), f"diagnostics.{KEY}"
+    if document is None:
+        return None
+    if not isinstance(document, Mapping) or document.get("kind") not in get_args(Kind):
+        raise DataError(place, "no such object", f"kind {' or '.join(map(repr, get_args(Kind)))}")
+    try:
+        columns = zip(document["drive"], document["frame"], document["bits"], document["values"], strict=True)
+        gains = tuple(
+            Gain(
+                FrameId(printable(drive), int(frame)),
+                None if bits is None else float(bits),
+                np.array(values, dtype=np.float64).reshape(7),
+            )
+            for drive, frame, bits, values in columns
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(place, f"no such columns ({error})", "drive, frame, bits, values (7)") from None
+    if not all((np.abs([*gain.values, gain.bits or 0.0]) <= MAX_NUMBER).all() for gain in gains):
+        expected = f"finite numbers of at most {MAX_NUMBER:g}"
+        raise DataError(place, "a value that is not finite, or huge", expected)
+    return Gained(document["kind"], gains)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def _log_det(covariance: FloatArray) -> float:
+    sigmas = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(sigmas, sigmas)
+    return float(np.linalg.slogdet(correlation)[1] + 2.0 * np.log(sigmas).sum())

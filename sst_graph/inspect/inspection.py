@@ -1,0 +1,285 @@
+"""How far a result can be trusted, in numbers for people: sigmas, correlations, weak directions, frames.
+
+Pure functions of a :class:`~sst_graph.result.CalibrationResult`; nothing is measured anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
+from sst_graph.errors import DataError
+from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
+from sst_graph.inspect.gained import Gained, gained_of
+from sst_graph.inspect.planning import Plan, limits_of, plan_recording
+from sst_graph.result import CalibrationResult, Sigmas, WeakDirection
+
+FloatArray = NDArray[np.float64]
+
+NAMES = ("rotation x", "rotation y", "rotation z", "x", "y", "z", "time offset")
+UNITS = ("deg", "deg", "deg", "cm", "cm", "cm", "ms")
+HUMAN: FloatArray = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
+"""(7,) from SI to :data:`UNITS`."""
+
+RANGES_M = (5.0, 20.0, 50.0)
+"""Ranges for which the error in the image is told [m]."""
+
+
+@dataclass(frozen=True)
+class InspectConfig(Settings):
+    """What is told, and from where on.
+
+    Attributes:
+        strong: least correlation that is put into words.
+        redundant: a frame is redundant if no sigma grows by more than this share without it.
+        next_frames: frames that the predictions add.
+    """
+
+    strong: float = setting(0.6, at_least=0.0, at_most=1.0)
+    redundant: float = setting(0.01, at_least=0.0, at_most=10.0)
+    next_frames: int = setting(10, at_least=1, at_most=1_000_000)
+
+
+@dataclass(frozen=True)
+class Correlation:
+    """Two unknowns that the data tie together; numbers of the covariance's order.
+
+    Attributes:
+        first, second: the two.
+        value: correlation, -1 to 1.
+        slope: change of the second for a change of the first [SI].
+        first_alone, second_alone: sigma of each if the other were known [SI].
+    """
+
+    first: int
+    second: int
+    value: float
+    slope: float
+    first_alone: float
+    second_alone: float
+
+
+@dataclass(frozen=True)
+class PixelSigma:
+    """Error in the image of a point straight ahead, one sigma, everything at rest.
+
+    Attributes:
+        range_m: its depth [m].
+        across_px, down_px: along the image's x and y [px].
+    """
+
+    range_m: float
+    across_px: float
+    down_px: float
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What there is to say about a result's uncertainty.
+
+    Attributes:
+        result: the result.
+        lidar: sigmas about and along the LiDAR's axes.
+        camera: the same about and along the camera's axes (x right, y down, z forward).
+        pixels: error in the image.
+        correlation: (7, 7).
+        strong: the strongest correlations, strongest first.
+        weakest: the direction known worst, measured in the limits, also where it is within them.
+        frames: what each frame brought; empty where the result does not tell.
+        redundant: positions in ``frames`` of those that each could be left out ...
+        redundant_share: ... without any sigma growing by more than this share.
+        plan: what to record next, or None without ``frames``.
+        gained: what else the result says of each frame, or None.
+    """
+
+    result: CalibrationResult
+    lidar: Sigmas
+    camera: Sigmas
+    pixels: tuple[PixelSigma, ...]
+    correlation: FloatArray
+    strong: tuple[Correlation, ...]
+    weakest: WeakDirection
+    frames: tuple[FrameInformation, ...]
+    redundant: tuple[int, ...]
+    redundant_share: float
+    plan: Plan | None
+    gained: Gained | None
+
+
+def inspect_result(result: CalibrationResult, config: InspectConfig | None = None) -> Inspection:
+    """Everything there is to say about a result's uncertainty.
+
+    Raises:
+        DataError: the result's information by frame is malformed.
+    """
+    config = config or InspectConfig()
+    frames = frames_of(result)
+    limits = limits_of(result)
+    return Inspection(
+        result,
+        result.sigmas(),
+        camera_sigmas(result),
+        tuple(pixel_sigma(result, range_m) for range_m in RANGES_M),
+        correlation_matrix(result.covariance),
+        strong_correlations(result.covariance, config.strong),
+        weakest_direction(result, limits),
+        frames,
+        redundant_frames(frames, config.redundant),
+        config.redundant,
+        _plan(result, frames, config.next_frames),
+        gained_of(result),
+    )
+
+
+def _plan(result: CalibrationResult, frames: tuple[FrameInformation, ...], next_frames: int) -> Plan | None:
+    """What to record next; None without information by frame.
+
+    Raises:
+        DataError: that information is none that a calibration can have.
+    """
+    if not frames:
+        return None
+    try:
+        with np.errstate(all="ignore"):
+            return plan_recording(result, frames, next_frames)
+    except np.linalg.LinAlgError as error:
+        place = f"diagnostics.{KEY}"
+        raise DataError(place, f"numbers that predict nothing ({error})", "information by frame") from error
+
+
+def correlation_matrix(covariance: FloatArray) -> FloatArray:
+    """(n, n) correlations; an unknown without variance is correlated with nothing."""
+    sigmas = np.sqrt(np.diag(covariance))
+    scale = np.where(sigmas > 0.0, sigmas, 1.0)
+    correlation = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
+    np.fill_diagonal(correlation, 1.0)
+    return np.asarray(correlation)
+
+
+def strong_correlations(covariance: FloatArray, least: float) -> tuple[Correlation, ...]:
+    """Pairs of unknowns whose correlation is ``least`` or more, either sign, strongest first."""
+    sigmas, values = np.sqrt(np.diag(covariance)), correlation_matrix(covariance)
+    found = []
+    for i, j in zip(*np.triu_indices(len(sigmas), 1), strict=True):
+        value = float(values[i, j])
+        if abs(value) < least:
+            continue
+        rest = float(np.sqrt(max(0.0, 1.0 - value**2)))
+        slope = value * float(sigmas[j] / sigmas[i])
+        found.append(
+            Correlation(int(i), int(j), value, slope, rest * float(sigmas[i]), rest * float(sigmas[j]))
+        )
+    return tuple(sorted(found, key=lambda pair: -abs(pair.value)))
+
+
+def camera_covariance(result: CalibrationResult) -> FloatArray:
+    """(7, 7) covariance with rotation and translation about and along the camera's axes."""
+    R = result.T_camera_lidar.rotation().matrix()
+    turn = np.eye(7)
+    turn[:3, :3] = turn[3:6, 3:6] = R
+    return np.asarray(turn @ result.covariance @ turn.T)
+
+
+def camera_sigmas(result: CalibrationResult) -> Sigmas:
+    """Standard deviations about and along the camera's axes, in degrees, centimetres and milliseconds."""
+    rx, ry, rz, x, y, z, offset = (HUMAN * np.sqrt(np.diag(camera_covariance(result)))).tolist()
+    return Sigmas((rx, ry, rz), (x, y, z), offset)
+
+
+def pixel_sigma(result: CalibrationResult, range_m: float) -> PixelSigma:
+    """Where a point on the optical axis lands in the image, to one sigma, by the extrinsic's covariance."""
+    cP = np.array([0.0, 0.0, range_m])
+    lP = result.T_camera_lidar.transformTo(cP)
+    R = result.T_camera_lidar.rotation().matrix()
+    x, y, z = lP
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    cP_H_cTl = R @ np.hstack([-cross, np.eye(3)])
+    J = result.camera.uv_H_cP(cP[None])[0] @ cP_H_cTl
+    across, down = np.sqrt(np.diag(J @ result.covariance[:6, :6] @ J.T)).tolist()
+    return PixelSigma(range_m, across, down)
+
+
+def weakest_direction(result: CalibrationResult, limits: ObservabilityConfig) -> WeakDirection:
+    """The direction known worst, each unknown measured in its limit; also where it is within the limits."""
+    least = {
+        name: max(1e-9 * getattr(limits, name), 1e-30)
+        for name in ("rotation_deg", "translation_m", "offset_s")
+    }
+    tiny = dataclasses.replace(limits, **least)
+    return weak_directions(result.covariance, result.T_camera_lidar, tiny)[0]
+
+
+def redundant_frames(frames: Sequence[FrameInformation], share: float) -> tuple[int, ...]:
+    """Positions of the frames without which, one at a time, no sigma grows by more than ``share``."""
+    return tuple(k for k, frame in enumerate(frames) if frame.without.max() <= 1.0 + share)
+
+
+def telling_frames(frames: Sequence[FrameInformation], unknown: int, count: int = 3) -> list[int]:
+    """Positions of the frames that matter most for one unknown, the most important first."""
+    order = np.argsort([-frame.without[unknown] for frame in frames], kind="stable")
+    return [int(k) for k in order[:count] if frames[int(k)].without[unknown] > 1.0]
+
+
+def to_dict(inspection: Inspection) -> dict[str, Any]:
+    """The inspection as a JSON-able dictionary; units in the names, SI but for sigmas in ``sigmas``."""
+    result = inspection.result
+    return {
+        "status": result.status,
+        "reasons": list(result.reasons),
+        "method": result.method,
+        "T_camera_lidar": result.T_camera_lidar.matrix().tolist(),
+        "time_offset_s": result.time_offset_s,
+        "drive_offsets": [dataclasses.asdict(drive) for drive in result.drive_offsets],
+        "sigmas": {
+            "lidar_axes": dataclasses.asdict(inspection.lidar),
+            "camera_axes": dataclasses.asdict(inspection.camera),
+        },
+        "pixels": [dataclasses.asdict(pixel) for pixel in inspection.pixels],
+        "order": list(NAMES),
+        "correlation": inspection.correlation.tolist(),
+        "strong_correlations": [dataclasses.asdict(pair) for pair in inspection.strong],
+        "weak_directions": [_direction(weak) for weak in result.weak_directions],
+        "weakest_direction": _direction(inspection.weakest),
+        "frames": [_frame(frame, k in inspection.redundant) for k, frame in enumerate(inspection.frames)],
+        "plan": None if inspection.plan is None else inspection.plan.to_dict(),
+        "gained": None if inspection.gained is None else _gained(inspection.gained),
+    }
+
+
+def _direction(weak: WeakDirection) -> dict[str, Any]:
+    return {**dataclasses.asdict(weak), "vector": np.asarray(weak.vector).tolist()}
+
+
+def _gained(gained: Gained) -> dict[str, Any]:
+    name = "sigma_after" if gained.kind == "as they came" else "sigma_ratio_without"
+    return {
+        "kind": gained.kind,
+        "frames": [
+            {"drive": g.frame.drive, "frame": g.frame.frame, "bits": g.bits, name: g.values.tolist()}
+            for g in gained.gains
+        ],
+    }
+
+
+def _frame(frame: FrameInformation, redundant: bool) -> Mapping[str, Any]:
+    return {
+        "drive": frame.frame.drive,
+        "frame": frame.frame.frame,
+        "bits": frame.bits,
+        "sigma_ratio_without": frame.without.tolist(),
+        "sigma_ratio_so_far": frame.so_far.tolist(),
+        "speed_mps": frame.speed,
+        "turn_rate_radps": frame.turn_rate,
+        "matches": frame.matches,
+        "objects": frame.objects,
+        "nearest_m": frame.nearest_m,
+        "left": frame.left,
+        "redundant": redundant,
+    }

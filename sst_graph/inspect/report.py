@@ -1,0 +1,189 @@
+"""A result in words: the summary on the terminal and the report beside calibration.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from sst_graph.inspect.budget_words import budget_lines, estimated_lines
+from sst_graph.metrics import (
+    CalibrationErrors,
+    euler_angles_deg,
+    mean_translation_difference_m,
+    quaternion_angle_deg,
+)
+from sst_graph.result import CalibrationResult
+
+OFFSET_SIGN = "t_lidar = t_camera_stamp + offset"
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Errors against a calibration that is known.
+
+    Attributes:
+        errors: of the estimate against it.
+        name: what it is, such as "the truth" or "the published calibration".
+    """
+
+    errors: CalibrationErrors
+    name: str
+
+
+def summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
+    """The result in a dozen lines: numbers with sigmas, status, what cannot be told."""
+    rows = [
+        ("status", result.status),
+        ("method", f"{result.method}, {_frames(result)}"),
+        ("transform", f"p_{result.camera_name} = T_camera_lidar . p_lidar"),
+        *(("", row) for row in _matrix_rows(result.T_camera_lidar)),
+        ("sigma", _pose_sigmas(result)),
+        ("time offset", f"{_offset(result)}   ({OFFSET_SIGN})"),
+        *(
+            ("", f"{drive.drive}: {_milliseconds(drive.time_offset_s, drive.sigma_s)}")
+            for drive in result.drive_offsets
+        ),
+    ]
+    rows += [("estimated" if k == 0 else "", text) for k, text in enumerate(estimated_lines(result))]
+    sweeps = _sweeps(result)
+    rows += [("sweep" if k == 0 else "", text) for k, text in enumerate(sweeps)]
+    if result.initial is not None:
+        rows.append(("moved", _moved(result, result.initial)))
+    if comparison is not None:
+        rows.append((f"against {comparison.name}", ""))
+        rows += [("", line) for line in error_lines(comparison.errors)]
+    rows += [("reason", reason) for reason in result.reasons]
+    for weak in result.weak_directions:
+        if not any(weak.sentence in reason for reason in result.reasons):
+            rows += [("weak", weak.sentence), ("", weak.advice)]
+    return "\n".join(f"{name:<15} {text}".rstrip() for name, text in rows)
+
+
+def error_lines(errors: CalibrationErrors) -> list[str]:
+    """The errors, one metric a line, in degrees, centimetres and milliseconds."""
+    lines = [
+        f"rotation     {errors.qad_deg:.3f} deg (QAD), {errors.aead_deg:.3f} deg (AEAD)",
+        f"translation  {100.0 * errors.atd_m:.2f} cm (ATD)",
+    ]
+    if errors.time_offset_s is not None:
+        lines.append(f"time offset  {1e3 * errors.time_offset_s:+.2f} ms")
+    if errors.nees is not None:
+        parts = f"rotation {errors.nees.rotation:.1f} of 3, translation {errors.nees.translation:.1f} of 3"
+        if errors.nees.time_offset is not None:
+            parts += f", offset {errors.nees.time_offset:.1f} of 1"
+        known = 6 if errors.nees.time_offset is None else 7
+        lines.append(f"NEES         {errors.nees.joint:.1f} of {known} ({parts})")
+    return lines
+
+
+def markdown_report(result: CalibrationResult, comparison: Comparison | None, pictures: Sequence[str]) -> str:
+    """A short Markdown page; ``pictures`` are file names beside it."""
+    blocks = [
+        "# Calibration",
+        f"Status: **{result.status}**{': ' * bool(result.reasons)}{'; '.join(result.reasons)}",
+        _table(
+            ("", "value", "sigma"),
+            [
+                *_euler_rows(result),
+                ("time offset", f"{1e3 * result.time_offset_s:+.2f} ms", _sigma_ms(result)),
+            ],
+        ),
+        "Roll, pitch and yaw are those of the LiDAR in the camera turned to x forward, y left, z up; "
+        "translation is in the camera's axes (x right, y down, z forward). "
+        f"Sign of the offset: {OFFSET_SIGN}.",
+        "```\n" + summary(result, comparison) + "\n```",
+    ]
+    if parts := budget_lines(result):
+        blocks += ["## Where the sigmas come from", "```\n" + "\n".join(parts) + "\n```"]
+    if result.weak_directions:
+        items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
+        blocks += ["## What the data hardly tells", "\n".join(items)]
+    if pictures:
+        blocks += [
+            "## Before and after",
+            "Vehicle points: green inside the image's vehicle mask, red outside; the contour is the mask's.",
+            "\n\n".join(f"![{name}]({name})" for name in pictures),
+        ]
+    versions = ", ".join(f"{name} {number}" for name, number in result.versions.items())
+    blocks.append(f"Made by {versions}." if versions else "Settings stand in calibration.json.")
+    return "\n\n".join(blocks) + "\n"
+
+
+def _frames(result: CalibrationResult) -> str:
+    drives = sorted({frame.drive for frame in result.frames_used})
+    frames, many = len(result.frames_used), len(drives)
+    return f"{frames} frame{'s' * (frames != 1)} of {many} drive{'s' * (many != 1)}" + (
+        f" ({', '.join(drives)})" if drives else ""
+    )
+
+
+def _sweeps(result: CalibrationResult) -> list[str]:
+    """By drive: whether its points are as measured, and how that is known; where it was decided."""
+    found = result.diagnostics.get("sweep", {})
+    entries = found.items() if isinstance(found, Mapping) else ()
+    decided = [(drive, entry) for drive, entry in entries if isinstance(entry, Mapping)]
+    decided = [(drive, entry) for drive, entry in decided if entry.get("kind", "given") != "given"]
+    return [
+        f"{drive}: {entry.get('sentence', '')}" if len(decided) > 1 else str(entry.get("sentence", ""))
+        for drive, entry in decided
+    ]
+
+
+def _matrix_rows(pose: gtsam.Pose3) -> list[str]:
+    return [" ".join(f"{value:10.6f}" for value in row) for row in pose.matrix()[:3]]
+
+
+def _pose_sigmas(result: CalibrationResult) -> str:
+    sigmas = result.sigmas()
+    rotation = " ".join(_short(value) for value in sigmas.rotation_deg)
+    translation = " ".join(_short(value) for value in sigmas.translation_cm)
+    return f"rotation {rotation} deg about, translation {translation} cm along the LiDAR's x y z"
+
+
+def _offset(result: CalibrationResult) -> str:
+    return f"{1e3 * result.time_offset_s:+.2f} ms +- {_sigma_ms(result)}"
+
+
+def _sigma_ms(result: CalibrationResult) -> str:
+    return f"{_short(result.sigmas().time_offset_ms)} ms"
+
+
+def _milliseconds(offset_s: float, sigma_s: float) -> str:
+    return f"{1e3 * offset_s:+.2f} ms +- {_short(1e3 * sigma_s)} ms"
+
+
+def _moved(result: CalibrationResult, initial: gtsam.Pose3) -> str:
+    turned = quaternion_angle_deg(result.T_camera_lidar.rotation(), initial.rotation())
+    shifted = 100.0 * mean_translation_difference_m(result.T_camera_lidar, initial)
+    later = 1e3 * (result.time_offset_s - result.initial_offset_s)
+    return f"from the start by {turned:.2f} deg, {shifted:.1f} cm (mean of x y z), {later:+.1f} ms"
+
+
+def _euler_rows(result: CalibrationResult) -> list[tuple[str, str, str]]:
+    """Angles and translation with sigmas about and along the axes they are given in."""
+    R = result.T_camera_lidar.rotation().matrix()
+    angles = euler_angles_deg(result.T_camera_lidar.rotation())
+    angle_sigmas = result.sigmas().rotation_deg
+    shift_sigmas = 100.0 * np.sqrt(np.diag(R @ result.covariance[3:6, 3:6] @ R.T))
+    rows = [
+        (name, f"{angle:.4f} deg", f"{_short(sigma)} deg")
+        for name, angle, sigma in zip(("roll", "pitch", "yaw"), angles, angle_sigmas, strict=True)
+    ]
+    for name, shift, sigma in zip("xyz", result.T_camera_lidar.translation(), shift_sigmas, strict=True):
+        rows.append((name, f"{100.0 * shift:.2f} cm", f"{_short(sigma)} cm"))
+    return rows
+
+
+def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = [head, tuple("---" for _ in head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _short(value: float) -> str:
+    """Two significant digits, without an exponent below a million."""
+    if value == 0.0 or value >= 1e6:
+        return f"{value:.2g}"
+    return f"{value:.{max(0, 1 - int(np.floor(np.log10(value))))}f}"

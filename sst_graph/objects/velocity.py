@@ -1,0 +1,304 @@
+"""Velocity over ground of objects that move: their near end, followed through the scans around.
+
+The centre of an outline wanders over a vehicle while other sides of it come into view, by half a metre a
+second close by. Its end towards the LiDAR along the way that it takes, and its side towards the LiDAR across
+it, are the same pieces of it in every scan, as long as it does not pass alongside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import ScanFeatures
+from sst_graph.features.lidar_edges import Boundaries, Edge
+from sst_graph.objects.persistence import ObjectName
+from sst_graph.odometry.lidar import MOVABLE_CLASSES
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class VelocityConfig(Settings):
+    """When an object is followed well enough.
+
+    Attributes:
+        window_s: half width of the time around a scan that is looked at [s].
+        min_sightings: fewest scans within it.
+        least_mps: slower ones have no direction to speak of [m/s].
+        least_sigmas: nor have those whose velocity is not as many deviations from none.
+        least_points: fewest points of an outline.
+        end: share of an outline that lies beyond its end, for stray points.
+        max_scatter_m: largest rms distance of end and side from a steady motion [m].
+        acceleration_mps2: deviation of the velocity's rate of change; it counts where the scans do not lie
+            evenly around [m/s^2].
+        floor_mps: least deviation of a velocity [m/s].
+        memory_s: an object that moved within this time before or after moves [s].
+        reach_m: farthest that a point of an outline may be from the same outline in another scan [m] ...
+        kept: ... for this share of the points at least where the outline is moved on ...
+        gained: ... and this share more than where it is not. An end that the field of view cuts off moves
+            along with the LiDAR, and the rest of the outline does not.
+    """
+
+    window_s: float = setting(0.35, at_least=0.01, at_most=10.0)
+    min_sightings: int = setting(4, at_least=2, at_most=1000)
+    least_mps: float = setting(1.0, at_least=0.0, at_most=100.0)
+    least_sigmas: float = setting(3.0, at_least=0.0, at_most=100.0)
+    least_points: int = setting(8, at_least=1, at_most=10_000)
+    end: float = setting(0.02, at_least=0.0, at_most=0.5)
+    max_scatter_m: float = setting(0.25, at_least=0.0, at_most=10.0)
+    acceleration_mps2: float = setting(1.0, at_least=0.0, at_most=100.0)
+    floor_mps: float = setting(0.03, at_least=0.0001, at_most=10.0)
+    memory_s: float = setting(0.8, at_least=0.0, at_most=10.0)
+    reach_m: float = setting(0.2, at_least=0.001, at_most=10.0)
+    kept: float = setting(0.4, at_least=0.0, at_most=1.0)
+    gained: float = setting(0.2, at_least=-1.0, at_most=1.0)
+
+
+@dataclass(frozen=True)
+class ObjectVelocity:
+    """Velocity over ground at a scan's stamp.
+
+    Attributes:
+        l_velocity: (3,) in the LiDAR frame of the scan [m/s].
+        sigma_mps: deviation of either horizontal component [m/s].
+    """
+
+    l_velocity: FloatArray
+    sigma_mps: float
+
+
+class Velocities:
+    """Velocities of the movable objects of the latest scans, which are numbered without gaps as they come.
+
+    An object's velocity is found when its scan comes, and again when all around it has been seen.
+
+    Attributes:
+        found: by the object's track and the scan.
+    """
+
+    def __init__(self, config: VelocityConfig | None = None) -> None:
+        self.config = config or VelocityConfig()
+        self._scans: dict[int, _Seen] = {}
+        self._sightings: dict[int, dict[int, ObjectName]] = {}
+        self.found: dict[int, dict[int, ObjectVelocity]] = {}
+
+    def add(
+        self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
+    ) -> set[int]:
+        """A further scan, posed at ``wTl``, and the tracks of its objects.
+
+        Returns:
+            Numbers of the earlier scans about which this tells something new.
+        """
+        before = max((seen.stamp_ns for seen in self._scans.values()), default=scan.stamp_ns)
+        self.remember(number, scan, tracks, wTl)
+        reach = round(1e9 * self.config.window_s)
+        whole = {k for k, seen in self._scans.items() if before <= seen.stamp_ns + reach < scan.stamp_ns}
+        return whole.union(*(self._judge(k) for k in sorted({number, *whole}))) - {number}
+
+    def remember(
+        self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
+    ) -> None:
+        """Keep a scan's outlines."""
+        self._scans[number] = _Seen.of(scan, tracks, wTl)
+        for name, track in self._scans[number].tracks.items():
+            self._sightings.setdefault(track, {})[number] = name
+
+    def judge_all(self) -> None:
+        """Look again at all scans, with all that has been seen."""
+        for number in self._scans:
+            self._judge(number)
+
+    def forget(self, before: int) -> None:
+        """Drop all scans before one."""
+        for old in [k for k in self._scans if k < before]:
+            for track in self._scans.pop(old).tracks.values():
+                for by_track in (self._sightings, self.found):
+                    by_track.get(track, {}).pop(old, None)
+                    if not by_track.get(track, True):
+                        del by_track[track]
+
+    def of(self, number: int, name: ObjectName) -> ObjectVelocity | None:
+        """Velocity of an object of a scan, or None where it is not followed well enough."""
+        seen = self._scans.get(number)
+        track = None if seen is None else seen.tracks.get(name)
+        return None if track is None else self.found.get(track, {}).get(number)
+
+    def speeds(self, number: int) -> dict[ObjectName, float]:
+        """Speed of the objects of a scan that are known to have moved a little before or after [m/s]."""
+        found = {}
+        for name, track in self._scans[number].tracks.items() if number in self._scans else ():
+            near = self._known_near(track, number)
+            if near:
+                found[name] = max(float(np.linalg.norm(velocity.l_velocity)) for velocity in near.values())
+        return found
+
+    def _known_near(self, track: int, number: int) -> dict[int, ObjectVelocity]:
+        """What is known of an object a little before or after a scan."""
+        known = self.found.get(track)
+        return (
+            {k: known[k] for k in self._around(number, self.config.memory_s) if k in known} if known else {}
+        )
+
+    def _around(self, number: int, seconds: float) -> list[int]:
+        """The scans within some seconds of one, itself included, in their order."""
+        stamp_ns, reach = self._scans[number].stamp_ns, round(1e9 * seconds)
+        first = last = number
+        while first - 1 in self._scans and stamp_ns - self._scans[first - 1].stamp_ns <= reach:
+            first -= 1
+        while last + 1 in self._scans and self._scans[last + 1].stamp_ns - stamp_ns <= reach:
+            last += 1
+        return list(range(first, last + 1))
+
+    def _judge(self, number: int) -> set[int]:
+        """Find the velocities of a scan's objects; scans in which that alone shows, or showed, motion."""
+        told = set[int]()
+        for name, track in self._scans[number].tracks.items():
+            found, known = self._followed(number, name), self.found.setdefault(track, {})
+            if (found is None) == (number in known):
+                known.pop(number, None)
+                near = [k for k in self._around(number, self.config.memory_s) if k in self._sightings[track]]
+                told |= {k for k in near if not self._known_near(track, k)}
+            if found is not None:
+                known[number] = found
+            if not known:
+                del self.found[track]
+        return told
+
+    def _followed(self, number: int, name: ObjectName) -> ObjectVelocity | None:
+        here = self._scans[number]
+        sightings = self._sightings[here.tracks[name]]
+        near = [(k, sightings[k]) for k in self._around(number, self.config.window_s) if k in sightings]
+        few = len(here.outlines[name]) < self.config.least_points
+        if few or len(near) < self.config.min_sightings:
+            return None
+        times_s = np.array([1e-9 * (self._scans[k].stamp_ns - here.stamp_ns) for k, _ in near])
+        centres = np.array([self._scans[k].centres[own] for k, own in near])
+        rough = _slopes(times_s, centres)
+        if np.hypot(*rough) < self.config.least_mps:
+            return None
+        outlines = [self._scans[k].outlines[own] for k, own in near]
+        places = [self._scans[k].place for k, _ in near]
+        found = near_end_velocity(times_s, outlines, places, rough, self.config)
+        if found is None or not self._carried(found[0], here.outlines[name], times_s, outlines):
+            return None
+        w_velocity, sigma_mps = found
+        return ObjectVelocity(here.wTl.rotation().unrotate(np.append(w_velocity, 0.0)), sigma_mps)
+
+    def _carried(
+        self, w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
+    ) -> bool:
+        """Whether a velocity carries an outline to where the first and the last scan around show it."""
+        shares = []
+        for velocity in (w_velocity, np.zeros(2)):
+            distances = [
+                cdist(outline + times_s[i] * velocity, outlines[i]).min(axis=1)
+                for i in (0, -1)
+                if abs(times_s[i]) > 1e-3
+            ]
+            shares.append(float(np.mean(np.concatenate(distances) < self.config.reach_m)))
+        return shares[0] >= max(self.config.kept, shares[1] + self.config.gained)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects."""
+
+    stored_apart: ClassVar[bool] = True
+
+    stamp_ns: int
+    wTl: gtsam.Pose3
+    place: FloatArray
+    outlines: dict[ObjectName, FloatArray]
+    centres: dict[ObjectName, tuple[float, float]]
+    tracks: dict[ObjectName, int]
+
+    @classmethod
+    def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _Seen:
+        outlines = {}
+        for c in MOVABLE_CLASSES:
+            if (points := scan.boundaries.get(c)) is None:
+                continue
+            points = points.take(np.flatnonzero(points.edges == Edge.SIDE))
+            if len(points):
+                wPs = points.lPs @ wTl.rotation().matrix()[:2].T + wTl.translation()[:2]
+                order = np.argsort(points.objects, kind="stable")
+                numbers, starts = np.unique(points.objects[order], return_index=True)
+                parts = np.split(wPs[order], starts[1:])
+                outlines.update({(c, int(n)): part for n, part in zip(numbers, parts, strict=True)})
+        followed = {name: outline for name, outline in outlines.items() if name in tracks}
+        own = {name: tracks[name] for name in followed}
+        centres = {name: tuple((part.sum(axis=0) / len(part)).tolist()) for name, part in followed.items()}
+        return cls(scan.stamp_ns, wTl, np.asarray(wTl.translation()[:2]), followed, centres, own)
+
+
+def velocities_of_points(
+    l_velocities: Mapping[ObjectName, FloatArray], boundaries: Mapping[SemanticClass, Boundaries]
+) -> dict[SemanticClass, FloatArray]:
+    """(n, 3) velocity over ground of each boundary point's object [m/s], by class where any moves.
+
+    Args:
+        l_velocities: (3,) of objects that move, in the LiDAR frame of the scan [m/s].
+    """
+    found: dict[SemanticClass, FloatArray] = {}
+    for (c, n), l_velocity in l_velocities.items():
+        if c in boundaries:
+            objects = boundaries[c].objects
+            found.setdefault(c, np.zeros((len(objects), 3)))[objects == n] = l_velocity
+    return {c: velocities for c, velocities in found.items() if velocities.any()}
+
+
+def near_end_velocity(
+    times_s: FloatArray,
+    outlines: Sequence[FloatArray],
+    places: Sequence[FloatArray],
+    rough: FloatArray,
+    config: VelocityConfig,
+) -> tuple[FloatArray, float] | None:
+    """Velocity (2,) at time 0 and its deviation [m/s] of an outline (n, 2), seen from a place (2,) each time.
+
+    None where it does not move steadily, or passes alongside.
+
+    Args:
+        rough: (2,) velocity, good enough to tell along from across [m/s].
+    """
+    speed = float(np.hypot(*rough))
+    axes = np.array([[rough[0], rough[1]], [-rough[1], rough[0]]]) / speed
+    ends = []
+    for outline, place in zip(outlines, places, strict=True):
+        along, across = axes @ (outline - place).T
+        if along.min() < 0.0 < along.max():
+            return None
+        ends.append(axes @ place + [_near_end(along, config.end), _near_end(across, config.end)])
+    X, t = np.stack(ends), times_s - times_s.mean()
+    slopes = _slopes(times_s, X)
+    variances = ((X - X.mean(axis=0) - t[:, None] * slopes) ** 2).sum(axis=0) / (len(t) - 2)
+    if variances.max() > config.max_scatter_m**2:
+        return None
+    drift = config.acceleration_mps2 * float(times_s.mean())
+    sigma_mps = np.sqrt(variances.mean() / (t @ t) + drift**2 + config.floor_mps**2)
+    if np.hypot(*slopes) < max(config.least_mps, config.least_sigmas * sigma_mps):
+        return None
+    return axes.T @ slopes, float(sigma_mps)
+
+
+def _near_end(values: FloatArray, share: float) -> float:
+    """The end of some coordinates (n,) that is nearest to 0, but for a share of them."""
+    beyond = int(share * len(values))
+    place = beyond if values.sum() > 0.0 else len(values) - 1 - beyond
+    return float(np.partition(values, place)[place])
+
+
+def _slopes(times_s: FloatArray, values: FloatArray) -> FloatArray:
+    """(k,) slopes of the lines that fit values (n, k) over times (n,) best."""
+    t = times_s - times_s.mean()
+    return np.asarray(t @ values / (t @ t))

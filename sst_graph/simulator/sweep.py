@@ -1,0 +1,235 @@
+"""Exact nearest surfaces along all rays of a spinning LiDAR, at rest or moving while it turns.
+
+A column of rays lies in a vertical half-plane; each triangle is cut with the half-planes that may
+meet it, and the rings between the two cuts hit it. See :mod:`sst_graph.simulator.casting`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.simulator.casting import IndexArray, nearest_faces, runs
+from sst_graph.types import FloatArray
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The firing directions of a spinning LiDAR.
+
+    Attributes:
+        azimuth0, step: azimuth of column 0, and between columns [rad]; columns fill the circle.
+        count: number of columns.
+        slopes: (r,) tangent of each ring's elevation, ascending.
+    """
+
+    azimuth0: float
+    step: float
+    count: int
+    slopes: FloatArray
+
+    @property
+    def azimuths(self) -> FloatArray:
+        """(count,) azimuths, counter-clockwise from forward, within -pi to pi [rad]."""
+        azimuth = self.azimuth0 + self.step * np.arange(self.count)
+        return np.asarray(np.mod(azimuth + np.pi, 2 * np.pi) - np.pi)
+
+
+@dataclass(frozen=True)
+class SweepMotion:
+    """How the sensor moves while it sweeps, relative to its pose at the scan's stamp.
+
+    Attributes:
+        rotations, positions: (count, 3, 3) and (count, 3) [m] of the sensor at each column's time.
+        seconds: (count,) each column's time after the stamp [s].
+        velocities: (n, 3, 3) of the corners of all faces, in the sensor's frame at the stamp [m/s].
+        cut: azimuth at which the turn begins and ends: the times of the columns jump there [rad].
+    """
+
+    rotations: FloatArray
+    positions: FloatArray
+    seconds: FloatArray
+    velocities: FloatArray
+    cut: float = np.pi
+
+    def seen(self, corners: FloatArray, face: IndexArray, column: IndexArray) -> FloatArray:
+        """(3, 3, m) corners (corner, axis, pair) of faces in the sensor's frame at the columns' times.
+
+        corners: (3, 3, n) of all faces (corner, axis, face) in its frame at the stamp [m].
+        """
+        moving = np.any(self.velocities, axis=(1, 2))
+        at = corners[:, :, face]
+        pairs = np.flatnonzero(moving[face])
+        if len(pairs):
+            speed = self.velocities[face[pairs]].transpose(1, 2, 0)
+            at[:, :, pairs] += speed * self.seconds[column[pairs]]
+        at -= self.positions.T[:, column]
+        # p = R^T (w - t), written out: rows of R^T are columns of R.
+        turn = self.rotations.transpose(1, 2, 0)[:, :, column]
+        return np.stack(
+            [at[:, 0] * turn[0, k] + at[:, 1] * turn[1, k] + at[:, 2] * turn[2, k] for k in range(3)], axis=1
+        )
+
+    def reach(self) -> tuple[FloatArray, float]:
+        """Bounds: (n,) displacement of each face relative to the sensor [m], the sensor's rotation [rad]."""
+        half = float(np.abs(self.seconds).max())
+        fastest = np.linalg.norm(self.velocities, axis=2).max(axis=1, initial=0.0)
+        cosine = (np.trace(self.rotations, axis1=1, axis2=2) - 1.0) / 2.0
+        turn = float(np.arccos(np.clip(cosine, -1.0, 1.0)).max())
+        return np.linalg.norm(self.positions, axis=1).max() + fastest * half + 1e-3, turn + 1e-5
+
+
+def cast_lidar(
+    triangles: FloatArray,
+    columns: Columns,
+    shifts: tuple[float, ...] = (0.0,),
+    motion: SweepMotion | None = None,
+) -> list[tuple[IndexArray, FloatArray]]:
+    """Nearest face (r, count) along every ray (-1: none), and its horizontal range [m] (inf: none).
+
+    triangles: (n, 3, 3) corners in the LiDAR frame at the stamp [m]. One answer for each of
+    ``shifts``: a turn of all columns [rad], small against their step. With ``motion`` each column
+    sees the world at its own instant.
+    """
+    corners = np.ascontiguousarray(triangles.transpose(1, 2, 0))
+    normal = _normals(corners)
+    d = (normal * corners[0]).sum(axis=0)
+    size = np.maximum(np.sqrt((normal**2).sum(axis=0)), 1e-12)
+    slack: FloatArray | float = 0.0 if motion is None else motion.reach()[0]
+    kept = np.flatnonzero(d / size < slack)
+    face, column = _candidate_pairs(corners, kept, columns, max(abs(shift) for shift in shifts), motion)
+    if motion is None:
+        at, n, dd = corners[:, :, face], normal[:, face], d[face]
+    else:
+        at = motion.seen(corners, face, column)
+        n = _normals(at)
+        dd = (n * at[0]).sum(axis=0)
+    front = np.flatnonzero(dd < 0.0)
+    at, n, face, column = at[:, :, front], n[:, front] / dd[front], face[front], column[front]
+    azimuths = columns.azimuths
+    return [_cast_beam(at, n, face, column, azimuths + shift, columns.slopes) for shift in shifts]
+
+
+def _cast_beam(
+    at: FloatArray,
+    n: FloatArray,
+    face: IndexArray,
+    column: IndexArray,
+    azimuths: FloatArray,
+    slopes: FloatArray,
+) -> tuple[IndexArray, FloatArray]:
+    """Nearest faces from pairs: corners (3, 3, m), planes n . p = 1 (3, m), faces and columns (m,)."""
+    cos, sin = np.cos(azimuths)[column], np.sin(azimuths)[column]
+    low, high = _column_cuts(at, cos, sin)
+    first, last = np.searchsorted(slopes, low), np.searchsorted(slopes, high)
+    hit = np.flatnonzero(last > first)
+    pair, step = runs((last - first)[hit])
+    pair = hit[pair]
+    ring = first[pair] + step
+    # 1/r = n . [cos sin slope] with r the horizontal range.
+    level = n[0] * cos + n[1] * sin
+    inverse = level[pair] + n[2][pair] * slopes[ring]
+    shape = (len(slopes), len(azimuths))
+    best, closeness = nearest_faces(shape[0] * shape[1], ring * shape[1] + column[pair], inverse, face[pair])
+    reach = np.where(best >= 0, 1.0 / np.maximum(closeness, 1e-9), np.inf)
+    return best.reshape(shape), reach.reshape(shape)
+
+
+def _normals(corners: FloatArray) -> FloatArray:
+    """(3, n) outward normals, not normalised, of triangles (corner, axis, n)."""
+    (ax, ay, az), (bx, by, bz) = corners[1] - corners[0], corners[2] - corners[0]
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def _candidate_pairs(
+    corners: FloatArray, kept: IndexArray, columns: Columns, widen: float, motion: SweepMotion | None
+) -> tuple[IndexArray, IndexArray]:
+    """All pairs (face, column) of the faces ``kept`` whose half-plane may cut the face."""
+    start, low, high, distance, _ = _extent(corners[:, :, kept])
+    pad: FloatArray | float = 0.0
+    shift: FloatArray | float = 0.0
+    seen = corners[:, :, kept]
+    if motion is not None:
+        reach, turn = motion.reach()
+        reach = reach[kept]
+        wide = turn + np.arcsin(np.minimum(reach / distance, 1.0))
+        # Look again at the time at which the beam passes; what moves from then on is less by the
+        # share of the sweep that the face and its shift cover. At the seam, and near by, all of it.
+        middle = np.mod(start + 0.5 * (low + high) + np.pi, 2 * np.pi) - np.pi
+        for _ in range(2):
+            column = np.rint((middle - columns.azimuth0) / columns.step).astype(np.intp) % columns.count
+            seen = motion.seen(corners, kept, column)
+            start, low, high, distance, _ = _extent(seen)
+            shift, middle = middle, np.mod(start + 0.5 * (low + high) + np.pi, 2 * np.pi) - np.pi
+        share = np.minimum(2.0 * ((high - low) + np.abs(middle - shift)) / np.pi + 0.03, 2.0)
+        from_cut = np.abs(np.mod(middle - motion.cut + np.pi, 2 * np.pi) - np.pi)
+        seam = from_cut < 0.5 * (high - low) + wide
+        pad = np.where(seam | (distance < 3.0 * reach), 2.0 * wide, share * wide)
+    low, high = low - pad - widen, high + pad + widen
+    everywhere = (high - low > 0.9 * np.pi) | (distance < 1e-5)
+    first = np.ceil((start + low - columns.azimuth0) / columns.step - 1e-6)
+    last = np.floor((start + high - columns.azimuth0) / columns.step + 1e-6)
+    counts = np.where(everywhere, columns.count, np.clip(last - first + 1, 0, columns.count))
+    counts = counts * _within_rings(seen, distance, columns.slopes, 0.0 if motion is None else 0.3)
+    face, offset = runs(counts.astype(np.intp))
+    return kept[face], (first[face].astype(np.intp) + offset) % columns.count
+
+
+def _extent(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Of triangles (3, 3, n): azimuth of the first corner, least and greatest turn from it [rad],
+    horizontal distance of the z axis from the outline, and that of the farthest corner [m]."""
+    x, y = corners[:, 0], corners[:, 1]
+    azimuth = np.arctan2(y, x)
+    turn = np.mod(azimuth[1:] - azimuth[:1] + np.pi, 2 * np.pi) - np.pi
+    low, high = np.minimum(turn.min(axis=0), 0.0), np.maximum(turn.max(axis=0), 0.0)
+    nearest = np.full(x.shape[1], np.inf)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        dx, dy = x[b] - x[a], y[b] - y[a]
+        t = np.clip(-(x[a] * dx + y[a] * dy) / np.maximum(dx**2 + dy**2, 1e-12), 0.0, 1.0)
+        nearest = np.minimum(nearest, np.hypot(x[a] + t * dx, y[a] + t * dy))
+    return azimuth[0], low, high, np.maximum(nearest, 1e-6), np.hypot(x, y).max(axis=0)
+
+
+def _within_rings(
+    corners: FloatArray, nearest: FloatArray, slopes: FloatArray, slack: float
+) -> NDArray[np.bool_]:
+    """(n,) False for triangles wholly above or below all rings; ``slack``: what they may still move [m]."""
+    z = corners[:, 2]
+    top, bottom = z.max(axis=0) + slack, z.min(axis=0) - slack
+    near = np.maximum(nearest - slack, 1e-6)
+    far = np.hypot(corners[:, 0], corners[:, 1]).max(axis=0) + slack
+    highest = np.where(top > 0, top / near, top / far)
+    lowest = np.where(bottom < 0, bottom / near, bottom / far)
+    return np.asarray((highest >= slopes[0]) & (lowest <= slopes[-1]))
+
+
+def _column_cuts(corners: FloatArray, cos: FloatArray, sin: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Slopes between which the half-planes at azimuths (cos, sin) (m,) cut the triangles (3, 3, m).
+
+    A triangle that the axis itself pierces is cut once; it then reaches straight down (or up).
+    """
+    x, y, z = corners[:, 0], corners[:, 1], corners[:, 2]
+    side, along = cos * y - sin * x, cos * x + sin * y
+    low, high = np.full(len(cos), np.inf), np.full(len(cos), -np.inf)
+    hits = np.zeros(len(cos), np.int8)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        pairs = np.flatnonzero((side[i] <= 0.0) != (side[j] <= 0.0))
+        # From the right-hand corner to the left-hand one, the same for both triangles at an edge.
+        s0, s1 = side[i][pairs], side[j][pairs]
+        r0, r1, z0, z1 = along[i][pairs], along[j][pairs], z[i][pairs], z[j][pairs]
+        swap = s0 > s1
+        s0, s1 = np.where(swap, s1, s0), np.where(swap, s0, s1)
+        r0, r1 = np.where(swap, r1, r0), np.where(swap, r0, r1)
+        z0, z1 = np.where(swap, z1, z0), np.where(swap, z0, z1)
+        t = s0 / (s0 - s1)
+        reach = r0 + t * (r1 - r0)
+        ahead = reach > 1e-9
+        pairs, slope = pairs[ahead], ((z0 + t * (z1 - z0))[ahead] / reach[ahead])
+        low[pairs] = np.minimum(low[pairs], slope)
+        high[pairs] = np.maximum(high[pairs], slope)
+        hits[pairs] += 1
+    once = hits == 1
+    below = z.mean(axis=0) < 0.0
+    return np.where(once & below, -np.inf, low), np.where(once & ~below, np.inf, high)

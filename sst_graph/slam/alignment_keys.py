@@ -1,0 +1,181 @@
+"""Where alignment terms stand in a graph: the trajectory's poses, extrinsic, time offset and mask biases."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError
+from sst_graph.factors.variables import checked_key, number_or_key, pose_or_key
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+_CLASSES = tuple(SemanticClass)
+COLUMNS = 7 + len(_CLASSES)
+"""What all terms share, in order: extrinsic (6), time offset, the mask bias of each class."""
+
+
+def bias_column(semantic_class: SemanticClass) -> int:
+    """Place of a class's mask bias among :data:`COLUMNS`."""
+    return 7 + _CLASSES.index(semantic_class)
+
+
+class Trajectory:
+    """Keys and stamps of a body's poses wTb, in the order of time; poses may be added at the end."""
+
+    def __init__(self, keys: Iterable[int] = (), stamps_ns: Iterable[int] = ()) -> None:
+        """keys: of Pose3 variables; stamps_ns: in the LiDAR's clock, rising [ns]."""
+        self._keys: list[int] = []
+        self._stamps: list[int] = []
+        keys, stamps = list(keys), list(stamps_ns)
+        if len(keys) != len(stamps):
+            raise DataError("Trajectory", f"{len(keys)} keys, {len(stamps)} stamps", "one stamp a key")
+        for key, stamp_ns in zip(keys, stamps, strict=True):
+            self.append(key, stamp_ns)
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def append(self, key: int, stamp_ns: int) -> None:
+        """Add the pose after all others.
+
+        Raises:
+            DataError: a stamp that is no later than the last.
+            FactorError: no key.
+        """
+        if self._stamps and stamp_ns <= self._stamps[-1]:
+            raise DataError("stamp of a pose", f"{stamp_ns} ns", f"a stamp after {self._stamps[-1]} ns")
+        self._keys.append(checked_key("Trajectory", "key", key))
+        self._stamps.append(int(stamp_ns))
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        return tuple(self._keys)
+
+    @property
+    def stamps_ns(self) -> tuple[int, ...]:
+        return tuple(self._stamps)
+
+    def position(self, stamp_ns: int) -> int | None:
+        """Position of the pose with just this stamp; None where there is none."""
+        at = int(np.searchsorted(self._stamps, stamp_ns))
+        return at if at < len(self) and self._stamps[at] == stamp_ns else None
+
+    def interval(self, true_ns: float) -> int | None:
+        """Position of the pose before a time that lies between two poses; None outside of all."""
+        if len(self) < 2 or not self._stamps[0] <= true_ns <= self._stamps[-1]:
+            return None
+        return int(np.clip(np.searchsorted(self._stamps, true_ns, "right") - 1, 0, len(self) - 2))
+
+    def outside_s(self, true_ns: float) -> float:
+        """How far a time lies after the last pose (positive) or before the first (negative) [s]."""
+        if not self._stamps:
+            return float("nan")
+        late, early = true_ns - self._stamps[-1], true_ns - self._stamps[0]
+        return 1e-9 * (late if late > 0.0 else min(early, 0.0))
+
+    def twist(self, values: gtsam.Values, position: int) -> FloatArray | None:
+        """(6,) mean body twist from a pose to the next [rad/s, m/s]; None where one is not in the values."""
+        if not 0 <= position < len(self) - 1:
+            return None
+        a, b = self._keys[position : position + 2]
+        if not (values.exists(a) and values.exists(b)):
+            return None
+        seconds = 1e-9 * (self._stamps[position + 1] - self._stamps[position])
+        return np.asarray(gtsam.Pose3.Logmap(values.atPose3(a).between(values.atPose3(b)))) / seconds
+
+    def acceleration(self, values: gtsam.Values, position: int) -> FloatArray:
+        """(6,) rate of change of the body's twist at the middle of an interval, from its neighbours."""
+        found = [(k, self.twist(values, k)) for k in (position - 1, position, position + 1)]
+        known = [(self._middle_s(k), twist) for k, twist in found if twist is not None]
+        (t_1, first), (t_2, last) = known[0], known[-1]
+        return np.zeros(6) if t_2 == t_1 else (last - first) / (t_2 - t_1)
+
+    def _middle_s(self, position: int) -> float:
+        return 5e-10 * float(self._stamps[position] + self._stamps[position + 1] - 2 * self._stamps[0])
+
+
+@dataclass(frozen=True)
+class AlignmentKeys:
+    """Where the terms of one camera stand in a graph.
+
+    Attributes:
+        trajectory: poses wTb of the body, one at each scan's stamp.
+        cTl: key of the extrinsic, or a fixed pose.
+        offset_s: key of the time offset (``Vector(1)`` or ``double``), or a fixed offset [s].
+        biases_px: by class, key of its mask bias or a fixed bias [px]; none where a class is missing.
+        bTl: pose of the LiDAR in the body; None where the poses are the LiDAR's own.
+    """
+
+    trajectory: Trajectory
+    cTl: int | gtsam.Pose3
+    offset_s: int | float
+    biases_px: Mapping[SemanticClass, int | float] = field(default_factory=dict)
+    bTl: gtsam.Pose3 | None = None
+
+    def __post_init__(self) -> None:
+        place = "AlignmentKeys"
+        object.__setattr__(self, "cTl", pose_or_key(place, "cTl", self.cTl))
+        object.__setattr__(self, "offset_s", number_or_key(place, "offset_s", self.offset_s))
+        biases = {c: number_or_key(place, "biases_px", bias) for c, bias in self.biases_px.items()}
+        object.__setattr__(self, "biases_px", biases)
+
+    def extrinsic(self, values: gtsam.Values) -> gtsam.Pose3:
+        return self.cTl if isinstance(self.cTl, gtsam.Pose3) else values.atPose3(self.cTl)
+
+    def offset(self, values: gtsam.Values) -> float:
+        return number(values, self.offset_s)
+
+    def bias(self, values: gtsam.Values, semantic_class: SemanticClass) -> float:
+        return number(values, self.biases_px.get(semantic_class, 0.0))
+
+    @property
+    def variables(self) -> tuple[int, ...]:
+        """Keys of extrinsic and time offset, those of the two that are variables."""
+        return tuple(key for key in (self.cTl, self.offset_s) if isinstance(key, int))
+
+    @property
+    def lasting(self) -> tuple[int, ...]:
+        """Keys of all that no pose marginalizes: extrinsic, time offset and mask biases."""
+        biases = (key for key in self.biases_px.values() if isinstance(key, int))
+        return tuple(dict.fromkeys((*self.variables, *biases)))
+
+    def placed(self, covariance: FloatArray) -> FloatArray:
+        """(n, n) over :data:`COLUMNS` from the covariance of :attr:`lasting`; zeros for what is constant."""
+        A = np.zeros((len(covariance), COLUMNS))
+        rows = dict(zip(self.lasting, self._first_rows(), strict=True))
+        if isinstance(self.cTl, int):
+            A[rows[self.cTl] : rows[self.cTl] + 6, :6] = np.eye(6)
+        if isinstance(self.offset_s, int):
+            A[rows[self.offset_s], 6] = 1.0
+        for c, key in self.biases_px.items():
+            if isinstance(key, int):
+                A[rows[key], bias_column(c)] = 1.0
+        return np.asarray(A.T @ covariance @ A)
+
+    def _first_rows(self) -> list[int]:
+        sizes = [6 if key == self.cTl else 1 for key in self.lasting]
+        return [sum(sizes[:k]) for k in range(len(sizes))]
+
+    def keeps_double(self, values: gtsam.Values) -> bool:
+        """Whether the time offset is kept as a ``double``."""
+        try:
+            values.atDouble(int(self.offset_s))
+        except RuntimeError:
+            return False
+        return True
+
+
+def number(values: gtsam.Values, key_or_value: int | float) -> float:
+    """A scalar variable, ``Vector(1)`` or ``double``, or the constant itself."""
+    if not isinstance(key_or_value, int):
+        return key_or_value
+    try:
+        return float(values.atVector(key_or_value)[0])
+    except RuntimeError:
+        return float(values.atDouble(key_or_value))

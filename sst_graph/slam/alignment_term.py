@@ -1,0 +1,391 @@
+"""One image and one scan in a graph of the user's own: matched anew at every estimate.
+
+A term knows its data, and where extrinsic, time offset and the trajectory stand in the graph. At any values
+it finds the two poses between which the image was taken in true time, stamp + offset, matches scan and image
+there, and makes its factor (:func:`sst_graph.factors.pose_alignment_factor`). Matches are frozen in a
+factor: what it says holds near the values at which it was made, and :class:`TermMatches` tells how near they
+still are. :mod:`sst_graph.slam.solving` swaps the factors of many terms in a solver.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from typing import Any, cast
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
+from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.reprojection import residuals
+from sst_graph.factors.robust import KernelKind, RobustKernel
+from sst_graph.factors.slam import pose_alignment_factor
+from sst_graph.objects.persistence import ObjectName
+from sst_graph.slam.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
+from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
+from sst_graph.slam.object_sides import ObjectSides
+from sst_graph.types import CameraImage, Scan, SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TermConfig(Settings):
+    """How a term matches.
+
+    Attributes:
+        classes: to match.
+        match: how boundary points meet contours; its ``side_sigma_px`` bounds what a side may claim.
+        kernel: kind of robust kernel on each match.
+        min_matches: fewer matches than this make no factor.
+    """
+
+    classes: tuple[SemanticClass, ...] = VEHICLES
+    match: MatchConfig = SLAM_MATCHES
+    kernel: KernelKind = "geman_mcclure"
+    min_matches: int = setting(10, at_least=1, at_most=1_000_000)
+
+
+class TermState(Enum):
+    """Why a term has a factor, or has none."""
+
+    MATCHED = "matched"
+    FEW_MATCHES = "fewer matches than the least"
+    BEFORE_TRAJECTORY = "stamp + offset lies before the first pose"
+    AFTER_TRAJECTORY = "stamp + offset lies after the last pose"
+    NO_SCAN_POSE = "the trajectory has no pose at the scan's stamp"
+    POSE_MISSING = "a pose around stamp + offset is not among the values"
+
+
+@dataclass(frozen=True)
+class TermPlace:
+    """Where an image falls in the trajectory.
+
+    Attributes:
+        X_a, X_b, X_scan: keys of the poses before and after stamp + offset, and of the scan's pose.
+        stamp_a_ns: stamp of X_a [ns].
+        seconds: from X_a to X_b [s].
+        image_after_a_s: image stamp minus stamp of X_a [s].
+        position: of X_a in the trajectory.
+        scan: position of the scan among the term's.
+    """
+
+    X_a: int
+    X_b: int
+    X_scan: int
+    stamp_a_ns: int
+    seconds: float
+    image_after_a_s: float
+    position: int
+    scan: int
+
+
+@dataclass(frozen=True)
+class TermRows:
+    """Matches of one term, linearized, over the columns :data:`~sst_graph.slam.alignment_keys.COLUMNS`.
+
+    Attributes:
+        J: (m, n) derivatives of the residuals, the trajectory held [px per unit].
+        r: (m,) residuals, mask bias included [px].
+        weights: (m,) robust weight times the match's own.
+        sigmas_px: (m,) that the factor gives the residuals [px].
+        sides: (m,) number of the side of an object that each match lies on, the same in every image.
+    """
+
+    J: FloatArray
+    r: FloatArray
+    weights: FloatArray
+    sigmas_px: FloatArray
+    sides: NDArray[np.intp]
+
+    @classmethod
+    def none(cls) -> TermRows:
+        return cls(np.zeros((0, COLUMNS)), np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.intp))
+
+    @classmethod
+    def joined(cls, parts: Sequence[TermRows]) -> TermRows:
+        """One after the other."""
+        parts = [cls.none(), *parts]
+        return cls(
+            np.concatenate([part.J for part in parts]),
+            np.concatenate([part.r for part in parts]),
+            np.concatenate([part.weights for part in parts]),
+            np.concatenate([part.sigmas_px for part in parts]),
+            np.concatenate([part.sides for part in parts]),
+        )
+
+    def __len__(self) -> int:
+        return len(self.r)
+
+
+@dataclass(frozen=True)
+class TermMatches:
+    """A term at some values: its factor, or why there is none.
+
+    Attributes:
+        state: whether there is a factor.
+        kernel_px: scale of the robust kernel under which the matches were made [px].
+        outside_s: how far stamp + offset lies outside of the trajectory [s]; negative before it.
+        place: poses around the image; None outside of the trajectory.
+        found: the matches.
+        factor: of them; None where the state is not ``MATCHED``.
+        information: what the image counts in the factor, over what its matches would by themselves.
+    """
+
+    state: TermState
+    kernel_px: float
+    outside_s: float = 0.0
+    place: TermPlace | None = None
+    found: FrameAlignments = field(default_factory=lambda: FrameAlignments((), (), ()))
+    factor: gtsam.CustomFactor | None = None
+    information: float = 1.0
+    term: AlignmentTerm | None = field(default=None, repr=False)
+    made_at: tuple[FloatArray, ...] = field(default=(), repr=False)
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def __str__(self) -> str:
+        outside = f", by {1e3 * abs(self.outside_s):.0f} ms" if self.outside_s else ""
+        return f"{self.state.value}{outside}: {len(self)} matches, kernel {self.kernel_px:.1f} px"
+
+    def left_interval_s(self, values: gtsam.Values) -> float:
+        """How far stamp + offset now lies outside of the two poses that the factor is on [s]; 0 within."""
+        if self.term is None or self.place is None:
+            return 0.0
+        late = self.place.image_after_a_s + self.term.keys.offset(values)
+        return float(max(-late, late - self.place.seconds, 0.0))
+
+    def moved_px(self, values: gtsam.Values) -> float:
+        """How far the values have moved the matched points across the contours since matching, RMS [px]."""
+        if self.term is None or not self.made_at:
+            return 0.0
+        now = [r for r, _ in self.term.residuals_of(self, values)]
+        moved = np.concatenate([b - a for a, b in zip(self.made_at, now, strict=True)])
+        return float(np.sqrt(np.mean(np.square(moved)))) if len(moved) else 0.0
+
+    def predicted_sigma_px(self, values: gtsam.Values, covariance: ArrayLike) -> float:
+        """What an uncertain calibration means in the image: sigma of the matched points across the contours,
+        RMS [px].
+
+        Args:
+            values: where to linearize.
+            covariance: (7, 7) of extrinsic and time offset; zeros for what is constant.
+        """
+        if self.term is None or not len(self):
+            return 0.0
+        J = np.concatenate([J for _, J in self.term.residuals_of(self, values)])
+        return float(np.sqrt(np.mean(np.einsum("ij,jk,ik->i", J, np.asarray(covariance), J))))
+
+
+@dataclass(frozen=True)
+class AlignmentTerm:
+    """One image and one scan, to be aligned in a graph of the user's own.
+
+    Attributes:
+        scans, image: as the data have them, kept as their features: one scan or several of the poses around.
+            Of several that one is taken which is nearest to the image in true time.
+        camera: of the image.
+        keys: where extrinsic, offset and the poses stand in the graph; the trajectory needs a pose at a
+            scan's stamp.
+        config: how to match.
+        l_velocities: for each scan (3,) over ground of objects that move, in the scan's LiDAR frame [m/s], by
+            class and number within the scan. Where the image falls into another interval than the one that
+            begins with the scan, these objects are left out.
+    """
+
+    scans: Scan | ScanFeatures | Sequence[Scan | ScanFeatures]
+    image: CameraImage | ImageFeatures
+    camera: PinholeCamera
+    keys: AlignmentKeys
+    config: TermConfig = field(default_factory=TermConfig)
+    l_velocities: Sequence[Mapping[ObjectName, ArrayLike]] = ()
+
+    def __post_init__(self) -> None:
+        given = [self.scans] if isinstance(self.scans, Scan | ScanFeatures) else list(self.scans)
+        if not given:
+            raise DataError("AlignmentTerm", "no scan", "one scan or more")
+        features = [features_of(scan, self.image, self.config.classes) for scan in given]
+        velocities = tuple(self.l_velocities) or ({},) * len(given)
+        if len(velocities) != len(given):
+            raise DataError(
+                "l_velocities of AlignmentTerm", f"{len(velocities)}", f"{len(given)}, one a scan"
+            )
+        object.__setattr__(self, "scans", tuple(scan for scan, _ in features))
+        object.__setattr__(self, "image", features[0][1])
+        object.__setattr__(self, "l_velocities", velocities)
+
+    @property
+    def features(self) -> tuple[ScanFeatures, ...]:
+        """Of the scans."""
+        return cast(tuple[ScanFeatures, ...], self.scans)
+
+    @property
+    def stamp_ns(self) -> int:
+        """The image's own stamp [ns]."""
+        return self.image.stamp_ns
+
+    def place(self, values: gtsam.Values) -> TermPlace | TermMatches:
+        """The poses between which the image was taken under the present offset, or why there are none."""
+        trajectory = self.keys.trajectory
+        true_ns = self.stamp_ns + 1e9 * self.keys.offset(values)
+        outside_s = trajectory.outside_s(true_ns)
+        a = trajectory.interval(true_ns)
+        if a is None:
+            after = outside_s > 0.0 or len(trajectory) < 2
+            state = TermState.AFTER_TRAJECTORY if after else TermState.BEFORE_TRAJECTORY
+            return TermMatches(state, 0.0, outside_s)
+        keys, stamps = trajectory.keys, trajectory.stamps_ns
+        scan, of_scan = self._nearest_scan(true_ns, values)
+        if of_scan is None:
+            return TermMatches(TermState.NO_SCAN_POSE, 0.0)
+        poses = keys[a], keys[a + 1], keys[of_scan]
+        if not all(values.exists(key) for key in poses):
+            return TermMatches(TermState.POSE_MISSING, 0.0)
+        seconds, late_s = 1e-9 * (stamps[a + 1] - stamps[a]), 1e-9 * (self.stamp_ns - stamps[a])
+        return TermPlace(*poses, stamps[a], seconds, late_s, a, scan)
+
+    def _nearest_scan(self, true_ns: float, values: gtsam.Values) -> tuple[int, int | None]:
+        """Which scan is nearest in true time of those whose pose is known, and where in the trajectory."""
+        trajectory, found = self.keys.trajectory, []
+        for scan, features in enumerate(self.features):
+            at = trajectory.position(features.stamp_ns)
+            if at is not None and values.exists(trajectory.keys[at]):
+                found.append((abs(features.stamp_ns - true_ns), scan, at))
+        return min(found)[1:] if found else (0, None)
+
+    def matched(self, values: gtsam.Values, kernel_px: float, information: float = 1.0) -> TermMatches:
+        """Match at the values, and make the factor.
+
+        Args:
+            values: with extrinsic, offset, biases and the poses around the image.
+            kernel_px: scale of the robust kernel [px]; ``config.match.gate`` times it is the search range.
+            information: what the image counts, over what its matches would by themselves.
+        """
+        place = self.place(values)
+        if isinstance(place, TermMatches):
+            return place
+        found = self._align(values, place, kernel_px)
+        if len(found) < self.config.min_matches:
+            return TermMatches(TermState.FEW_MATCHES, kernel_px, place=place, found=found)
+        factor = self._factor(place, found, information)
+        matches = TermMatches(TermState.MATCHED, kernel_px, 0.0, place, found, factor, information, self)
+        return replace(matches, made_at=tuple(r for r, _ in self.residuals_of(matches, values)))
+
+    def rows(self, matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> TermRows:
+        """The matches as rows of the linear problem at the values, with the sides that they lie on."""
+        place = matches.place
+        if matches.factor is None or place is None:
+            return TermRows.none()
+        scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.X_scan)
+        found, parts = matches.found, []
+        for c, alignment, numbers, (r, J) in zip(
+            found.classes,
+            found.alignments,
+            sides.of(scan_ns, found, wTl),
+            self.residuals_of(matches, values),
+            strict=True,
+        ):
+            r = r + self.keys.bias(values, c)
+            weights = alignment.weights * alignment.kernel.weight(r / alignment.sigmas_px)
+            columns = np.zeros((len(r), COLUMNS))
+            columns[:, :7], columns[:, bias_column(c)] = J, 1.0
+            parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers))
+        return TermRows.joined(parts)
+
+    def _wTl(self, values: gtsam.Values, X: int) -> gtsam.Pose3:
+        wTb = values.atPose3(X)
+        return wTb if self.keys.bTl is None else wTb * self.keys.bTl
+
+    def _factor(self, place: TermPlace, found: FrameAlignments, information: float) -> gtsam.CustomFactor:
+        return pose_alignment_factor(
+            found.alignments,
+            place.X_a,
+            place.X_b,
+            self.keys.cTl,
+            self.keys.offset_s,
+            place.seconds,
+            X_scan=place.X_scan,
+            bTl=self.keys.bTl,
+            biases_px=[self.keys.biases_px.get(c) for c in found.classes],
+            image_after_middle_s=place.image_after_a_s - 0.5 * place.seconds,
+            noise=gtsam.noiseModel.Isotropic.Sigma(1, information**-0.5),
+        )
+
+    def residuals_of(self, matches: TermMatches, values: gtsam.Values) -> list[tuple[FloatArray, FloatArray]]:
+        """Of each alignment, (rows,) residuals at the values [px] and their Jacobian (rows, 7) by extrinsic
+        and offset, the trajectory and the camera's twist held."""
+        place = matches.place
+        if place is None:
+            return []
+        cTl, offset_s = self.keys.extrinsic(values), self.keys.offset(values)
+        a, b = values.atPose3(place.X_a), values.atPose3(place.X_b)
+        c_twist = cTl.AdjointMap() @ self._in_lidar(
+            np.asarray(gtsam.Pose3.Logmap(a.between(b))) / place.seconds
+        )
+        lTs = self._lTs(values, place)
+        moved = cTl if lTs is None else cTl * lTs
+        late_s = offset_s + place.image_after_a_s - 0.5 * place.seconds
+        found = []
+        for alignment in matches.found.alignments:
+            twist = c_twist + late_s * alignment.c_acceleration
+            r, J = residuals(alignment, moved, offset_s, twist)
+            # cTl Exp(d) lTs = cTl lTs Exp(Ad(lTs^-1) d)
+            by_cTl = J[:, :6] if lTs is None else J[:, :6] @ lTs.inverse().AdjointMap()
+            found.append((r, np.column_stack([by_cTl, J[:, 6]])))
+        return found
+
+    def _align(self, values: gtsam.Values, place: TermPlace, kernel_px: float) -> FrameAlignments:
+        trajectory, keys = self.keys.trajectory, self.keys
+        twist = trajectory.twist(values, place.position)
+        assert twist is not None  # place() has looked
+        acceleration = trajectory.acceleration(values, place.position)
+        late_s = keys.offset(values) + place.image_after_a_s - 0.5 * place.seconds
+        lTs = self._lTs(values, place)
+        scan, moving = self.features[place.scan], self.l_velocities[place.scan]
+        return align_frame(
+            scan if lTs is None else _without(scan, moving),
+            self.image,
+            self.camera,
+            keys.extrinsic(values),
+            keys.offset(values),
+            self._in_lidar(twist + late_s * acceleration),
+            l_acceleration=self._in_lidar(acceleration),
+            lTs=lTs,
+            from_ns=None if lTs is None else place.stamp_a_ns,
+            classes=self.config.classes,
+            biases_px={c: keys.bias(values, c) for c in keys.biases_px},
+            l_velocities=moving if lTs is None else None,
+            kernel=RobustKernel(self.config.kernel, kernel_px),
+            config=self.config.match,
+        )
+
+    def _in_lidar(self, b_twist: FloatArray) -> FloatArray:
+        if self.keys.bTl is None:
+            return b_twist
+        return np.asarray(self.keys.bTl.inverse().AdjointMap() @ b_twist)
+
+    def _lTs(self, values: gtsam.Values, place: TermPlace) -> gtsam.Pose3 | None:
+        """Pose of the scan in the LiDAR's frame at X_a; None where it was taken there."""
+        if place.X_scan == place.X_a:
+            return None
+        aTs = values.atPose3(place.X_a).between(values.atPose3(place.X_scan))
+        bTl = self.keys.bTl
+        return aTs if bTl is None else bTl.inverse() * aTs * bTl
+
+
+def _without(scan: ScanFeatures, moving: Mapping[ObjectName, Any]) -> ScanFeatures:
+    """A scan without the objects that move."""
+    if not moving:
+        return scan
+    kept = {}
+    for c, points in scan.boundaries.items():
+        numbers = [n for of, n in moving if of == c]
+        kept[c] = points.take(np.flatnonzero(~np.isin(points.objects, numbers)))
+    return replace(scan, boundaries=kept)

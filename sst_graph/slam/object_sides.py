@@ -1,0 +1,86 @@
+"""Sides of objects, known again from image to image by their place in the world.
+
+An outline that differs from its mask does so in every image that shows it: what errs together is one
+cluster. Objects are followed by the centre of their matched points, near where it was last seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.association.edge_matching import SIDES
+from sst_graph.slam.align import FrameAlignments
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+SAME_OBJECT_M = 1.5
+"""Centres of an object's matched points in consecutive images lie nearer than this [m]: parked vehicles
+stand at least a vehicle's width apart, and what is seen of one moves by decimetres from image to image."""
+
+
+@dataclass
+class _Track:
+    """One object: its class, and where it was seen last, in the world [m]."""
+
+    semantic_class: SemanticClass
+    place: FloatArray
+
+
+class ObjectSides:
+    """Numbers for the sides of objects, the same in every image."""
+
+    def __init__(self) -> None:
+        self._tracks: list[_Track] = []
+        self._names: dict[tuple[int, SemanticClass, int], int] = {}
+
+    def __len__(self) -> int:
+        """How many sides have a number."""
+        return SIDES * len(self._tracks)
+
+    def of(self, scan_ns: int, found: FrameAlignments, wTl: gtsam.Pose3) -> list[NDArray[np.intp]]:
+        """Of each alignment, (n,) number of the side that each match lies on.
+
+        Args:
+            scan_ns: stamp of the scan, which names its objects.
+            found: matches of the scan.
+            wTl: pose of the LiDAR at the scan.
+        """
+        numbers = []
+        for c, alignment, objects, sides in zip(
+            found.classes, found.alignments, found.objects, found.sides, strict=True
+        ):
+            tracks = np.zeros(len(objects), dtype=np.intp)
+            for number in np.unique(objects):
+                own = objects == number
+                centre = np.asarray(wTl.transformFrom(alignment.lPs[own].mean(axis=0)))
+                tracks[own] = self._track((scan_ns, c, int(number)), centre)
+            numbers.append(tracks * SIDES + sides)
+        return numbers
+
+    def _track(self, name: tuple[int, SemanticClass, int], centre: FloatArray) -> int:
+        """The track of an object of a scan: the nearest of its class that the scan has not named yet."""
+        if name not in self._names:
+            self._names[name] = self._nearest(name[0], name[1], centre)
+        track = self._names[name]
+        self._tracks[track].place = centre
+        return track
+
+    def _nearest(self, scan_ns: int, semantic_class: SemanticClass, centre: FloatArray) -> int:
+        taken = {
+            track for (stamp, c, _), track in self._names.items() if (stamp, c) == (scan_ns, semantic_class)
+        }
+        near = [
+            (float(np.linalg.norm(track.place - centre)), k)
+            for k, track in enumerate(self._tracks)
+            if track.semantic_class == semantic_class and k not in taken
+        ]
+        distance, nearest = min(near, default=(np.inf, -1))
+        if distance <= SAME_OBJECT_M:
+            return nearest
+        self._tracks.append(_Track(semantic_class, centre))
+        return len(self._tracks) - 1

@@ -1,0 +1,174 @@
+"""Matching again and again while a graph is solved: Levenberg-Marquardt, and what all solvers share.
+
+Frozen matches lead to a point that the next matches confirm or not. The loop solves, matches again at what
+was found, and narrows the robust kernel wherever a round has moved the matched points little beside it
+(deterministic annealing, as in robust ICP). While the kernel is wide, what the matches hardly tell is held
+by a *proximal* prior on extrinsic and offset about the present estimate, whose sigmas are a kernel's width
+in the image: matches say nothing farther than they reach. It follows the estimate, so that it pulls towards
+nothing, and it is gone at the end.
+
+The covariance of extrinsic and offset is cluster-robust (:mod:`sst_graph.slam.covariance`), and the factors
+are scaled down by its mean ratio to what they claim, so that the marginals of the graph itself tell the same
+size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import EstimationError
+from sst_graph.factors.delay import time_offset_prior
+from sst_graph.slam.alignment_keys import AlignmentKeys
+from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
+from sst_graph.slam.config import RematchConfig
+from sst_graph.slam.covariance import (
+    TermSums,
+    fit_errors,
+    inflation,
+    marginal,
+    robust_covariance,
+    rows_of,
+    told,
+    total,
+)
+from sst_graph.slam.object_sides import ObjectSides
+from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings, wide_uncertainty
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RematchSolution:
+    """Where the loop ended.
+
+    Attributes:
+        values: the estimate.
+        graph: the user's factors and those of the terms, with the last matches.
+        matches: of each term, in their order.
+        covariance: (7, 7) cluster-robust, of extrinsic and time offset; order and perturbation as
+            :mod:`factors` has them; zeros for what is constant.
+        rounds: rounds of matching.
+        settled: the last round moved the matched points by less than ``step_px``.
+        warnings: what may be wrong.
+    """
+
+    values: gtsam.Values
+    graph: gtsam.NonlinearFactorGraph
+    matches: tuple[TermMatches, ...]
+    covariance: FloatArray
+    rounds: int
+    settled: bool
+    warnings: tuple[TermWarning, ...]
+
+
+def solve_with_terms(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    terms: Sequence[AlignmentTerm],
+    config: RematchConfig | None = None,
+) -> RematchSolution:
+    """Levenberg-Marquardt on a graph and the terms' factors, matched again until that changes nothing.
+
+    Args:
+        graph: all other factors, priors on extrinsic and offset among them.
+        values: start, of all variables.
+        terms: of one camera.
+        config: the schedule.
+
+    Raises:
+        EstimationError: no term, no match at the start, or a system that is indeterminate at the end.
+    """
+    config = config or RematchConfig()
+    if not terms:
+        raise EstimationError("solve_with_terms: found no term, expected one or more")
+    keys, kernel_px, held = terms[0].keys, config.first_px, True
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(config.inner_iterations)
+    matches = match_all(terms, values, kernel_px, 1.0)
+    warnings = wide_uncertainty(matches, values, marginal(graph, values, keys)[:7, :7], config)
+    settled, rounds = False, 0
+    while not settled and rounds < config.most_rounds:
+        whole = with_factors(graph, matches)
+        if held:
+            whole.push_back(proximal(matches, values, kernel_px, keys))
+        values = gtsam.LevenbergMarquardtOptimizer(whole, values, parameters).optimize()
+        moved, rounds = moved_px(matches, values), rounds + 1
+        if kernel_px > config.last_px:
+            if moved < config.settled * kernel_px:
+                kernel_px = config.narrower(kernel_px)
+        elif held:
+            held = moved >= config.settled * kernel_px
+        else:
+            settled = moved < config.step_px
+        matches = match_all(terms, values, kernel_px, 1.0)
+    # The covariance by matches that count in full; then the factors are scaled down to it.
+    P, sides = marginal(with_factors(graph, matches), values, keys), ObjectSides()
+    if not np.isfinite(P).all():
+        found = "a graph that does not determine extrinsic and time offset"
+        raise EstimationError(f"solve_with_terms: found {found}, expected priors on them")
+    rows = [rows_of(each, sides, values) for each in matches]
+    sums = total(TermSums.of(each, 1.0) for each in rows)
+    robust = robust_covariance(P, sums, fit_errors(rows, config), keys)
+    C = robust.covariance
+    matches = match_all(terms, values, kernel_px, 1.0 / inflation(robust.independent, robust.clustered))
+    whole = with_factors(graph, matches)
+    if not settled:
+        warnings.append(TermWarning(WarningKind.NOT_SETTLED, moved, config.step_px, "px"))
+    warnings += last_warnings(matches, values, C, config)
+    warnings += told(marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config)
+    return RematchSolution(values, whole, tuple(matches), C, rounds, settled, tuple(warnings))
+
+
+def match_all(
+    terms: Sequence[AlignmentTerm], values: gtsam.Values, kernel_px: float, information: float
+) -> list[TermMatches]:
+    """Every term at the values.
+
+    Raises:
+        EstimationError: none of them has a factor.
+    """
+    matches = [term.matched(values, kernel_px, information) for term in terms]
+    if all(each.factor is None for each in matches):
+        states = ", ".join(sorted({each.state.value for each in matches}))
+        found = f"no factor in {len(terms)} terms ({states})"
+        raise EstimationError(f"alignment: found {found}, expected one or more")
+    return matches
+
+
+def with_factors(
+    graph: gtsam.NonlinearFactorGraph, matches: Sequence[TermMatches]
+) -> gtsam.NonlinearFactorGraph:
+    """A copy of the graph with the terms' factors."""
+    whole = gtsam.NonlinearFactorGraph(graph)
+    for each in matches:
+        if each.factor is not None:
+            whole.add(each.factor)
+    return whole
+
+
+def moved_px(matches: Sequence[TermMatches], values: gtsam.Values) -> float:
+    """How far the values have moved the matched points since matching, RMS over the terms [px]."""
+    moved = [each.moved_px(values) for each in matches if each.factor is not None]
+    return float(np.sqrt(np.mean(np.square(moved)))) if moved else 0.0
+
+
+def proximal(
+    matches: Sequence[TermMatches], values: gtsam.Values, kernel_px: float, keys: AlignmentKeys
+) -> gtsam.NonlinearFactorGraph:
+    """Priors on extrinsic and offset about the values; along each axis a kernel's width in the image."""
+    J = [J for each in matches if each.term is not None for _, J in each.term.residuals_of(each, values)]
+    reach = np.sqrt(np.mean(np.square(np.concatenate(J)), axis=0)) if J else np.zeros(7)
+    sigmas = kernel_px / np.maximum(reach, 1e-3 * kernel_px)  # at most 1,000 of what moves nothing
+    graph = gtsam.NonlinearFactorGraph()
+    if isinstance(keys.cTl, int):
+        noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[:6])
+        graph.add(gtsam.PriorFactorPose3(keys.cTl, values.atPose3(keys.cTl), noise))
+    if isinstance(keys.offset_s, int):
+        double = keys.keeps_double(values)
+        graph.add(time_offset_prior(keys.offset_s, keys.offset(values), float(sigmas[6]), double=double))
+    return graph

@@ -1,0 +1,97 @@
+"""Do the data contradict what a tracker takes for granted? Score tests from its sums, at any time.
+
+What leaves the window is kept as one belief on the unknowns x that carries the parameters of all assumptions
+along (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
+With H the information of past and window on [x, theta], g its vector at the estimate and a = [-H_xx^-1 H_xt,
+1], the score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of
+matches add, and
+
+    theta = a'g / (a'H a / f + s^-2)
+
+is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
+threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.batch.assumption_tests`).
+Objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch.assumption_tests import Finding, few_objects
+from sst_graph.covariance.considered import AssumptionConfig
+from sst_graph.covariance.jackknife import believed_flatness
+from sst_graph.errors import EstimationError
+from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.tracker.window.smoother import WindowSmoother
+
+EVERY = 10
+"""Scans between two tests: they cost about as much as the covariance, which each frame has."""
+
+
+def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[Finding, ...]:
+    """What the data so far say of each assumption that the matches test, the most contradicted first.
+
+    Raises:
+        EstimationError: a direction without any information.
+    """
+    H, g, n = smoother.information(), smoother.vector(), smoother.past.point.size
+    try:
+        follows = -(scaled_inverse(H[:n, :n]) @ H[:n, n:])
+    except np.linalg.LinAlgError as error:
+        raise EstimationError(str(error)) from error
+    A = np.concatenate([follows, np.eye(smoother.past.held)])
+    score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
+    surplus = np.einsum("nk,nm,mk->k", A, smoother.surplus(with_held=True), A)
+    before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
+    curvature = np.maximum(information, 0.0) / believed_flatness(smoother.flatness) + before
+    values = score / curvature
+    sigmas = np.sqrt(np.maximum(information + surplus, 0.0) + before) / curvature
+    sigmas *= few_objects(smoother.objects, config.threshold)
+    found = []
+    for place, name in enumerate(smoother.held_names):
+        assumption = ASSUMPTIONS[name]
+        if not assumption.by_matches:
+            continue
+        value, sigma = float(values[place]), float(sigmas[place])
+        contradicted = abs(value) > config.threshold * sigma
+        found.append(Finding(assumption, value, sigma, contradicted))
+    return tuple(sorted(found, key=lambda finding: -finding.score))
+
+
+class AssumptionTests:
+    """When a running tracker tests what it takes for granted, and what it has found.
+
+    Attributes:
+        found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
+    """
+
+    def __init__(self, config: AssumptionConfig) -> None:
+        self.config = config
+        self.found: dict[str, tuple[float, float, bool]] = {}
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """Of the last test, the most contradicted first."""
+        return tuple(Finding(ASSUMPTIONS[name], *said) for name, said in self.found.items())
+
+    def restart(self) -> None:
+        """A new calibration begins."""
+        self.found = {}
+
+    def take(self, scan: int, smoother: WindowSmoother) -> None:
+        """The smoother knows a scan of this number."""
+        if scan % EVERY == 0:
+            self.look(smoother)
+
+    def look(self, smoother: WindowSmoother) -> None:
+        """Test now.
+
+        Raises:
+            EstimationError: a direction without any information.
+        """
+        if self.config.test:
+            self.found = {
+                finding.assumption.name: (finding.value, finding.sigma, finding.contradicted)
+                for finding in score_findings(smoother, self.config)
+            }

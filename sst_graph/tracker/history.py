@@ -1,0 +1,92 @@
+"""The calibration over time: every epoch, smoothed over all of them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.tracker.window.epochs import RetiredEpoch
+from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.smoother import WindowSmoother
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HistoryEntry:
+    """One epoch.
+
+    Attributes:
+        stamp_ns: its first scan's stamp.
+        cTl, time_offset_s: the smoothed calibration.
+        covariance: (7, 7), cluster-robust epoch by epoch.
+    """
+
+    stamp_ns: int
+    cTl: gtsam.Pose3
+    time_offset_s: float
+    covariance: FloatArray
+
+
+class History:
+    """Beliefs of the epochs that have passed, one run after each alarm; the oldest are forgotten."""
+
+    def __init__(self, most: int) -> None:
+        self.epochs: deque[RetiredEpoch] = deque(maxlen=most)
+
+    def take(self, smoother: WindowSmoother) -> None:
+        """Take over the epochs that a smoother has retired."""
+        self.epochs.extend(smoother.retired)
+        smoother.retired.clear()
+
+    def cut(self) -> None:
+        """A break: what comes is not tied to what was."""
+        self.epochs.clear()
+
+    def smoothed(self, smoother: WindowSmoother) -> list[HistoryEntry]:
+        """All epochs since the last break, the window's included, each given all the others."""
+        epochs = [*self.epochs, *smoother.live_epochs()]
+        walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
+        point = smoother.point.core()
+        beliefs = [_honest(epoch, point) for epoch in epochs]
+        forward = _passed(beliefs, walks, smoother.prior)
+        nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))
+        backward = _passed(beliefs[::-1], walks[::-1], nothing)[::-1]
+        entries = []
+        for epoch, belief, a, b in zip(epochs, beliefs, forward, backward, strict=True):
+            total = belief.plus(a).plus(b)
+            best = total.mean()
+            covariance = scaled_inverse(total.information)[:7, :7]
+            entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.offset_s, covariance))
+        return entries
+
+
+def _passed(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
+    """What reaches each epoch from those before it."""
+    messages = [first]
+    for belief, walk in zip(beliefs[:-1], walks, strict=True):
+        messages.append(belief.plus(messages[-1]).drifted(walk))
+    return messages
+
+
+def _honest(epoch: RetiredEpoch, point: Point) -> Gaussian:
+    """The epoch's belief with its cluster-robust information: H M^-1 H, M = H + surplus."""
+    belief = epoch.belief.at(point)
+    H = belief.information
+    diagonal = np.diag(H)
+    if not (diagonal > 0.0).any():
+        return belief
+    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
+    K = H * np.outer(scale, scale)
+    M = K + epoch.surplus * np.outer(scale, scale) + 1e-9 * np.eye(len(H))
+    shrink = np.linalg.solve(M, K).T  # K M^-1
+    information = shrink @ K / np.outer(scale, scale)
+    vector = (shrink @ (belief.vector * scale)) / scale
+    return Gaussian(point, 0.5 * (information + information.T), vector)

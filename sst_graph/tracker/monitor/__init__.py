@@ -1,0 +1,1 @@
+"""Whether the calibration has changed, and which one to use."""

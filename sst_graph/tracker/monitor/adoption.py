@@ -1,0 +1,93 @@
+"""Whether a candidate may replace the calibration in use: its covariance and held-out frames must agree."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sst_graph.drive.preparation import Drive, outline_size
+from sst_graph.factors import alignment_cost
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
+from sst_graph.tracker.config import AdoptionConfig
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.types import SemanticClass
+
+
+class Adoption:
+    """The calibration in use, and the gate to it."""
+
+    def __init__(self, config: AdoptionConfig, adopted: Point | None = None) -> None:
+        self.config = config
+        self.adopted = adopted
+        self.costs: deque[tuple[float, float]] = deque(maxlen=config.held_out)
+
+    def restart(self) -> None:
+        """Forget the comparison; the calibration in use stays until a better one has shown itself."""
+        self.costs.clear()
+
+    def hear(self, cost: Callable[[Point], float | None], candidate: Point, guess: Point | None) -> None:
+        """New frames, before they are used, by what they cost at a point.
+
+        Args:
+            candidate: the estimate before them.
+            guess: what is in use while nothing has been adopted.
+        """
+        in_use = self.adopted or guess
+        ours = theirs = cost(candidate)
+        if in_use is not None and float(np.abs(candidate.core().local(in_use.core())).max()) > 0.0:
+            theirs = cost(in_use)
+        self.compare(ours, theirs)
+
+    def compare(self, candidate: float | None, in_use: float | None) -> None:
+        """Held-out costs of one frame: of the candidate made before it, and of the one in use."""
+        if candidate is not None and in_use is not None:
+            self.costs.append((candidate, in_use))
+
+    def offer(self, candidate: Point, trusted: bool) -> bool:
+        """Adopt the candidate if its covariance is within the limits and held-out frames agree."""
+        if not trusted or len(self.costs) < self.config.held_out:
+            return False
+        ours, theirs = np.mean(self.costs, axis=0)
+        if ours > (1.0 + self.config.margin) * theirs:
+            return False
+        self.adopted = candidate
+        return True
+
+
+def held_out_cost(
+    drive: Drive,
+    tracks: Tracks,
+    point: Point,
+    classes: tuple[SemanticClass, ...],
+    kernel: RobustKernel,
+    config: GraphConfig,
+) -> float | None:
+    """Mean robust cost of the boundary points of frames that took no part; None where none can be seen.
+
+    A point that finds no contour costs as much as the farthest match.
+    """
+    pairs = associate([drive], tracks, point.state(classes), kernel, config)
+    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.undersides)) for pair in pairs]
+    return mean_cost(counted, point, classes, kernel, config)
+
+
+def mean_cost(
+    pairs: Sequence[tuple[PairMatches, int]],
+    point: Point,
+    classes: tuple[SemanticClass, ...],
+    kernel: RobustKernel,
+    config: GraphConfig,
+) -> float | None:
+    """Mean robust cost of boundary points, given each pair's matches and number of boundary points."""
+    worst = float(kernel.loss(config.match.gate * kernel.scale))
+    cost, count = 0.0, 0
+    for pair, total in pairs:
+        count += total
+        cost += worst * (total - len(pair))
+        for c, matches in pair.matches.items():
+            bias = float(point.biases_px[classes.index(c)])
+            cost += alignment_cost(matches.alignment, point.cTl, point.offset_s, pair.motion.c_twist, bias)
+    return cost / count if count else None

@@ -1,0 +1,262 @@
+"""The tracker's first estimate: a short batch over the window."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from sst_graph.association.time_pairing import pair_by_time
+from sst_graph.assumptions import named_sigmas
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import EstimationError
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.building import GraphConfig, Tracks
+from sst_graph.graph.outer_loop import JointConfig, explained, solving_joint
+from sst_graph.graph.state import State
+from sst_graph.initialization.selection import choosing_start, narrowed
+from sst_graph.stepwise import Stepwise, whole
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.monitor.adoption import held_out_cost
+from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.types import SemanticClass
+
+_OTHER_BASIN_RAD = float(np.radians(2.0))
+"""Poses that are turned by more are of different basins."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a start begins.
+
+    Attributes:
+        cTl: rough extrinsic, or None where nothing is known.
+        offset_s: rough time offset [s].
+        search: search around the guess; False trusts it to within a degree or two.
+    """
+
+    cTl: gtsam.Pose3 | None
+    offset_s: float
+    search: bool = True
+
+    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point | None:
+        """As an estimate without mask biases, its parameters (``names``) 0; None where nothing is known."""
+        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes, names)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """A solution and the mean cost of all boundary points under it."""
+
+    cost: float
+    point: Point
+
+    def turned_from(self, other: _Solved) -> bool:
+        """Whether the two are poses of different basins."""
+        return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
+
+
+class _Unsettled(EstimationError):
+    """A solution that still moved when its iterations ended, as far as it came."""
+
+    def __init__(self, message: str, reached: _Solved) -> None:
+        super().__init__(message)
+        self.reached = reached
+
+
+def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
+    """All steps of :func:`estimating_first`."""
+    return whole(estimating_first(drive, guess, config))
+
+
+def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
+    """The batch solution of some scans of the window, step by step.
+
+    A short stretch of driving at one speed does not tell the time offset. So the offset stays with the
+    guess unless the labels clearly say otherwise: a solution whose search left the offset free must
+    explain them better by ``start_gain``, and within a solution a step of the offset is damped.
+
+    Raises:
+        EstimationError: too little to see, an ambiguous start, or a solution that did not settle, or did
+            while one that did not explains the labels better.
+    """
+    searched = guess.search or guess.cTl is None
+    reach = config.calibration.start.search.delay_s if guess.search else 0.0
+    # 1. Candidates, with time offsets around the guess's.
+    starts = yield from _starts(drive, guess, config, reach)
+    # 2. Their poses with the guess's time offset; then as they are.
+    held = [State(start.cTl, (guess.offset_s,)) for start in _of_other_basins(starts)]
+    if searched:
+        # The contest has led them near.
+        joint = narrowed(config.calibration.joint)
+        config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, joint=joint))
+    ways = [held, starts] if reach > 0.0 else [starts]
+    solved, failed = yield from _tried([_best(drive, way, config) for way in ways])
+    if not solved:
+        raise failed[-1]
+    best, *others = solved
+    for other in others:
+        if other.cost < (1.0 - config.start_gain) * best.cost:
+            best = other
+    _refuse_beside(best, failed, config)
+    return best.point
+
+
+def _of_other_basins(starts: Sequence[State]) -> list[State]:
+    """The starts that are not in the basin of one before."""
+    chosen: list[State] = []
+    for start in starts:
+        if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
+            chosen.append(start)
+    return chosen
+
+
+def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
+
+
+def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
+    """The solutions, and why there are no others."""
+    solved, failed = [], []
+    for way in ways:
+        try:
+            solved.append((yield from way))
+        except EstimationError as error:
+            failed.append(error)
+    return solved, failed
+
+
+def _unsettled(failed: Sequence[EstimationError]) -> list[_Solved]:
+    """What those reached that only did not come to rest."""
+    return [error.reached for error in failed if isinstance(error, _Unsettled)]
+
+
+def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: TrackerConfig) -> None:
+    """Refuse a solution if one of another basin is clearly better, though it has not come to rest.
+
+    At a steady speed the time offset may slide along with the translation for ever.
+    """
+    for other in _unsettled(failed):
+        if best.turned_from(other) and other.cost < (1.0 - config.start_gain) * best.cost:
+            raise EstimationError(
+                f"another pose explains the labels better (cost {other.cost:.3f} against {best.cost:.3f} a "
+                "point), but has not settled"
+            )
+
+
+def _best(drive: Drive, starts: Sequence[State], config: TrackerConfig) -> Stepwise[_Solved]:
+    """The best of the solutions from some starts.
+
+    Raises:
+        EstimationError: no solution, or two that differ and explain the labels alike.
+    """
+    solved, failed = yield from _tried([_solution(drive, start, config) for start in starts])
+    if not solved:
+        if reached := _unsettled(failed):
+            raise _Unsettled(str(failed[0]), min(reached, key=lambda one: one.cost))
+        raise failed[0]
+    best, *others = sorted(solved, key=lambda solution: solution.cost)
+    _refuse_beside(best, failed, config)
+    for other in others:
+        if best.turned_from(other) and best.cost > (1.0 - config.start_gain) * other.cost:
+            raise EstimationError(
+                f"two poses explain the labels alike (cost {best.cost:.3f} and {other.cost:.3f} a point)"
+            )
+    return best
+
+
+def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
+    """Where the solutions begin: the winners of the batch's contest, with offsets within ``delay_s`` of the
+    guess's, or the guess itself.
+
+    Raises:
+        EstimationError: nothing to search for, or no guess and no search.
+    """
+    calibration = config.calibration
+    search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
+    enabled = guess.search or guess.cTl is None
+    start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    if config.start_work > 0:
+        # The estimate is waited for, and scans of one second show much the same: candidates are compared on
+        # every other one, and the best are solved on all.
+        few = min(start.contest_scans, (len(drive.scans) + 1) // 2)
+        start = dataclasses.replace(start, contest_scans=few)
+    joint = _damped(config) if delay_s == 0.0 else calibration.joint
+    contest = yield from choosing_start(
+        [drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, joint, start
+    )
+    return [State(cTl, (offset_s,)) for cTl, offset_s in contest.finalists]
+
+
+def _damped(config: TrackerConfig) -> JointConfig:
+    """The joint method with small steps of the time offset."""
+    joint = config.calibration.joint
+    graph = dataclasses.replace(joint.graph, delay_sigma_s=config.start_offset_step_s)
+    return dataclasses.replace(joint, graph=graph)
+
+
+def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_Solved]:
+    """The joint method from a start, its offset damped."""
+    calibration = config.calibration
+    solution = yield from solving_joint([drive], start, _damped(config))
+    state = solution.state
+    biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
+    names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
+    parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
+    cTl, offset_s = state.cTl, state.offset_s(0)
+    point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
+    if not solution.converged:
+        message = f"the first solution still moved after {solution.outer_iterations} iterations"
+        raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
+    if explained(solution) < calibration.start.min_explained:
+        share = f"{100.0 * explained(solution):.0f} %"
+        raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
+    _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
+    return _Solved(_cost(drive, point, config), point)
+
+
+def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
+    """Mean cost of all boundary points of the window."""
+    joint, classes = config.calibration.joint, config.calibration.classes
+    kernel = RobustKernel("geman_mcclure", joint.kernel_px[-1])
+    cost = held_out_cost(drive, Tracks([drive]), point, classes, kernel, joint.graph)
+    if cost is None:
+        raise EstimationError("no boundary point meets an image")
+    return cost
+
+
+def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, config: TrackerConfig) -> None:
+    """Refuse a solution that has run off in time: it leaves pairs behind, or the searched offsets."""
+    limit = config.calibration.joint.graph.max_interval_periods * drive.image_period_s
+    seen = [
+        pair
+        for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, limit)
+        if drive.scans[pair.scan].boundaries and drive.images[pair.image].contours
+    ]
+    if pairs < config.start_share * len(seen):
+        raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
+    reach = config.calibration.start.search.delay_s
+    if abs(offset_s - start_s) > reach:
+        raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
+
+
+def prior_belief(
+    point: Point, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
+) -> Gaussian:
+    """The batch's own weak priors around the guess, linearized at a point.
+
+    A class's mask bias is around 0, that of its undersides around the class's; an estimated parameter of an
+    assumption is around 0.
+    """
+    estimated = dict(named_sigmas(config.estimate))
+    sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
+    k = len(classes)
+    sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
+    information = np.diag(1.0 / np.square(sigmas))
+    tie, biases = config.underside_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
+    information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
+    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
+    return Gaussian(point, information, information @ point.local(centre))

@@ -1,0 +1,1 @@
+"""A tracker on disk and back."""

@@ -1,0 +1,367 @@
+"""A tracker on disk: one npz file, written whole or not at all, arrays and JSON only.
+
+What is read is held against its checksum, against the classes of the estimators, and against what a tracker
+can answer; a file that passes none of it is refused as a whole.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import gc
+import hashlib
+import importlib
+import io
+import json
+import pkgutil
+import re
+import warnings
+import zipfile
+import zlib
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from sst_graph.errors import CheckpointError, DataError
+from sst_graph.files import atomic_write_in_steps
+from sst_graph.files.checked_values import checked_camera
+from sst_graph.files.object_store import Block, Blocks, Node, class_name, restored, stored
+from sst_graph.files.reading import FileKind, parse_json, read_file
+from sst_graph.tracker.storage.resume import Setup, check_memory, check_setup
+from sst_graph.tracker.tracker import Tracker
+from sst_graph.types import NO_PICTURE, CameraImage
+
+FORMAT = "sst-graph/tracker"
+VERSION = 18
+"""Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
+
+CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
+
+_NPY_HEADER = re.compile(
+    rb"\x93NUMPY\x01\x00..\{'descr': '\|u1', 'fortran_order': False, 'shape': \((\d{1,15}),\), \} *\n",
+    re.DOTALL,
+)
+"""How NumPy begins the file of an array of bytes; its own reader evaluates more than that."""
+
+_MEMBERS = ("head", "data", "sha256")
+_STEP_BYTES = 8 * 1024 * 1024
+"""Are summed up, or written, in a step: some milliseconds."""
+_MAX_DEPTH = 200
+"""Levels of a checkpoint's JSON; a tracker's has about forty."""
+
+_PACKAGES = (
+    "sst_graph.association",
+    "sst_graph.assumptions",
+    "sst_graph.baselines",
+    "sst_graph.batch",
+    "sst_graph.covariance",
+    "sst_graph.drive",
+    "sst_graph.factors",
+    "sst_graph.features",
+    "sst_graph.graph",
+    "sst_graph.hand_eye",
+    "sst_graph.initialization",
+    "sst_graph.inspect",
+    "sst_graph.objects",
+    "sst_graph.odometry",
+    "sst_graph.odometry.sweep",
+    "sst_graph.sweep_timing",
+    "sst_graph.tracker",
+    "sst_graph.types",
+)
+"""Where the classes are defined that a tracker is made of."""
+
+
+class Saver:
+    """Saves one tracker under one name, so that no frame takes long for it.
+
+    ``saver.follow(tracker)`` goes before each frame, ``saver.save(tracker)`` behind one that is to be saved.
+    What a tracker keeps of a scan, an image or a pair never changes: it is stored once, with the frame after
+    the one that brought it. A save consolidates the tracker; before the next frame the rest of it is stored,
+    and then the file is written, some with each frame. It takes its name in one step, so that a kill at any
+    moment leaves the former one whole, or the new one.
+
+    As a context it finishes where the block ends well, and leaves the former file where it does not.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = path
+        self._blocks = Blocks(checkpoint_classes())
+        self._saved: Tracker | None = None
+        self._writing: Generator[None] | None = None
+
+    def __enter__(self) -> Saver:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self.finish()
+        elif self._writing is not None:
+            self._writing.close()
+
+    def follow(self, tracker: Tracker) -> None:
+        """Store what the last frame brought, and the rest of a tracker that was saved, or write some of it.
+
+        Raises:
+            OSError: it cannot be written; what stood there is untouched.
+        """
+        for value in _lasting(tracker):
+            self._blocks.number(value)
+        if self._saved is not None:
+            self._store()
+        elif self._writing is not None:
+            next(self._writing, None)
+
+    def save(self, tracker: Tracker) -> None:
+        """Save a tracker as it is; the file is there after :meth:`finish`, or some frames later.
+
+        The tracker is consolidated (:meth:`Tracker.consolidate`), so that it and the one that is read back go
+        on to the same estimates. It may change after the next :meth:`follow`, not before.
+
+        Raises:
+            OSError: an earlier one cannot be written; what stood there is untouched.
+        """
+        self.finish()
+        tracker.consolidate(self._blocks)
+        self._saved = tracker
+
+    def _store(self) -> None:
+        """Store the tracker that was saved; a large file is still to be written."""
+        with _uncollected():
+            node, rest, blocks = self._blocks.stored(self._saved)
+        self._saved = None
+        self._writing = atomic_write_in_steps(self._path, partial(_filling, node, rest, blocks))
+        if len(rest) + sum(len(block.data) for block in blocks) < _STEP_BYTES:
+            self.finish()
+
+    def finish(self) -> None:
+        """Write all that is left to write.
+
+        Raises:
+            OSError: it cannot be written; what stood there is untouched.
+        """
+        if self._saved is not None:
+            self._store()
+        for _ in self._writing or ():
+            pass
+
+
+def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
+    """Write a tracker; a file that exists is replaced in one step.
+
+    The tracker is consolidated first (:meth:`Tracker.consolidate`), so that it and the one that is read back
+    go on to the same estimates.
+
+    Raises:
+        OSError: it cannot be written; what stood there is untouched.
+    """
+    with Saver(path) as saver:
+        saver.save(tracker)
+
+
+def _lasting(tracker: Tracker) -> Iterator[object]:
+    """What never changes of what a tracker holds, most of it; the rest of that is small."""
+    yield from (features for _, features in tracker.window.scans)
+    yield from tracker.window.images
+    if tracker.smoother is not None:
+        yield from tracker.smoother.entries.values()
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without Python's search for circular garbage: so many lists at once would set it off for nothing."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
+
+
+def _filling(node: Node, rest: bytes, blocks: Sequence[Block], stream: BinaryIO) -> Iterator[None]:
+    """Write a tracker as :func:`numpy.savez` does, with its checksum, some with each step."""
+    # 1. JSON, the blocks' as it is there already, and all bytes.
+    yield
+    head, parts = _head(node, len(rest), blocks), [rest, *(block.data for block in blocks)]
+    yield
+    # 2. The checksum of both.
+    digest = hashlib.sha256(len(head).to_bytes(8, "little"))
+    for portion in _portions([head, *parts]):
+        for part in portion:
+            digest.update(part)
+        yield
+    # 3. The file.
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in zip(_MEMBERS, ([head], parts, [digest.digest()]), strict=True):
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                array = {"descr": "|u1", "fortran_order": False, "shape": (sum(map(len, content)),)}
+                np.lib.format.write_array_header_1_0(member, array)
+                for portion in _portions(content):
+                    member.writelines(portion)
+                    yield
+
+
+def _head(node: Node, start: int, blocks: Sequence[Block]) -> bytes:
+    """All JSON of a checkpoint; the blocks' bytes begin at ``start``."""
+    records = []
+    for block in blocks:
+        records.append(f"[{block.number}, {start}, {len(block.data)}, {block.text}]")
+        start += len(block.data)
+    text = json.dumps({"format": FORMAT, "version": VERSION, "tracker": node}, allow_nan=False)
+    return f'{text[:-1]}, "blocks": [{", ".join(records)}]}}'.encode("ascii")
+
+
+def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:
+    """The parts, in order, some megabytes at a time."""
+    portion: list[bytes] = []
+    for part in parts:
+        portion.append(part)
+        if sum(map(len, portion)) >= _STEP_BYTES:
+            yield portion
+            portion = []
+    yield portion
+
+
+def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
+    """The tracker in a checkpoint, at the estimate it was saved with.
+
+    Whether it goes on with the drive that it was saved on,
+    :func:`sst_graph.tracker.storage.resume.frames_to_come` tells.
+
+    Args:
+        setup: camera, settings and guess that it must have been made with; None for any.
+
+    Raises:
+        CheckpointError: no such file, not a checkpoint of this version, or one that was changed or damaged.
+        DataError: one of a tracker that was made with another camera, other settings or another guess.
+    """
+    try:
+        head, data = _members(read_file(path, CHECKPOINT), path)
+        document = parse_json(head, path, CHECKPOINT.name, max_depth=_MAX_DEPTH)
+    except CheckpointError:
+        raise
+    except DataError as error:
+        raise CheckpointError(path, error.found, error.expected) from None
+    found = (document.get("format"), document.get("version")) if isinstance(document, dict) else (None, None)
+    if found != (FORMAT, VERSION):
+        raise CheckpointError(
+            path, f"{found[0]!r:.60} version {found[1]!r:.60}", f"{FORMAT} version {VERSION}"
+        )
+    # Numbers of a forged file overflow where those of a tracker do not: no warning of NumPy's is ours.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        _rehearse(_tracker(document, data, path), path)
+        tracker = _tracker(document, data, path)
+        tracker.starting.catch_up()
+    if setup is not None:
+        check_setup(tracker, setup, path)
+    return tracker
+
+
+def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tracker:
+    try:
+        blocks = document.get("blocks", [])
+        tracker = restored(document.get("tracker"), data, checkpoint_classes(), blocks)
+    except ValueError as error:
+        raise CheckpointError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
+    if not isinstance(tracker, Tracker):
+        raise CheckpointError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
+    return tracker
+
+
+def _rehearse(tracker: Tracker, path: str | Path) -> None:
+    """Require a tracker that answers and takes its last frame once more: its parts go with each other.
+
+    Raises:
+        CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
+    """
+    try:
+        checked_camera(tracker.camera, "camera")
+        check_memory(tracker)
+        tracker.starting.catch_up()
+        tracker.current().to_dict()
+        tracker.consolidate()
+        _again(tracker)
+        tracker.current().to_dict()
+        stored(tracker)
+    except Exception as error:
+        found = f"a tracker that does not answer ({type(error).__name__}: {error})"
+        raise CheckpointError(path, found, "all of a tracker") from error
+
+
+def _again(tracker: Tracker) -> None:
+    """The last frame once more, a second later."""
+    scan, images = tracker.last_scan, tracker.window.images
+    stamps = [one.stamp_ns for one in (scan, *images) if one is not None]
+    if not stamps:
+        return
+    later = max(stamps) + 1_000_000_000
+    if images:
+        tracker.add_image(CameraImage(later, images[-1].mask, NO_PICTURE))
+    if scan is not None:
+        tracker.add_scan(dataclasses.replace(scan, stamp_ns=later))
+
+
+@cache
+def checkpoint_classes() -> dict[str, type]:
+    """Classes and enumerations that a checkpoint may name."""
+    modules = []
+    for package in map(importlib.import_module, _PACKAGES):
+        modules.append(package)
+        found = pkgutil.walk_packages(getattr(package, "__path__", ()), f"{package.__name__}.")
+        modules += [importlib.import_module(info.name) for info in found]
+    return {
+        class_name(cls): cls
+        for module in modules
+        for cls in vars(module).values()
+        if isinstance(cls, type) and cls.__module__ == module.__name__ and not issubclass(cls, Exception)
+    }
+
+
+def _members(archive: bytes, path: str | Path) -> tuple[str, memoryview]:
+    """JSON and bytes of an npz file whose members are stored as they are, and have their checksum.
+
+    Nothing is unpacked: a member's declared shape is compared with the bytes that are there.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(archive)) as file:
+            names = [f"{name}.npy" for name in _MEMBERS]
+            if file.namelist() != names:
+                raise ValueError(f"members {file.namelist()!r:.100}")
+            head, data, digest = (_bytes_of(file, name, len(archive)) for name in names)
+            text = bytes(head).decode("ascii")
+    except (zipfile.BadZipFile, zlib.error, ArithmeticError, LookupError, OSError, RuntimeError) as error:
+        raise _unreadable(path, error) from error
+    except (EOFError, MemoryError, NotImplementedError, ValueError) as error:
+        raise _unreadable(path, error) from error
+    if _digest(head, data) != bytes(digest):
+        raise CheckpointError(path, "no readable checkpoint (another checksum)", "one as it was written")
+    return text, data
+
+
+def _bytes_of(file: zipfile.ZipFile, name: str, most: int) -> memoryview:
+    info = file.getinfo(name)
+    if info.compress_type != zipfile.ZIP_STORED or info.flag_bits & 1 or info.file_size > most:
+        raise ValueError(f"{name} compressed, encrypted or larger than the file")
+    content = file.read(info)
+    header = _NPY_HEADER.match(content)
+    if header is None or int(header[1]) != len(content) - header.end():
+        raise ValueError(f"{name} that is no array of as many bytes as it says")
+    return memoryview(content)[header.end() :]
+
+
+def _digest(head: bytes | memoryview, data: bytes | memoryview) -> bytes:
+    """SHA-256 of both: a damaged or edited checkpoint is told from one as it was written."""
+    sum_ = hashlib.sha256(len(head).to_bytes(8, "little"))
+    sum_.update(head)
+    sum_.update(data)
+    return sum_.digest()
+
+
+def _unreadable(path: str | Path, error: Exception) -> CheckpointError:
+    found = f"no readable checkpoint ({type(error).__name__}: {error})"
+    return CheckpointError(path, found, CHECKPOINT.name)

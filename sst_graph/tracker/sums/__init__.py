@@ -1,0 +1,1 @@
+"""The sums that the covariance of a running estimate is made from."""

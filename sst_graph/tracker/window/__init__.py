@@ -1,0 +1,1 @@
+"""The latest scans and images, and the smoother over them."""

@@ -1,0 +1,103 @@
+"""Scans that left the window when it was not certain which image they belong to.
+
+A scan half way between two images is paired with the one or the other as the time offset moves by its own
+sigma. The batch pairs by its answer. So of a scan that leaves, what it says with the other image is kept too,
+and the past changes from the one to the other when the offset passes the middle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.tracker.window.gaussian import Gaussian, Point
+
+FloatArray = NDArray[np.float64]
+
+REACH_SIGMAS = 4.0
+"""A pairing is certain where the offset is farther from the middle, in its standard deviations."""
+MOST = 100
+"""Latest scans that are kept; older ones stay as they are."""
+
+
+@dataclass(frozen=True)
+class Other:
+    """What a scan says with the other image.
+
+    Attributes:
+        belief: on the unknowns of the scan.
+        middle_s: time offset at which the scan lies half way between its two images [s].
+        early: whether the pairing in use is with the earlier image, as it is from ``middle_s`` on.
+    """
+
+    belief: Gaussian
+    middle_s: float
+    early: bool
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """Other pairings less those in use, one row a scan, about a point, in the columns of the past and of what
+    it holds.
+
+    Attributes:
+        middles_s: (k,) time offsets at which the scans lie half way between their images [s].
+        early: (k,) whether the earlier image is in use.
+        information, vector: (k, n, n), (k, n).
+    """
+
+    middles_s: FloatArray
+    early: NDArray[np.bool_]
+    information: FloatArray
+    vector: FloatArray
+
+    @classmethod
+    def none(cls, n: int) -> Undecided:
+        return cls(np.zeros(0), np.zeros(0, np.bool_), np.zeros((0, n, n)), np.zeros((0, n)))
+
+    def plus(self, used: Gaussian, other: Other, point: Point) -> Undecided:
+        """One more scan; objects of the other pairing that are not known at the point are left out."""
+        n = point.size + used.held
+        difference = np.zeros((n, n)), np.zeros(n)
+        for belief, sign in ((other.belief, 1.0), (used, -1.0)):
+            unknown = [track for track in belief.point.tracks if track not in point.tracks]
+            belief = belief.without(unknown)[0] if unknown else belief
+            belief = belief.at(point)
+            columns = point.columns(belief.point.tracks, belief.held)
+            difference[0][np.ix_(columns, columns)] += sign * belief.information
+            difference[1][columns] += sign * belief.vector
+        return Undecided(
+            np.append(self.middles_s, other.middle_s)[-MOST:],
+            np.append(self.early, other.early)[-MOST:],
+            np.concatenate([self.information, difference[0].reshape(1, n, n)])[-MOST:],
+            np.concatenate([self.vector, difference[1].reshape(1, n)])[-MOST:],
+        )
+
+    def moved(self, step: FloatArray) -> Undecided:
+        """About a point that lies a step away; (m,) of the unknowns, without what is held."""
+        moved = self.information[:, :, : len(step)] @ step
+        return Undecided(self.middles_s, self.early, self.information, self.vector - moved)
+
+    def through(self, T: FloatArray) -> Undecided:
+        """In other unknowns: scores follow T (m, n), as :meth:`Gaussian.without` tells it."""
+        return Undecided(self.middles_s, self.early, T @ self.information @ T.T, self.vector @ T.T)
+
+    def decided(self, past: Gaussian, offset_s: float) -> tuple[Undecided, Gaussian]:
+        """Pairings as they are under a time offset, and the past with them; both about the past's point."""
+        changed = (offset_s >= self.middles_s) != self.early
+        if not changed.any():
+            return self, past
+        information, n = past.information + self.information[changed].sum(axis=0), past.point.size
+        if np.linalg.eigvalsh(information[:n, :n])[0] <= 0.0:
+            return self, past
+        past = Gaussian(past.point, information, past.vector + self.vector[changed].sum(axis=0))
+        sign = np.where(changed, -1.0, 1.0)
+        flipped = Undecided(
+            self.middles_s,
+            self.early ^ changed,
+            sign[:, None, None] * self.information,
+            sign[:, None] * self.vector,
+        )
+        return flipped, past

@@ -1,0 +1,46 @@
+"""What each scan brought to the tracker as it came."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.inspect.gained import Gain, Gained, bits_between
+from sst_graph.result import FrameId
+
+FloatArray = NDArray[np.float64]
+
+MOST = 2000
+"""Latest scans that are kept."""
+
+
+class Arrivals:
+    """Covariance after each scan that was taken in.
+
+    Attributes:
+        rows: (9,) each: number of the scan, bits gained (NaN for the first after a start), sigmas after it.
+    """
+
+    def __init__(self) -> None:
+        self.rows: deque[FloatArray] = deque(maxlen=MOST)
+        self._last: FloatArray | None = None
+
+    def restart(self) -> None:
+        """A new calibration begins."""
+        self._last = None
+
+    def take(self, scan: int, covariance: FloatArray) -> None:
+        """A scan was taken in and left this covariance (7, 7)."""
+        bits = np.nan if self._last is None else bits_between(self._last, covariance)
+        self.rows.append(np.array([scan, bits, *np.sqrt(np.diag(covariance))]))
+        self._last = covariance.copy()
+
+    def gained(self, drive: str) -> Gained:
+        """As it stands in a result."""
+        gains = (
+            Gain(FrameId(drive, int(row[0])), None if np.isnan(row[1]) else float(row[1]), row[2:])
+            for row in self.rows
+        )
+        return Gained("as they came", tuple(gains))

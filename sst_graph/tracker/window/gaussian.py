@@ -1,0 +1,350 @@
+"""A Gaussian belief on extrinsic, time offset, mask biases and estimated parameters of assumptions, in
+information form at a point."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from itertools import groupby, pairwise
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.factors import custom_factor
+from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.state import State, underside_track
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A value of the unknowns; tangent order [extrinsic 6, offset 1, biases, parameters, object biases].
+
+    Attributes:
+        cTl: extrinsic.
+        offset_s: time offset [s].
+        biases_px: (2 c,) mask bias of each class, then that of each class's undersides [px].
+        tracks: objects with a mask bias of their own, by the number of their track.
+        object_biases_px: (k,) those biases [px].
+        names: assumptions whose parameters are estimated.
+        parameters: (p,) the values of these parameters, in their units.
+    """
+
+    cTl: gtsam.Pose3
+    offset_s: float
+    biases_px: FloatArray
+    tracks: tuple[int, ...] = ()
+    object_biases_px: FloatArray = field(default_factory=lambda: np.zeros(0))
+    names: tuple[str, ...] = ()
+    parameters: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def unbiased(
+        cls,
+        cTl: gtsam.Pose3,
+        offset_s: float,
+        classes: Sequence[SemanticClass],
+        names: Sequence[str] = (),
+    ) -> Point:
+        """With mask biases of 0, and parameters of 0 by these names."""
+        nothing = np.zeros(len(names))
+        return cls(cTl, offset_s, np.zeros(2 * len(classes)), names=tuple(names), parameters=nothing)
+
+    @property
+    def size(self) -> int:
+        return self.core_size + len(self.tracks)
+
+    @property
+    def core_size(self) -> int:
+        """Unknowns before the objects' biases."""
+        return 7 + len(self.biases_px) + len(self.parameters)
+
+    @property
+    def parameter_columns(self) -> range:
+        """Columns of the estimated parameters."""
+        return range(7 + len(self.biases_px), self.core_size)
+
+    def columns(self, tracks: Sequence[int], held: int = 0) -> IntArray:
+        """Columns of [extrinsic, offset, biases, parameters, these objects' biases, and ``held`` further ones
+        that are behind all]; not to be written to."""
+        return _columns(self.core_size, self.tracks, tuple(tracks), held)
+
+    def seen(self, places: Mapping[int, int]) -> Point:
+        """The point with just these objects; one that has no bias yet takes its class's.
+
+        Args:
+            places: place of its class's bias by the number of the track.
+        """
+        known = dict(zip(self.tracks, self.object_biases_px.tolist(), strict=True))
+        biases = [known.get(track, float(self.biases_px[place])) for track, place in places.items()]
+        return replace(self, tracks=tuple(places), object_biases_px=np.array(biases))
+
+    def with_object(self, track: int, bias_px: float) -> Point:
+        """The point with one more object."""
+        biases = np.append(self.object_biases_px, bias_px)
+        return replace(self, tracks=(*self.tracks, track), object_biases_px=biases)
+
+    def core(self) -> Point:
+        """The point without objects."""
+        return self.seen({})
+
+    def local(self, other: Point) -> FloatArray:
+        """(n,) step from here to another point, over the objects that are known here."""
+        turn = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        theirs = other.object_biases_px
+        if other.tracks != self.tracks:
+            theirs = theirs[other.columns(self.tracks)[other.core_size :] - other.core_size]
+        return np.concatenate(
+            [
+                turn,
+                [other.offset_s - self.offset_s],
+                np.subtract(other.biases_px, self.biases_px),
+                np.subtract(other.parameters, self.parameters),
+                theirs - self.object_biases_px,
+            ]
+        )
+
+    def moved(self, step: FloatArray) -> Point:
+        """The point a step (n,) away."""
+        return replace(
+            self,
+            cTl=self.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
+            offset_s=self.offset_s + float(step[6]),
+            biases_px=self.biases_px + step[7 : 7 + len(self.biases_px)],
+            parameters=self.parameters + step[7 + len(self.biases_px) : self.core_size],
+            object_biases_px=self.object_biases_px + step[self.core_size :],
+        )
+
+    def state(self, classes: Sequence[SemanticClass]) -> State:
+        """As the state that matches are made at."""
+        of_class, below = np.split(self.biases_px, 2)
+        biases = {(0, c): float(bias) for c, bias in zip(classes, of_class, strict=True)}
+        shared = {(0, underside_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
+        return State(self.cTl, (self.offset_s,), biases, shared, self.nuisances)
+
+    @property
+    def nuisances(self) -> dict[str, float]:
+        """The estimated parameters by name."""
+        return dict(zip(self.names, self.parameters.tolist(), strict=True))
+
+
+@dataclass(frozen=True)
+class Gaussian:
+    """exp(-1/2 d' information d + vector' d) of the step d from a point.
+
+    Behind the unknowns there may be parameters that are held at 0, those of assumptions that are not
+    estimated: what the data say of them is carried along, and taken for what it is where all else is known.
+
+    Attributes:
+        point: where it was linearized.
+        information: (n, n) of the unknowns, then of what is held.
+        vector: (n,).
+    """
+
+    point: Point
+    information: FloatArray
+    vector: FloatArray
+
+    @property
+    def held(self) -> int:
+        """How many parameters are held."""
+        return len(self.vector) - self.point.size
+
+    def without_held(self) -> Gaussian:
+        """The belief on the unknowns alone."""
+        n = self.point.size
+        return self if self.held == 0 else Gaussian(self.point, self.information[:n, :n], self.vector[:n])
+
+    def holding(self, count: int) -> Gaussian:
+        """The belief with so many parameters held of which nothing is known yet."""
+        n = len(self.vector)
+        information = np.zeros((n + count, n + count))
+        information[:n, :n] = self.information
+        return Gaussian(self.point, information, np.append(self.vector, np.zeros(count)))
+
+    def at(self, point: Point) -> Gaussian:
+        """The same belief about another, near point; objects that are new there are left out."""
+        point = point if point.tracks == self.point.tracks else _like(self.point, point)
+        moved = self.information[:, : self.point.size] @ self.point.local(point)
+        return Gaussian(point, self.information, self.vector - moved)
+
+    def plus(self, other: Gaussian) -> Gaussian:
+        """Both beliefs together, at this one's point; the objects of the other are all known here.
+
+        What is held is what this belief holds, or nothing.
+        """
+        other = other.at(self.point) if self.held else other.without_held().at(self.point)
+        columns = self.point.columns(other.point.tracks, other.held)
+        information, vector = self.information.copy(), self.vector.copy()
+        information[np.ix_(columns, columns)] += other.information
+        vector[columns] += other.vector
+        return Gaussian(self.point, information, vector)
+
+    def information_with(self, others: Sequence[Gaussian]) -> FloatArray:
+        """(n, n) information of this belief and others, whose objects are all known here."""
+        others = others if self.held else [other.without_held() for other in others]
+        columns = [self.point.columns(other.point.tracks, other.held) for other in others]
+        return self.information + scattered(len(self.vector), columns, [o.information for o in others])[0]
+
+    def vector_with(self, others: Sequence[Gaussian]) -> FloatArray:
+        """(n,) vector of the same, about this belief's point."""
+        vector = self.vector.copy()
+        for other in others:
+            vector[self.point.columns(other.point.tracks, other.held)] += other.at(self.point).vector
+        return vector
+
+    def with_objects(self, places: Mapping[int, int], sigma_px: float) -> Gaussian:
+        """The belief with biases of further objects, each within ``sigma_px`` of its class's.
+
+        Args:
+            places: place of its class's bias by the number of the track.
+        """
+        if not places:
+            return self
+        of_class = [float(self.point.biases_px[place]) for place in places.values()]
+        point = replace(
+            self.point,
+            tracks=(*self.point.tracks, *places),
+            object_biases_px=np.append(self.point.object_biases_px, of_class),
+        )
+        n, size = self.point.size, len(self.vector) + len(places)
+        information, vector = np.zeros((size, size)), np.zeros(size)
+        before = np.array([*range(n), *range(point.size, size)])
+        information[np.ix_(before, before)], vector[before] = self.information, self.vector
+        weight = sigma_px**-2.0
+        for i, place in enumerate(places.values()):
+            a, b = 7 + place, n + i
+            information[a, a] += weight
+            information[b, b] += weight
+            information[a, b] = information[b, a] = -weight
+        return Gaussian(point, information, vector)
+
+    def without(self, tracks: Sequence[int]) -> tuple[Gaussian, FloatArray]:
+        """The belief with some objects' biases marginalized out, and how scores follow.
+
+        Returns:
+            the belief; T (m, n) = [I, -H_xo H_oo^-1]: a score (n,) of the whole belief counts in the smaller
+            one as T times it.
+        """
+        kept = [track for track in self.point.tracks if track not in set(tracks)]
+        x = self.point.columns(kept, self.held)
+        o = np.setdiff1d(np.arange(len(self.vector)), x)
+        T = np.zeros((len(x), len(self.vector)))
+        T[np.arange(len(x)), x] = 1.0
+        H = self.information
+        T[:, o] = -np.linalg.solve(H[np.ix_(o, o)], H[np.ix_(o, x)]).T
+        point = replace(self.point, tracks=tuple(kept), object_biases_px=_picked(self.point, kept))
+        information = T @ H[:, x]
+        return Gaussian(point, 0.5 * (information + information.T), T @ self.vector), T
+
+    def core(self) -> Gaussian:
+        """The belief on [extrinsic, offset, biases] alone."""
+        return self.without(self.point.tracks)[0] if self.point.tracks else self
+
+    def transition(self, variances: FloatArray) -> FloatArray:
+        """A (n, n) = (I + information Q)^-1 of a random walk, Q = diag(variances (m,), 0): the rest stays."""
+        Q = np.zeros(len(self.vector))
+        Q[: len(variances)] = variances
+        return np.asarray(np.linalg.inv(np.eye(len(Q)) + self.information * Q[None, :]))
+
+    def drifted(self, variances: FloatArray) -> Gaussian:
+        """The belief after a random walk."""
+        A = self.transition(variances)
+        information = A @ self.information
+        return Gaussian(self.point, 0.5 * (information + information.T), A @ self.vector)
+
+    def mean(self) -> Point:
+        """The most likely value, of beliefs that hold nothing."""
+        return self.point.moved(scaled_inverse(self.information) @ self.vector)
+
+    def factor(self, keys: Sequence[int]) -> gtsam.LinearContainerFactor:
+        """As a factor on [extrinsic, offset, biases..., parameters..., object biases...]; it can be pickled.
+
+        Of beliefs that hold nothing.
+        """
+        n, starts = self.point.size, [0, 6, *range(7, self.point.size + 1)]
+        scale = np.sqrt(np.maximum(np.diag(self.information), 1e-30))
+        R = np.linalg.cholesky(self.information / np.outer(scale, scale) + 1e-14 * np.eye(n)).T
+        b = np.linalg.solve(R.T, self.vector / scale)
+        R = R * scale
+        blocks = [np.asarray(R[:, start:end], np.float64) for start, end in pairwise(starts)]
+        error = np.asarray(-b, np.float64)
+
+        def linear(*_: object, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
+            return error, blocks if jacobians else None
+
+        values = gtsam.Values()
+        insert_point(values, keys, self.point)
+        dims = [end - start for start, end in pairwise(starts)]
+        factor = custom_factor(gtsam.noiseModel.Unit.Create(n), keys, linear, dims, n)
+        return gtsam.LinearContainerFactor(factor.linearize(values), values)
+
+
+@lru_cache(maxsize=4096)
+def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...], held: int) -> IntArray:
+    """Kept, for each frame asks for those of the whole window, and few of them are new."""
+    objects, size = [core + known.index(track) for track in chosen], core + len(known)
+    return np.array([*range(core), *objects, *range(size, size + held)], dtype=np.intp)
+
+
+def with_room(before: int, after: int, held: int) -> FloatArray:
+    """T (after + held, before + held) from some unknowns to more of them, before what is held."""
+    T = np.zeros((after + held, before + held))
+    T[:before, :before] = np.eye(before)
+    T[after:, before:] = np.eye(held)
+    return T
+
+
+def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
+    """(k, m) steps from each point to another, over [extrinsic, offset, biases, parameters]."""
+    turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)
+    offsets = np.array([to.offset_s - point.offset_s for point in points])
+    biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
+    parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
+    return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
+
+
+def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
+    """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
+    if not places:
+        return [np.zeros((n, n)) for _ in blocks]
+    # Blocks of one size together: a call for each of them would cost more than what it does.
+    order: list[int] = sorted(range(len(places)), key=lambda i: len(places[i]))
+    groups = [list(group) for _, group in groupby(order, key=lambda i: len(places[i]))]
+    columns = [np.array([places[i] for i in group]) for group in groups]
+    where = np.concatenate([(own[:, :, None] * n + own[:, None, :]).reshape(-1) for own in columns])
+    return [
+        np.asarray(np.bincount(where, _in_a_row(some, groups), n * n).reshape(n, n), np.float64)
+        for some in blocks
+    ]
+
+
+def _in_a_row(blocks: Sequence[FloatArray], groups: Sequence[Sequence[int]]) -> FloatArray:
+    """(k,) all entries of blocks, those of each group have one shape."""
+    return np.concatenate([np.array([blocks[i] for i in group]).reshape(-1) for group in groups])
+
+
+def _like(target: Point, source: Point) -> Point:
+    """The source's values, with the objects of the target."""
+    return replace(source, tracks=target.tracks, object_biases_px=_picked(source, target.tracks))
+
+
+def _picked(point: Point, tracks: Sequence[int]) -> FloatArray:
+    """(k,) biases of some objects of a point [px]."""
+    return point.object_biases_px[point.columns(tracks)[point.core_size :] - point.core_size]
+
+
+def insert_point(values: gtsam.Values, keys: Sequence[int], point: Point) -> None:
+    """Put a point into values under [extrinsic, offset, biases, parameters, object biases], where a key is
+    not there yet."""
+    scalars = [point.offset_s, *point.biases_px, *point.parameters, *point.object_biases_px]
+    if not values.exists(keys[0]):
+        values.insert(keys[0], point.cTl)
+    for key, scalar in zip(keys[1:], scalars, strict=True):
+        if not values.exists(key):
+            values.insert(key, np.array([float(scalar)]))

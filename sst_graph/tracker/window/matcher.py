@@ -1,0 +1,233 @@
+"""Matches of the window's scans, at any point, with the window's knowledge of the objects."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sst_graph.association.time_pairing import pair_by_time
+from sst_graph.assumptions import held_at_zero
+from sst_graph.batch.lower_edges import UndersideSupport, underside_support
+from sst_graph.drive.preparation import Drive, outline_size, outlines
+from sst_graph.drive.trajectory import GrowingTrack
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.building import PairMatches, Tracks, associate
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.monitor.adoption import mean_cost
+from sst_graph.tracker.sums.scan_scores import PairScore, score_pair, with_share
+from sst_graph.tracker.window.ambiguous_pairs import REACH_SIGMAS, Other
+from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.window import Window
+from sst_graph.types import SemanticClass
+
+_SMOOTHED = 12
+"""So many of the latest motions are smoothed anew with every scan."""
+
+
+class WindowMatcher:
+    """Pairs and matches the scans of a window: moving objects left out, each object with its track."""
+
+    def __init__(self, window: Window, config: TrackerConfig) -> None:
+        self.window = window
+        self.config = config
+        self.classes = config.calibration.classes
+        self.graph = config.calibration.joint.graph
+        self.held_names = held_at_zero(self.graph.estimate)
+        self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
+        self._twists: tuple[int, Tracks] | None = None
+        self._growing = GrowingTrack(_SMOOTHED)
+        self._last: tuple[Point, dict[int, PairMatches]] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What it knows, without what it has at hand for the present frame."""
+        return {**vars(self), "_twists": None, "_last": None}
+
+    def look_below(self, point: Point) -> None:
+        """Match edges towards the ground from now on, of classes whose labels agree about them."""
+        if self.config.calibration.undersides.use != "never":
+            self.match_below(self.support_below(point, None))
+
+    def support_below(self, point: Point, chosen: Collection[int] | None) -> UndersideSupport:
+        """What the edges towards the ground of some scans (None: all) say about their labels at a point."""
+        drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
+        tracks, state = self._tracks(drive, numbers), point.state(self.classes)
+        return underside_support([drive], tracks, state, self.config.calibration.joint)
+
+    def match_below(self, support: UndersideSupport) -> None:
+        """Match edges towards the ground from now on, of classes whose labels agree as this support says."""
+        chosen, _ = support.agreed(self.config.calibration.undersides)
+        self.graph = replace(self.config.calibration.joint.graph, undersides=chosen)
+
+    def match(
+        self,
+        point: Point,
+        chosen: Collection[int] | None,
+        kernel: RobustKernel | None = None,
+        share: float = 1.0,
+        offset_sigma_s: float = 0.0,
+    ) -> tuple[dict[int, Found], set[int]]:
+        """Matches of some scans (None: all) at a point, and the scans that have none.
+
+        Args:
+            share: factor on the weights of all matches.
+            offset_sigma_s: standard deviation of the time offset; where its image is not certain, the scan
+                that leaves the window next is matched with the other one too [s].
+        """
+        pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
+        if kernel is None:
+            self._last = (point, pairs)
+        stamps = self.window.stamps_ns()
+        found = {}
+        for number, pair in pairs.items():
+            if len(pair) >= self.config.min_frame_matches:
+                pair = pair if share == 1.0 else with_share(pair, share)
+                by_object = not self.config.drift.enabled
+                score = self._score(pair, number, point, share, by_object, self.held_names)
+                image = self.window.images[pair.pair.image]
+                out = self.left_out(pair, number, point.offset_s)
+                found[number] = Found(pair, score, stamps[number], image.index, left_out=out)
+        for number in self.window.leaving():
+            if number in found and offset_sigma_s > 0.0:
+                other = self._other(point, found[number], number, kernel or self.kernel, offset_sigma_s)
+                found[number] = replace(found[number], other=other)
+        return found, set(numbers) - set(found)
+
+    def _other(
+        self, point: Point, found: Found, number: int, kernel: RobustKernel, offset_sigma_s: float
+    ) -> Other | None:
+        """What a scan says with the image on its other side, if the offset may still lead there."""
+        images = {image.index: k for k, image in enumerate(self.window.images)}
+        used = images[found.image]
+        stamps = [image.stamp_ns for image in self.window.images]
+        early = stamps[used] + round(point.offset_s * 1e9) <= found.stamp_ns
+        position = used + 1 if early else used - 1
+        if not 0 <= position < len(stamps):
+            return None
+        middle_s = (found.stamp_ns - 0.5 * (stamps[used] + stamps[position])) * 1e-9
+        if abs(point.offset_s - middle_s) > REACH_SIGMAS * offset_sigma_s:
+            return None
+        part, numbers = self.window.drive(lambda k: k == number)
+        part = replace(part, images=(self.window.images[position],))
+        tracks, state = self._tracks(part, numbers), point.state(self.classes)
+        pairs = associate([part], tracks, state, kernel, self.graph)
+        if not pairs or len(pairs[0]) < self.config.min_frame_matches:
+            return None
+        score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
+        return Other(score.bent, middle_s, early)
+
+    def scores(
+        self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
+    ) -> list[PairScore]:
+        """What some scans say at a point, all their objects but those of the tracks ``without``."""
+        return self.scores_of(self.pairs_at(point, chosen, kernel), point, without)
+
+    def pairs_at(self, point: Point, chosen: Collection[int], kernel: RobustKernel) -> dict[int, PairMatches]:
+        """Matches of some scans at a point."""
+        return self._pairs(point, chosen, kernel)[0]
+
+    def scores_of(
+        self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
+    ) -> list[PairScore]:
+        """What matches of scans, made at a point, say there without the objects of some tracks."""
+        if without:
+            pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
+        return [
+            self._score(pair, number, point, 1.0, by_object=False)
+            for number, pair in pairs.items()
+            if len(pair)
+        ]
+
+    def in_view(
+        self, point: Point, chosen: Collection[int], without: Collection[int]
+    ) -> dict[int, dict[int, int]]:
+        """How many boundary points of each object of scans that have an image ought to be seen in it.
+
+        Args:
+            without: tracks of objects that do not count.
+
+        Returns:
+            By the scan's number and the object's track.
+        """
+        part, numbers = self.window.drive(chosen.__contains__)
+        limit = self.graph.max_interval_periods * part.image_period_s
+        found = {}
+        for pair in pair_by_time(part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, limit):
+            number, contours = numbers[pair.scan], part.images[pair.image].contours
+            counts: dict[int, int] = {}
+            for c, points in outlines(part.scans[pair.scan], self.graph.undersides).items():
+                if c in contours:
+                    cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
+                    inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
+                    seen = np.bincount(inside) if len(inside) else np.zeros(0, np.intp)
+                    tracks = self.window.tracks[number]
+                    counts.update({tracks[c, o]: int(seen[o]) for o in np.flatnonzero(seen).tolist()})
+            found[number] = {track: count for track, count in counts.items() if track not in without}
+        return found
+
+    def left_out(
+        self, pair: PairMatches, number: int, offset_s: float
+    ) -> frozenset[tuple[SemanticClass, int, int]]:
+        """The objects of a scan that count for less with the image of a pair, or for nothing: they move."""
+        return self.window.left_out(number, offset_s + pair.pair.base_tau_s, self.graph.mover_reach_m)
+
+    def objects_of(self, chosen: Collection[int]) -> set[int]:
+        """Tracks of all objects of some scans."""
+        return {track for number in chosen for track in self.window.tracks.get(number, {}).values()}
+
+    def _leaving_out(self, pair: PairMatches, number: int, out: Collection[int]) -> PairMatches:
+        tracks, matches, own, terms = self.window.tracks[number], {}, {}, {}
+        for c, m in pair.matches.items():
+            kept = np.flatnonzero([tracks[c, int(name)] not in out for name in m.objects])
+            if len(kept):
+                part = {name: getattr(m, name)[kept] for name in ("objects", "sides", "index")}
+                matches[c] = replace(m, alignment=m.alignment.take(kept), **part)
+                if c in pair.tracks:
+                    own[c] = pair.tracks[c][kept]
+                if c in pair.terms:
+                    terms[c] = {name: column[kept] for name, column in pair.terms[c].items()}
+        return replace(pair, matches=matches, tracks=own, terms=terms)
+
+    def cost(self, point: Point, chosen: Collection[int]) -> float | None:
+        """Mean cost of the boundary points of some scans at a point; None where none can be seen."""
+        if self._last is not None and self._last[0] is point:
+            pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
+        else:
+            pairs, _ = self._pairs(point, chosen, self.kernel)
+        scans, below = dict(self.window.scans), self.graph.undersides
+        counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
+        return mean_cost(counted, point, self.classes, self.kernel, self.graph)
+
+    def _pairs(
+        self, point: Point, chosen: Collection[int] | None, kernel: RobustKernel
+    ) -> tuple[dict[int, PairMatches], list[int]]:
+        part, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
+        state = point.state(self.classes)
+        pairs = associate([part], self._tracks(part, numbers), state, kernel, self.graph)
+        return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
+
+    def _score(
+        self,
+        pair: PairMatches,
+        number: int,
+        point: Point,
+        share: float,
+        by_object: bool,
+        held: Sequence[str] = (),
+    ) -> PairScore:
+        tracks = self.window.tracks[number]
+        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
+
+    def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
+        """Twists over the window's motions, made once a scan, and objects where they have biases."""
+        if self._twists is None or self._twists[0] != self.window.next_scan:
+            self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
+        twists = self._twists[1]
+        return (
+            twists.seeing(*self.window.objects_of(numbers))
+            if self.graph.object_bias_sigma_px > 0.0
+            else twists
+        )

@@ -1,0 +1,76 @@
+"""Which scans of the window are matched anew with a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+import numpy as np
+
+from sst_graph.covariance.cluster_robust import FloatArray
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.window.gaussian import core_steps
+from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.smoother import WindowSmoother
+from sst_graph.tracker.window.whole_window import Settling
+
+_FRESH_SIGMAS = 0.02
+"""A scan is matched once more before it leaves the window if the estimate has moved farther since."""
+
+
+def scans_to_match(
+    number: int,
+    matcher: WindowMatcher,
+    smoother: WindowSmoother,
+    entered: Collection[int],
+    covariance: FloatArray,
+    config: TrackerConfig,
+    settling: Settling | None = None,
+) -> set[int]:
+    """The newest, those still without a pair, those that leave next, and some in turn.
+
+    Args:
+        number: of the newest scan.
+        entered: scans that have had a pair.
+        covariance: (m, m) of the estimate, over [extrinsic, offset, biases].
+        settling: says which are matched in turn while the tracker settles.
+    """
+    window = matcher.window
+    numbers = [n for n, _ in window.scans]
+    waiting = [n for n in numbers if n not in smoother.entries and n not in entered]
+    # What cannot wait, and as many others as there is time for: those judged anew, then the stalest.
+    chosen = {number, *waiting[-4:], *(n for n in numbers[-2:] if n in smoother.entries)}
+    staleness = _staleness(smoother, covariance)
+    leaving = [n for n in window.leaving() if staleness.get(n, 1.0) > _FRESH_SIGMAS]
+    # Those that wait for a first match take the place of those in turn: a frame costs no more for them.
+    late = max(0, len(waiting[-4:]) - 1)
+    turn = None if settling is None else settling.advance(smoother.point, late)
+    if settling is not None:
+        # No others: all of the window come in their turn, and to look below them costs as much.
+        return chosen | set(leaving) | (set(turn or ()) & set(staleness))
+    known = sorted(staleness, key=staleness.__getitem__, reverse=True)
+    stale = sum([value > config.stale_sigmas for value in staleness.values()])
+    some = known[: max(config.renew - len(leaving), stale)]
+    wanted = [*_judged_anew(matcher, smoother), *some]
+    return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[: config.renew_most])
+
+
+def _judged_anew(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
+    """Scans with a pair in which other objects are to be left out than were; the others are forgotten."""
+    window, found = matcher.window, []
+    for number in sorted(window.judged_anew & set(smoother.entries)):
+        entry = smoother.entries[number]
+        if matcher.left_out(entry.pair, number, smoother.point.offset_s) != entry.left_out:
+            found.append(number)
+        else:
+            window.judged_anew.discard(number)
+    return found
+
+
+def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, float]:
+    """How far the estimate has moved since each pair was matched, in standard deviations."""
+    if not smoother.entries:
+        return {}
+    points = [entry.score.belief.point for entry in smoother.entries.values()]
+    steps = core_steps(points, smoother.point)
+    squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
+    return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -1,0 +1,366 @@
+"""iSAM2 over a window of pairs whose matches are renewed; what leaves it stays as one linear factor."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.association.edge_matching import SIDES
+from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
+from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.jackknife import composed
+from sst_graph.errors import EstimationError
+from sst_graph.factors import extrinsic_drift, time_offset_drift
+from sst_graph.graph.building import GraphConfig, motion_factor, silhouettes_factor
+from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.state import (
+    bias_key,
+    nuisance_key,
+    object_bias_key,
+    time_offset_key,
+    twist_key,
+    underside_track,
+)
+from sst_graph.tracker.config import DriftConfig
+from sst_graph.tracker.sums.score_sums import ScoreSums
+from sst_graph.tracker.window.ambiguous_pairs import Undecided
+from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
+from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
+from sst_graph.tracker.window.smoother_update import Change, TwistFactor, read_point
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+_RELINEARIZE = {
+    "E": np.repeat([2e-4, 1e-3], 3),
+    "D": np.array([5e-4]),
+    "B": np.array([0.02]),
+    "O": np.array([0.1]),
+    "V": np.repeat([0.005, 0.03], 3),
+}
+"""Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below what a frame tells."""
+
+
+_RELINEARIZE_SPANS = 1e-3
+"""The same of an assumption's parameter, in units of what it may be: a few hundredths of a pixel."""
+
+
+def _parameters(estimate: Sequence[str]) -> gtsam.ISAM2Params:
+    """estimate: names and deviations of the parameters that are variables."""
+    params = gtsam.ISAM2Params()
+    thresholds = gtsam.ISAM2ThresholdMap()
+    for name, steps in _RELINEARIZE.items():
+        thresholds.insert((name, steps))
+    # One threshold for all keys of a letter: the least of them.
+    spans = [ASSUMPTIONS[name].span for name, _ in named_sigmas(estimate)]
+    if spans:
+        thresholds.insert(("N", np.array([_RELINEARIZE_SPANS * min(spans)])))
+    params.setRelinearizeThreshold(thresholds)
+    params.relinearizeSkip = 1
+    params.findUnusedFactorSlots = True
+    return params
+
+
+class WindowSmoother:
+    """The graph of the window; every update happens whole or not at all."""
+
+    def __init__(
+        self,
+        prior: Gaussian,
+        start_ns: int,
+        classes: Sequence[SemanticClass],
+        graph: GraphConfig,
+        drift: DriftConfig,
+    ) -> None:
+        """prior: of the first epoch."""
+        self.classes, self.graph, self.drift = tuple(classes), graph, drift
+        self.held_names = held_at_zero(graph.estimate)
+        self.prior = self.alone = prior
+        self.past = self.bent = prior.holding(len(self.held_names))
+        self.undecided = Undecided.none(len(self.bent.vector))
+        self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
+        self.entries: dict[int, Entry] = {}
+        self.model = ErrorModel(0.0, 0.0, 1.0)
+        self.retired: list[RetiredEpoch] = []
+        self._epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
+        self.ids: dict[int, int] = {}
+        self.twists: dict[int, TwistFactor] = {}
+        values = gtsam.Values()
+        insert_point(values, self.keys(0, prior.point.tracks), prior.mean())
+        self.isam, (self.past_id,) = self._linearized(values)
+        self._point = prior.mean()
+        self.epoch_sums = EpochSums.empty(prior.point)
+
+    @property
+    def point(self) -> Point:
+        """The present estimate (of the last epoch)."""
+        return self._point
+
+    @property
+    def epochs(self) -> tuple[Epoch, ...]:
+        """Epochs whose calibration is still a variable, oldest first."""
+        return self._epochs
+
+    @property
+    def matches(self) -> int:
+        """Matches of the window."""
+        return sum(entry.score.matches for entry in self.entries.values())
+
+    def keys(self, epoch: int, tracks: Sequence[int] = ()) -> list[int]:
+        """Keys of [E, D, biases..., parameters..., biases of some objects...] of an epoch."""
+        biases = [bias_key(0, c) for c in self.classes]
+        biases += [object_bias_key(0, underside_track(c)) for c in self.classes]
+        parameters = [nuisance_key(name) for name in self.prior.point.names]
+        objects = [object_bias_key(0, track) for track in tracks]
+        return [int(gtsam.symbol("E", epoch)), time_offset_key(epoch), *biases, *parameters, *objects]
+
+    def update(
+        self,
+        found: Mapping[int, Found],
+        dropped: set[int],
+        first_scan: int,
+        alive: Container[int] = (),
+    ) -> None:
+        """Renew or add pairs, retire those before ``first_scan``.
+
+        Args:
+            found: new matches by scan.
+            dropped: scans that no longer have a match and leave without a trace.
+            first_scan: the window's first scan.
+            alive: tracks of objects that may be seen again; the biases of all others are marginalized out
+                as soon as no pair of the window sees them.
+
+        Raises:
+            EstimationError: the update fails or gives numbers that are not finite; nothing has changed.
+        """
+        change = Change(self, found, dropped, first_scan, alive)
+        try:
+            change.apply()
+        except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
+            raise EstimationError(f"the update failed: {' '.join(str(error).split())[:200]}") from error
+        self._take(change)
+
+    def _take(self, change: Change) -> None:
+        self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
+        self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
+        self.past, self.bent, self.alone, self.sums = change.past, change.bent, change.alone, change.sums
+        self.undecided = change.undecided
+        self.epoch_sums, self._point = change.epoch_sums, change.point
+        self.retired += change.retired
+        if self.entries or self.sums.recent:
+            self.model = self.sums.error_model([entry.score for entry in self.entries.values()])
+
+    def rest_at(self, point: Point) -> None:
+        """Answer this estimate until the next update."""
+        self._point = point
+
+    def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
+        """What the matches of a pair say."""
+        (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
+        at = entry.score.belief.point.nuisances
+        return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0), at)
+
+    def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
+        """What odometry says of the twist of a pair's image."""
+        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.belief.point
+        return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s, self.graph)
+
+    def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
+        """The random walk of extrinsic and offset from one epoch to the next."""
+        a, b, drift = self.keys(old.number), self.keys(new.number), self.drift
+        seconds, rate = (new.start_ns - old.start_ns) * 1e-9, float(np.radians(drift.rotation_deg))
+        turn = extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m)
+        return turn, time_offset_drift(a[1], b[1], seconds, drift.offset_s)
+
+    def polish(self, iterations: int = 10) -> None:
+        """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
+
+        Raises:
+            EstimationError: it fails; nothing has changed.
+        """
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(iterations)
+        params.setlambdaInitial(1e-6)
+        params.setRelativeErrorTol(1e-9)
+        try:
+            optimizer = gtsam.LevenbergMarquardtOptimizer(
+                self._whole(), self.isam.calculateEstimate(), params
+            )
+            isam, indices = self._linearized(optimizer.optimize())
+            tracks, names = self.past.point.tracks, self.past.point.names
+            point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks, names)
+        except (RuntimeError, ValueError) as error:
+            raise EstimationError(f"the window's optimisation failed: {error}") from error
+        self._go_on_with(isam, indices)
+        self._point = point
+
+    def relinearize(self) -> None:
+        """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
+        self._go_on_with(*self._linearized(self.isam.calculateEstimate(), self._held()))
+
+    def _held(self) -> gtsam.NonlinearFactorGraph:
+        """As :meth:`_whole`, the very factors that iSAM2 holds."""
+        links = [link for epoch in self._epochs for link in epoch.links or ()]
+        twists = [twist.index for twist in self.twists.values()]
+        held, graph = self.isam.getFactorsUnsafe(), gtsam.NonlinearFactorGraph()
+        for index in [self.past_id, *links, *self.ids.values(), *twists]:
+            graph.add(held.at(index))
+        return graph
+
+    def _whole(self) -> gtsam.NonlinearFactorGraph:
+        """Every factor of the window: the past, the walks, the pairs, the twists."""
+        graph = gtsam.NonlinearFactorGraph()
+        keys = self.keys(self._epochs[0].number, self.past.point.tracks)
+        graph.add(self.bent.without_held().factor(keys))
+        for old, new in pairwise(self._epochs):
+            for factor in self.drift_factors(old, new):
+                graph.add(factor)
+        for scan in self.ids:
+            graph.add(self.pair_factor(self.entries[scan]))
+        for twist in self.twists.values():
+            graph.add(self.twist_factor(self.entries[twist.scan]))
+        return graph
+
+    def _linearized(
+        self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
+    ) -> tuple[gtsam.ISAM2, list[int]]:
+        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
+        isam = gtsam.ISAM2(_parameters(self.graph.estimate))
+        whole = self._whole() if graph is None else graph
+        return isam, list(isam.update(whole, values).getNewFactorsIndices())
+
+    def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
+        """Go on with an iSAM2 of :meth:`_whole`."""
+        new = iter(indices)
+        self.isam, self.past_id = isam, next(new)
+        first, *others = self._epochs
+        linked = (replace(epoch, links=(next(new), next(new))) for epoch in others)
+        self._epochs = (replace(first, links=None), *linked)
+        self.ids = {scan: next(new) for scan in self.ids}
+        self.twists = {image: replace(twist, index=next(new)) for image, twist in self.twists.items()}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but iSAM2; of that, where it is linearized."""
+        values = self.isam.getLinearizationPoint()
+        known = [
+            (key, values.atPose3(key) if gtsam.symbolChr(key) == ord("E") else values.atVector(key))
+            for key in values.keys()  # noqa: SIM118
+        ]
+        return {**vars(self), "isam": known}
+
+    def __setstate__(self, state: Mapping[str, Any]) -> None:
+        vars(self).update(state)
+        values = gtsam.Values()
+        for key, value in state["isam"]:
+            values.insert(key, value)
+        self._go_on_with(*self._linearized(values))
+
+    def walk(self, seconds: float) -> FloatArray:
+        """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] over some seconds."""
+        drift = self.drift
+        rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.offset_s]
+        return np.asarray(seconds * np.square([*rates, *[0.0] * (self.prior.point.core_size - 7)]))
+
+    def information(self) -> FloatArray:
+        """(n, n) of past and window together on the last epoch, matches taken as independent, over the
+        unknowns of ``past`` and what it holds."""
+        return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
+
+    def vector(self) -> FloatArray:
+        """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
+        unknowns of ``past`` and what it holds."""
+        belief = self.bent.at(self._point)
+        for i, epoch in enumerate(self._epochs):
+            if i > 0:
+                belief = belief.drifted(self.walk(self._seconds(i)))
+            seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
+            belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
+        return belief.vector
+
+    def information_of_standing(self) -> FloatArray | None:
+        """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
+        alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
+        moves = any(entry.score.standing is not None for entry in self.entries.values())
+        if not moves and np.array_equal(alone.information, self.past.without_held().information):
+            return None
+        return self._onwards(alone, beliefs)
+
+    def _onwards(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
+        """(n, n) information of a past and a window, by scan, on the last epoch."""
+        belief = past
+        for i, epoch in enumerate(self._epochs):
+            if i > 0:
+                walk = self.walk(self._seconds(i))
+                belief = belief.drifted(walk)
+            seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
+            belief = replace(belief, information=belief.information_with(seen))
+        return belief.information
+
+    def _seconds(self, i: int) -> float:
+        """From the start of epoch i - 1 to that of epoch i [s]."""
+        return max(1e-3, (self._epochs[i].start_ns - self._epochs[i - 1].start_ns) * 1e-9)
+
+    def covariance(self, information: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
+
+        Args:
+            information: as :meth:`information` tells it; None to ask for it here.
+
+        Raises:
+            EstimationError: a direction without any information.
+        """
+        n = self.past.point.size
+        information = (self.information() if information is None else information)[:n, :n]
+        try:
+            naive = scaled_inverse(information)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(str(error)) from error
+        robust = naive + naive @ self.surplus() @ naive
+        spread = None
+        if not self.drift.enabled:
+            found = [e.score.objects for e in self.entries.values() if e.score.objects is not None]
+            spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
+        robust = composed(robust, spread, self.flatness)
+        return 0.5 * (robust + robust.T), naive
+
+    def surplus(self, with_held: bool = False) -> FloatArray:
+        """(n, n) variance of the score of past and window beyond that of independent matches.
+
+        Args:
+            with_held: over what ``past`` holds, too.
+        """
+        scores, point = [entry.score for entry in self.entries.values()], self.past.point
+        held = self.past.held if with_held else 0
+        columns = [point.columns(score.belief.point.tracks, held) for score in scores]
+        return self.sums.surplus(scores, columns, self.model, with_held)
+
+    @property
+    def flatness(self) -> float:
+        """Mean robust weight over mean curvature, of all matches of past and window."""
+        return self.sums.flatness([entry.score for entry in self.entries.values()])
+
+    @property
+    def objects(self) -> int:
+        """How many objects past and window have seen."""
+        sides = [np.array(list(self.sums.live), np.intp)]
+        sides += [entry.score.sides.sides for entry in self.entries.values()]
+        live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
+        return self.sums.objects.count + len(live)
+
+    def live_epochs(self) -> list[RetiredEpoch]:
+        """Epochs of the window, as if they retired now."""
+        found = []
+        for i, epoch in enumerate(self._epochs):
+            sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
+            for scan, entry in self.entries.items():
+                if entry.epoch == epoch.number:
+                    sums.add(entry.score, scan, self.graph.object_bias_sigma_px)
+            found.append(sums.retired(epoch.start_ns, self.model))
+        return found

@@ -1,0 +1,154 @@
+"""The whole window solved again as the batch does, from a wide kernel to the narrowest.
+
+At the end of a drive at once (:func:`settle_window`); while frames come, a little with each
+(:class:`Settling`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Container, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sst_graph.batch.lower_edges import UndersideSupport
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.smoother import WindowSmoother
+
+_RESTS_SIGMAS = 0.02
+"""A whole step shorter than this is rest."""
+_INNER = 2
+"""Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
+_PASSES = 2
+"""How often a running tracker matches the whole window anew when it settles."""
+
+
+@dataclass
+class Milestones:
+    """When a running tracker settles: each time it has seen twice as much, and before scans first leave.
+
+    A young estimate wanders, and what was matched on the way no longer lies where it would now.
+
+    Attributes:
+        first: number of the first scan.
+        next: scans seen at the next time.
+        window: length of the window.
+    """
+
+    first: int
+    next: int
+    window: int
+
+    def reached(self, scan: int) -> bool:
+        """Whether it is time at this scan; then the next time is set."""
+        seen = scan + 1 - self.first
+        if seen < self.next:
+            return False
+        while self.next <= seen:
+            self.next = self.window if self.next < self.window < 2 * self.next else 2 * self.next
+        return True
+
+
+def settle_window(
+    smoother: WindowSmoother,
+    matcher: WindowMatcher,
+    kernel_px: Sequence[float],
+    most: int,
+    whole_steps: int,
+    alive: Container[int],
+    share: float = 1.0,
+) -> bool:
+    """Match all scans, solve, and again under the next kernel; then under the last until it rests.
+
+    Matches made frame by frame hold the estimate within a standard deviation or two of where the batch
+    would end. Where matches come and go in turn, so that the estimate goes round in a circle, the steps
+    are shortened and end in the middle of it, as the batch's do.
+
+    Args:
+        kernel_px: scales of the robust kernel, one a step.
+        most: further steps under the last one.
+        whole_steps: those of them before the steps are shortened.
+        alive: tracks of objects that may be seen again.
+        share: factor on the weights of all matches.
+
+    Returns:
+        Whether it rests.
+
+    Raises:
+        EstimationError: an update fails; what the steps before it reached stays.
+    """
+    at = smoother.point
+    for i in range(len(kernel_px) + most):
+        kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
+        found, missing = matcher.match(at, None, kernel, share)
+        smoother.update(found, missing, 0, alive)
+        smoother.polish(_INNER)
+        rested = i + 1 - len(kernel_px)
+        left = smoother.point.core().local(at.core())
+        n = len(left)
+        if rested >= 0 and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _RESTS_SIGMAS**2:
+            return True
+        shorter = 1.0 / (1.0 + max(0, rested - whole_steps))
+        back = np.zeros(smoother.point.size)
+        back[:n] = (1.0 - shorter) * left
+        at = smoother.point.moved(back)
+    smoother.rest_at(at)
+    return False
+
+
+class Settling:
+    """One settling of a running tracker: the whole window is matched anew, some scans with each frame.
+
+    First the edges towards the ground are looked at; then each scan is matched, the oldest first, at the
+    estimate as it is by then, and all once more.
+
+    Attributes:
+        below: support of the edges towards the ground so far; None when it is known.
+        passes: how often all are still to be matched.
+        done: scans that were asked, or matched, in this pass.
+    """
+
+    def __init__(self, matcher: WindowMatcher, scans: int) -> None:
+        """scans: that are matched with each frame."""
+        self._matcher, self._scans = matcher, scans
+        self.passes = _PASSES
+        never = matcher.config.calibration.undersides.use == "never"
+        self.below = None if never else UndersideSupport()
+        self.done: set[int] = set()
+
+    @property
+    def ended(self) -> bool:
+        """Whether all is done."""
+        return self.passes == 0
+
+    def advance(self, point: Point, fewer: int = 0) -> list[int] | None:
+        """The scans to match with this frame; None while the edges towards the ground are looked at.
+
+        Args:
+            fewer: how many fewer than usual, for others are matched in their place; one at least.
+        """
+        numbers = [number for number, _ in self._matcher.window.scans]
+        # The newest is matched as it comes.
+        self.done.update(numbers[-1:])
+        waiting = [number for number in numbers if number not in self.done]
+        looking, below = self.below is not None, self.below
+        # To look below is to match twice.
+        most = max(1, self._scans - fewer)
+        some = waiting[: (most + 1) // 2 if looking else most]
+        if below is not None:
+            self.below = below.plus(self._matcher.support_below(point, some))
+        self.done.update(some)
+        if len(some) == len(waiting):
+            self._next()
+        return None if looking else some
+
+    def _next(self) -> None:
+        """All scans have been matched."""
+        self.done.clear()
+        if self.below is None:
+            self.passes -= 1
+        else:
+            self._matcher.match_below(self.below)
+            self.below = None

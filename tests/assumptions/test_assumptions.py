@@ -1,0 +1,116 @@
+"""Each assumption's effect against drives and cameras that break it by a known size."""
+
+from __future__ import annotations
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.assumptions.model import Scene
+from sst_graph.factors.alignment import Alignment, residuals
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.graph.nuisances import Deviation, residual_columns
+
+FloatArray = NDArray[np.float64]
+
+CAMERA = PinholeCamera(700.0, 720.0, 610.0, 170.0, 1242, 375)
+AXES = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
+cTl = gtsam.Pose3(AXES * gtsam.Rot3.Expmap(np.array([0.01, -0.02, 0.03])), np.array([0.1, -0.3, -0.2]))
+L_TWIST = np.array([0.02, -0.01, 0.1, 8.0, 0.3, -0.1])
+C_TWIST = np.asarray(cTl.AdjointMap()) @ L_TWIST
+SCENE = Scene(CAMERA, L_TWIST, 2.5, 0.1)
+OFFSET_S, BASE_TAU_S = 0.07, 0.02
+
+
+def alignment(lPs: FloatArray, offsets_s: FloatArray) -> Alignment:
+    rng = np.random.default_rng(3)
+    normals = rng.standard_normal((len(lPs), 2))
+    return Alignment(
+        camera=CAMERA,
+        lPs=lPs,
+        base_taus_s=BASE_TAU_S - offsets_s,
+        pixels=rng.uniform([0, 0], [1242, 375], (len(lPs), 2)),
+        sigmas_px=np.ones(len(lPs)),
+        normals=normals / np.linalg.norm(normals, axis=1, keepdims=True),
+    )
+
+
+def points(n: int = 40) -> FloatArray:
+    rng = np.random.default_rng(5)
+    return np.column_stack([rng.uniform(6, 40, n), rng.uniform(-5, 5, n), rng.uniform(-1.5, 0.5, n)])
+
+
+def projected(a: Alignment, twist: FloatArray = C_TWIST) -> FloatArray:
+    """(n, 2) pixels of the matches' points, by the factor's own residual with both axes."""
+    both = Alignment(CAMERA, a.lPs, a.base_taus_s, np.zeros((len(a), 2)), 1.0)
+    r, _ = residuals(both, cTl, OFFSET_S, twist)
+    return r.reshape(2, -1).T
+
+
+def truly_seen(name: str, theta: float, a: Alignment, offsets_s: FloatArray) -> FloatArray:
+    """Residuals (n,) when the world breaks an assumption, from first principles."""
+    lPs, taus, twist, camera = a.lPs.copy(), a.base_taus_s.copy(), C_TWIST, CAMERA
+    ranges = np.linalg.norm(lPs, axis=1, keepdims=True)
+    if name == "range_bias":
+        lPs = lPs * (ranges + theta) / ranges
+    if name == "range_scale":
+        lPs = lPs * (1.0 + theta)
+        twist = np.asarray(cTl.AdjointMap()) @ (L_TWIST * [1, 1, 1, 1 + theta, 1 + theta, 1 + theta])
+    if name == "skew":
+        taus = taus + theta * SCENE.image_s
+    if name == "sweep":
+        azimuth = np.degrees(np.arctan2(lPs[:, 1], lPs[:, 0]))
+        taus = taus + theta * SCENE.period_s * azimuth / 360.0
+    if name == "line_delay":
+        taus = taus + theta * (projected(a)[:, 1] - 187.0)
+    uvs = projected(Alignment(camera, lPs, taus, a.pixels, 1.0), twist)
+    rays = (uvs - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if name in ("k1", "k2"):
+        lens = np.array([theta, 0.0] if name == "k1" else [0.0, theta])
+        cPs = np.column_stack([rays, np.ones(len(rays))])
+        seen, _ = cv2.projectPoints(cPs, np.zeros(3), np.zeros(3), camera.matrix, np.append(lens, [0.0, 0.0]))
+        uvs = seen.reshape(-1, 2)
+    if name == "focal":
+        uvs = rays * [camera.fx * (1 + theta), camera.fy * (1 + theta)] + [camera.cx, camera.cy]
+    if name in ("cx", "cy"):
+        uvs = uvs + theta * np.eye(2)[["cx", "cy"].index(name)]
+    assert a.normals is not None
+    return np.asarray(((uvs - a.pixels) * a.normals).sum(axis=1))
+
+
+@pytest.mark.parametrize("name", ASSUMPTIONS)
+def test_the_column_is_the_derivative_of_what_a_broken_assumption_shows(name: str) -> None:
+    offsets = np.zeros(40)
+    a, step = alignment(points(), offsets), 1e-5 * ASSUMPTIONS[name].span
+    column = residual_columns(a, SCENE, BASE_TAU_S, (cTl, OFFSET_S, C_TWIST), [name])[name]
+    plus, minus = (truly_seen(name, sign * step, a, offsets) for sign in (1.0, -1.0))
+    np.testing.assert_allclose(column, (plus - minus) / (2.0 * step), rtol=2e-4, atol=1e-4)
+
+
+def test_points_with_times_miss_a_share_of_them() -> None:
+    offsets = np.linspace(-0.05, 0.05, 40)
+    a = alignment(points(), offsets)
+    column = residual_columns(a, SCENE, BASE_TAU_S, (cTl, OFFSET_S, C_TWIST), ["sweep"])["sweep"]
+    later, _ = residuals(alignment(points(), 1.001 * offsets), cTl, OFFSET_S, C_TWIST)
+    now, _ = residuals(a, cTl, OFFSET_S, C_TWIST)
+    np.testing.assert_allclose(column, (later - now) / 0.001, rtol=1e-2, atol=1e-3)
+
+
+def test_several_parameters_add_up() -> None:
+    lPs = points(5)
+    uvs = np.tile([700.0, 200.0], (5, 1))
+    both = Deviation({"cx": 2.0, "range_bias": 0.1, "cy": -1.0}, SCENE).effect(lPs, np.zeros(5), uvs)
+    assert both.pixel_shift is not None and both.l_shift is not None and both.time_s is None
+    np.testing.assert_allclose(both.pixel_shift, np.tile([2.0, -1.0], (5, 1)))
+    np.testing.assert_allclose(np.linalg.norm(both.l_shift, axis=1), 0.1)
+
+
+@pytest.mark.parametrize("name", ASSUMPTIONS)
+def test_every_assumption_says_what_it_is(name: str) -> None:
+    assumption = ASSUMPTIONS[name]
+    assert assumption.name == name and assumption.finding and assumption.remedy and assumption.source
+    assert 0.0 < assumption.sigma < assumption.span
+    assert assumption.figure(0.01234, 0.004).startswith(f"{name} = 0.0123 ± 0.004")

@@ -1,0 +1,207 @@
+"""Assumptions broken on simulated streets: found, named, estimated; clean streets contradict none."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from streets import crowded_street
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
+from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects
+from sst_graph.config import with_overrides
+from sst_graph.covariance.cluster_robust import robust_covariance
+from sst_graph.covariance.considered import BUDGET, AssumptionConfig
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import ConfigError
+from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
+from sst_graph.experiments.wrong_drives import with_focal
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.state import State, nuisance_key
+from sst_graph.inspect.budget_words import budget_lines
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.result import CalibrationResult
+
+CONFIG = with_overrides(
+    CalibrationConfig(), ["start.enabled=false", "use_motion=never", "contradictions.check=false"]
+)
+"""Of what is beside the point here nothing: the global search, the motion, parts of the drive."""
+
+
+@cache
+def prepared(k1: float = 0.0) -> list[Drive]:
+    """The street through a lens with radial distortion."""
+    return prepare_drives([crowded_street(k1)], CONFIG)
+
+
+def calibrated(drives: Sequence[Drive], config: CalibrationConfig = CONFIG) -> CalibrationResult:
+    return calibrate_prepared(drives, crowded_street().nominal, config)
+
+
+def difference(a: CalibrationResult, b: CalibrationResult) -> tuple[float, float]:
+    """Rotation [deg] and translation [m] between two answers."""
+    step = gtsam.Pose3.Logmap(a.T_camera_lidar.between(b.T_camera_lidar))
+    return float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:]))
+
+
+@pytest.fixture(scope="module")
+def clean() -> CalibrationResult:
+    return calibrated(prepared())
+
+
+def test_a_clean_street_contradicts_nothing(clean: CalibrationResult) -> None:
+    report = clean.diagnostics["assumptions"]
+    assert list(report) == list(ASSUMPTIONS)
+    assert not any(entry.get("contradicted") for entry in report.values())
+
+
+def test_the_parts_of_the_sigmas_add_up(clean: CalibrationResult) -> None:
+    parts = np.array(list(clean.diagnostics[BUDGET].values()))
+    np.testing.assert_allclose(np.sqrt((parts**2).sum(axis=0)), np.sqrt(np.diag(clean.covariance)), rtol=1e-4)
+    text = "\n".join(budget_lines(clean))
+    considered = clean.diagnostics["assumptions"]["cx"]["sigma"]
+    assert "matches" in text and "motion" in text and f"cx off by {considered:.2g} px" in text
+
+
+@pytest.mark.parametrize("k1", [-0.1])
+def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
+    bent = prepared(k1)
+    plain = calibrated(bent)
+    assert plain.status == "not_converged"
+    assert any("k1 = " in reason for reason in plain.reasons)
+    assert plain.diagnostics["assumptions"]["k1"]["estimate"] == pytest.approx(k1, abs=0.02)
+    config = dataclasses.replace(CONFIG, assumptions=AssumptionConfig(estimate=("k1",)))
+    result = calibrated(bent, config)
+    found = result.diagnostics["estimated"]["k1"]
+    assert found["value"] == pytest.approx(k1, abs=5.0 * found["sigma"]) and found["sigma"] < 0.02
+    # Points beyond the radius at which the lens would turn back tell nothing of it.
+    assert found["sigma"] > 0.002
+    # What the labels say of k1 where nothing is bent is in both.
+    rotation_deg, translation_m = difference(result, calibrated(prepared(), config))
+    assert rotation_deg < 0.1 and translation_m < 0.015
+
+
+def test_a_slight_distortion_is_covered_or_named() -> None:
+    result = calibrated(prepared(-0.03))
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(truth.cTl))
+    error = np.append(step, truth.time_offset_s - result.time_offset_s)
+    covered = (np.abs(error) < 3.0 * np.sqrt(np.diag(result.covariance))).all()
+    assert covered or result.status != "ok"
+    # The data complain, so that more than the prior deviation is considered.
+    entry = result.diagnostics["assumptions"]["k1"]
+    assert entry["sigma"] > 0.3 * abs(entry["estimate"])
+
+
+@pytest.fixture(scope="module")
+def problem() -> SolvedProblem:
+    """Solved with a distortion that is not known of."""
+    drives = prepared(-0.03)
+    objects = [object_tracks(drive) for drive in drives]
+    tracks = Tracks(drives, objects)
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    guess = State(truth.cTl, (truth.time_offset_s,))
+    joint = dataclasses.replace(CONFIG.joint, kernel_px=(5.0, 3.0), max_outer=6)
+    solution = solve_joint(drives, guess, joint, None, guess, tracks)
+    return SolvedProblem(drives, tracks, objects, solution, joint, guess)
+
+
+def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(problem: SolvedProblem) -> None:
+    linear = LinearProblem.of(problem, ["k1", "cx", "skew"])
+    for name in ("k1", "skew"):
+        start = dataclasses.replace(problem.solution.state, nuisances={name: 0.0})
+        alone = problem.solve_with((name,), start, (10.0, 5.0, 4.0, 3.0), 12)
+        robust = robust_covariance(alone.graph, alone.values, alone.pairs, alone.state, problem.objects)
+        column = robust.unknowns.column(nuisance_key(name))
+        sigma = np.sqrt(robust.matrix[column, column])
+        few = few_objects(int(robust.table.objects.max()) + 1, 3.3)
+        found = linear.alone(name, CONFIG.assumptions)
+        assert found.value == pytest.approx(alone.state.nuisances[name], abs=0.5 * sigma)
+        assert found.sigma == pytest.approx(few * sigma, rel=0.4)
+
+
+def test_the_table_counts_what_was_found() -> None:
+    def one(case: str, size: float, status: str, error: float, against: tuple[str, ...]) -> Run:
+        errors, told = np.full(7, error), {"k1": (size, 0.01), "cx": (0.0, 5.0)}
+        return Run(1, case, size, status, errors, np.eye(7), told, against)
+
+    text = table(
+        [
+            one(CLEAN, 0.0, "ok", 1.0, ()),
+            one("k1", 0.1, "not_converged", 5.0, ("k1", "cx")),
+            one("k1", -0.1, "ok", 4.0, ()),
+            one("cx", 5.0, "ok", 0.0, ()),
+        ]
+    )
+    assert "| k1 | 0.1 | 10.0 | 2 | 1 | 1 | 1 | 1 |" in text
+    assert "| cx | 5 | 1.0 | 1 | 0 | 0 | 0 | 0 |" in text
+    assert "- sizes above 5 σ: 2 runs, 1 contradicted, 1 not ok, 1 silent" in text
+    assert "- clean: 1 runs, 0 contradicted, 0 not ok, 0 silent" in text
+
+
+def test_rows_count_sizes_in_deviations_where_asked() -> None:
+    def one(seed: int, case: str, size: float) -> Run:
+        told = {"k1": (size, 0.01 * seed)}
+        return Run(seed, case, size, "ok", np.zeros(7), np.eye(7), told, ())
+
+    runs = [one(seed, CLEAN, 0.0) for seed in (1, 3)]
+    runs += [one(seed, "k1", sign * 0.05 * seed) for seed in (1, 3) for sign in (1.0, -1.0)]
+    assert "| k1 | 0.1 | 5.0 | 4 |" in table(runs, in_sigmas=True)
+    assert "| k1 | 0.05 | 5.0 | 2 |" in table(runs) and "| k1 | 0.15 | 5.0 | 2 |" in table(runs)
+
+
+def test_sizes_in_deviations_need_sizes_and_a_clean_street() -> None:
+    with pytest.raises(ConfigError, match="found no sizes"):
+        AssumptionTableConfig(in_sigmas=True)
+    with pytest.raises(ConfigError, match="cases leave out clean"):
+        AssumptionTableConfig(in_sigmas=True, sizes=(2.0,), cases=("k1",))
+
+
+def test_a_wrong_focal_length_is_contradicted() -> None:
+    result = calibrated(prepare_drives([with_focal(crowded_street(), 0.03)], CONFIG))
+    assert result.status != "ok"
+    assert result.diagnostics["assumptions"]["focal"]["contradicted"]
+
+
+def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -> None:
+    wide = with_overrides(CONFIG, ["assumptions.sigmas.focal=0.01", "assumptions.test=false"])
+    result = calibrated(prepared(), wide)
+    report, told = result.diagnostics["assumptions"], clean.diagnostics["assumptions"]
+    assert "estimate" not in report["focal"]
+    # Untested, all other assumptions keep their prior deviations.
+    for name, entry in report.items():
+        assert entry["sigma"] == CONFIG.assumptions.sigma(name) or name == "focal"
+    sensitivities = {name: np.array(told[name]["sensitivity"]) for name in ASSUMPTIONS}
+    gained = np.diag(result.covariance - clean.covariance)
+    expected = sum(
+        (report[name]["sigma"] ** 2 - told[name]["sigma"] ** 2) * sensitivities[name] ** 2
+        for name in ASSUMPTIONS
+    )
+    np.testing.assert_allclose(gained, expected, rtol=2e-3, atol=1e-9)
+
+
+def test_few_objects_ask_for_more() -> None:
+    assert few_objects(1000, 3.3) == pytest.approx(1.0, abs=0.01)
+    assert few_objects(9, 3.3) == few_objects(3, 3.3) > few_objects(20, 3.3) > 1.1
+
+
+@pytest.mark.parametrize(
+    ("estimate", "message"),
+    [
+        (("k3",), "expected one of focal"),
+        (("k1", "k1=0.2"), "each name once"),
+        (("k1=-1",), "k1: found '-1', expected"),
+        (("k1=x",), "k1: found 'x', expected"),
+    ],
+)
+def test_what_cannot_be_estimated_is_refused(estimate: tuple[str, ...], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        AssumptionConfig(estimate=estimate)

@@ -1,0 +1,259 @@
+"""Parts of the data that contradict each other: drives of two rigs, a knock, a lost image, sliding masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph import CalibrationConfig, open_source
+from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
+from sst_graph.batch.contradictions import ContradictionConfig, find_contradictions
+from sst_graph.batch.motion_factor import Labels, with_motion
+from sst_graph.batch.parts import Part, Parts, SolvedPart
+from sst_graph.config import with_overrides
+from sst_graph.covariance.contradiction import PartAnswer
+from sst_graph.drive.preparation import Drive
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.outer_loop import JointConfig, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.result import CalibrationResult
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.types import Frame, Source
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+STOP = DATA / "kitti_2011_09_26_stop"
+CONFIG = with_overrides(CalibrationConfig(), ["start.enabled=false"])
+STREET = SimulationConfig(
+    seed=101,
+    frames=24,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.25,
+    moving_fraction=0.0,
+    motion="no_stop",
+    speed_mps=5.0,
+)
+
+
+@cache
+def street(motion: str = "no_stop", frames: int = 24) -> SimulatedDrive:
+    return simulate(replace(STREET, motion=motion, frames=frames))
+
+
+@cache
+def frames_of(motion: str = "no_stop", frames: int = 24) -> tuple[Frame, ...]:
+    return tuple(street(motion, frames))
+
+
+class Edited:
+    """Frames of a drive that were changed, as a source with a name of its own."""
+
+    def __init__(self, source: Source, frames: Sequence[Frame], name: str = "edited") -> None:
+        self.name, self.camera, self.nominal, self.truth = name, source.camera, source.nominal, source.truth
+        self._frames = list(frames)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, position: int) -> Frame:
+        return self._frames[position]
+
+    def __iter__(self):  # type: ignore[no-untyped-def]
+        return iter(self._frames)
+
+
+def knocked(frames: Sequence[Frame], first: int, degrees: float) -> list[Frame]:
+    """From a frame on the LiDAR is turned about its own y axis."""
+    R = gtsam.Rot3.Ry(np.radians(degrees)).matrix()
+    return [
+        replace(frame, scan=replace(frame.scan, points=(frame.scan.points @ R.T).astype(np.float32)))
+        if frame.index >= first and frame.scan is not None
+        else frame
+        for frame in frames
+    ]
+
+
+def without_image(frames: Sequence[Frame], lost: int) -> list[Frame]:
+    """An image is lost and the numbering goes on: those after it carry the stamps before their own."""
+    found = list(frames[:lost])
+    for frame, later in zip(frames[lost:], [*frames[lost + 1 :], None], strict=True):
+        image = None
+        if later is not None and later.image is not None and frame.image is not None:
+            image = replace(later.image, stamp_ns=frame.image.stamp_ns)
+        found.append(replace(frame, image=image))
+    return found
+
+
+def sliding(frames: Sequence[Frame], pixels: int) -> list[Frame]:
+    """The masks drift to the right over the drive."""
+    found = []
+    for k, frame in enumerate(frames):
+        assert frame.image is not None
+        shift = round(pixels * k / (len(frames) - 1))
+        found.append(
+            replace(frame, image=replace(frame.image, mask=np.roll(frame.image.mask, shift, axis=1)))
+        )
+    return found
+
+
+def calibrated(sources: Sequence[Source], config: CalibrationConfig = CONFIG) -> CalibrationResult:
+    return calibrate_prepared(
+        prepare_drives(sources, config), street().truth.cTl, config, initial_offset_s=STREET.time_offset_s
+    )
+
+
+def parts_of(drives: Sequence[Drive], offset_s: float) -> Parts:
+    """Ready to be solved, about the truth."""
+    objects = [object_tracks(drive) for drive in drives]
+    reference = State(street().truth.cTl, (offset_s,))
+    return Parts(drives, Tracks(drives, objects), objects, reference, JointConfig(), CONFIG.assumptions)
+
+
+def first_frame_after(result: CalibrationResult) -> int:
+    """Of the only step within a drive that a result names, which is also in its reasons."""
+    (step,) = result.diagnostics["contradictions"]["within"]
+    (reason,) = [reason for reason in result.reasons if "contradict each other" in reason]
+    assert f"those from {step['frames'][0]} on" in reason
+    return int(step["frames"][0])
+
+
+def test_a_clean_drive_contradicts_nothing() -> None:
+    result = calibrated([Edited(street(), frames_of())])
+    assert result.diagnostics["contradictions"] == {"within": [], "between": {}}
+    assert not [reason for reason in result.reasons if "contradict" in reason]
+
+
+@pytest.mark.parametrize(("first", "degrees"), [(12, 2.0), (9, -0.7)])
+def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
+    result = calibrated([Edited(street(), knocked(frames_of(), first, degrees))])
+    assert result.status == "not_converged"
+    assert abs(first_frame_after(result) - first) <= 3
+    (reason,) = [reason for reason in result.reasons if "contradict each other" in reason]
+    assert "(pitch)" in reason and "the mount was moved" in reason
+    (step,) = result.diagnostics["contradictions"]["within"]
+    assert np.linalg.norm(step["step"][:3]) == pytest.approx(np.radians(abs(degrees)), rel=0.3)
+
+
+def test_a_mount_knocked_while_standing() -> None:
+    source, frames = street("standing", 12), frames_of("standing", 12)
+    result = calibrated([Edited(source, knocked(frames, 6, 2.0))])
+    assert result.status == "not_converged"
+    assert abs(first_frame_after(result) - 6) <= 3
+
+
+def test_an_image_lost_while_the_numbering_goes_on() -> None:
+    result = calibrated([Edited(street(), without_image(frames_of(), 12))])
+    assert result.status == "not_converged"
+    assert abs(first_frame_after(result) - 12) <= 3
+    (reason,) = [reason for reason in result.reasons if "contradict each other" in reason]
+    assert "an image or a scan was lost" in reason
+    (step,) = result.diagnostics["contradictions"]["within"]
+    assert step["step"][6] == pytest.approx(street().config.period_s, abs=0.04)
+
+
+def test_masks_that_slide() -> None:
+    result = calibrated([Edited(street(), sliding(frames_of(), 10))])
+    assert result.status == "not_converged"
+    assert any("the masks slide" in reason for reason in result.reasons)
+
+
+def test_no_check_no_contradiction() -> None:
+    config = with_overrides(CONFIG, ["contradictions.check=false"])
+    result = calibrated([Edited(street(), knocked(frames_of(), 12, 2.0))], config)
+    assert not [reason for reason in result.reasons if "contradict each other" in reason]
+
+
+@pytest.mark.parametrize("own_offsets", ["false", "true"])
+def test_drives_of_two_rigs(own_offsets: str) -> None:
+    config = with_overrides(CONFIG, [f"delay_per_drive={own_offsets}"])
+    frames = frames_of()
+    two = [Edited(street(), frames[:12], "a"), Edited(street(), knocked(frames[12:], 0, 1.1), "b")]
+    result = calibrated(two, config)
+    assert result.status == "not_converged"
+    (reason,) = [reason for reason in result.reasons if "contradicts" in reason]
+    assert reason.startswith("drive 'b' contradicts drive 'a': it differs in rotation by 1.")
+    assert "(pitch)" in reason
+
+
+def test_drives_of_one_rig() -> None:
+    frames = frames_of()
+    clean = calibrated([Edited(street(), frames[:12], "a"), Edited(street(), frames[12:], "b")])
+    assert set(clean.diagnostics["contradictions"]["between"]) == {"b"}
+    assert not [reason for reason in clean.reasons if "contradict" in reason]
+
+
+def test_the_offset_of_every_drive_counts() -> None:
+    """A standing drive cannot tell its own time offset, whichever drive comes first."""
+    config = with_overrides(CONFIG, ["delay_per_drive=true"])
+    moving = Edited(street(), frames_of()[:12], "moving")
+    standing = Edited(street("standing", 12), frames_of("standing", 12)[:4], "standing")
+    for order in ([moving, standing], [standing, moving]):
+        result = calibrated(order, config)
+        assert result.status != "ok"
+        (weak,) = [weak for weak in result.weak_directions if weak.sentence.startswith("drive 'standing'")]
+        assert "time offset" in weak.sentence and abs(weak.vector[6]) > 0.9
+        assert any("drive 'standing'" in reason for reason in result.reasons)
+        offsets = {offset.drive: offset.sigma_s for offset in result.drive_offsets}
+        assert offsets["standing"] > 3.0 * CONFIG.observability.offset_s > offsets["moving"]
+
+
+def test_parts_carry_the_tracks_of_their_scans() -> None:
+    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
+    parts, scans = parts_of(drives, STREET.time_offset_s), (3, 4, 5, 6, 10, 11)
+    tracks = parts.tracks.part(0, scans)
+    assert tracks.objects is not None
+    own = tracks.objects[0]
+    for (scan, c, n), track in own.items():
+        assert parts.objects[0][scans[scan], c, n] == track
+    assert len(own) == sum(scan in scans for scan, _, _ in parts.objects[0])
+    assert [scan.index for scan in drives[0].part(scans).scans] == list(scans)
+    solved = parts.solve(Part(0, scans))
+    assert solved is not None
+    support = parts.support(Part(0, scans), solved.state)
+    assert support.shape == (6,) and (support > 0.0).all()
+
+
+def test_a_part_without_labels_in_common_says_nothing() -> None:
+    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
+    blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))
+    parts = parts_of([blank], STREET.time_offset_s)
+    assert parts.solve(Part(0, (0, 1, 2, 3))) is None
+    assert find_contradictions(parts, ContradictionConfig()).sentences == ()
+
+
+def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
+    drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
+    parts = parts_of(drives, STREET.time_offset_s)
+    solution = solve_joint(drives, parts.reference, JointConfig(kernel_px=(5.0, 3.0)), tracks=parts.tracks)
+    sigmas = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
+    sure = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
+    agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartAnswer(np.zeros(7), sure))
+    away = np.zeros(7)
+    away[1] = np.radians(20.0)
+    differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartAnswer(away, np.diag(sigmas**2)))
+    for stretches, heard in (([agrees], True), ([agrees, differs], False)):
+        labels = Labels(solution, np.diag(sigmas**2), stretches)
+        found = with_motion(drives, parts.tracks, labels, parts.reference, CONFIG)
+        assert bool(found.diagnostics.get("fused")) is heard
+        assert (found.solution is solution) is not heard
+        assert bool(found.remarks) is not heard
+    assert "frames 4 to 7" in found.remarks[0]
+
+
+@pytest.mark.drives
+@pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
+def test_a_knock_on_a_real_drive() -> None:
+    source = open_source(STOP)
+    frames = knocked(list(source), 30, 2.0)
+    result = calibrate_prepared(prepare_drives([Edited(source, frames)], CONFIG), source.nominal, CONFIG)
+    assert result.status == "not_converged"
+    assert abs(first_frame_after(result) - 30) <= 3

@@ -1,0 +1,101 @@
+"""Edges towards the ground: kept apart, and matched only where the labels agree about them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from streets import prepared_street, standing_street
+
+from sst_graph.batch.lower_edges import UndersideConfig, underside_support, with_undersides
+from sst_graph.drive.preparation import Drive, image_features
+from sst_graph.features.lidar_edges import Edge
+from sst_graph.graph.building import Tracks, associate
+from sst_graph.graph.outer_loop import JointConfig, JointSolution, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.initialization.selection import narrowed
+from sst_graph.types import CameraImage, SemanticClass
+
+VEHICLE = SemanticClass.VEHICLE
+JOINT = replace(narrowed(JointConfig()), min_matches=10)
+CONFIG = UndersideConfig(min_support=10.0)
+
+
+@cache
+def street(shadow_px: int = 0) -> Drive:
+    """The standing street; its masks go on below every vehicle, as if a shadow were part of it."""
+    drive = prepared_street()
+    images = []
+    for image in drive.images:
+        mask = image.mask.copy()
+        for _ in range(shadow_px):
+            below = np.zeros(mask.shape, dtype=bool)
+            below[1:] = mask[:-1] == VEHICLE
+            mask[below] = VEHICLE
+        blank = np.zeros((*mask.shape, 3), np.uint8)
+        images.append(image_features(image.index, CameraImage(image.stamp_ns, mask, blank), [VEHICLE]))
+    return replace(drive, images=tuple(images))
+
+
+def solved(drive: Drive) -> tuple[JointSolution, State]:
+    start = State(standing_street().truth.cTl)
+    return solve_joint([drive], start, JOINT), start
+
+
+def test_edges_towards_the_ground_are_kept_apart() -> None:
+    for scan in prepared_street().scans:
+        assert Edge.BOTTOM not in scan.boundaries[VEHICLE].edges
+        below = scan.undersides[VEHICLE]
+        assert len(below) > 20 and (below.edges == Edge.BOTTOM).all()
+        assert np.isin(below.objects, scan.boundaries[VEHICLE].objects).all()
+
+
+def test_matched_where_they_are_asked_for() -> None:
+    drive, tracks = prepared_street(), Tracks([prepared_street()])
+    state, kernel = (
+        State(standing_street().truth.cTl),
+        solved(drive)[0].pairs[0].matches[VEHICLE].alignment.kernel,
+    )
+    without = associate([drive], tracks, state, kernel, JOINT.graph)
+    graph = replace(JOINT.graph, undersides=(VEHICLE,))
+    for few, many in zip(without, associate([drive], tracks, state, kernel, graph), strict=True):
+        assert not (few.matches[VEHICLE].sides == 3).any()
+        assert (many.matches[VEHICLE].sides == 3).sum() > 10
+        assert (many.matches[VEHICLE].sides < 3).sum() >= len(few)
+
+
+def test_used_where_the_labels_agree() -> None:
+    drive = street()
+    below = with_undersides([drive], Tracks([drive]), [solved(drive)], JOINT, CONFIG)
+    assert below.joint.graph.undersides == (VEHICLE,)
+    assert below.concentration[VEHICLE] > CONFIG.min_concentration
+    truth = standing_street().truth.cTl
+    off = [
+        np.linalg.norm(truth.localCoordinates(s.state.cTl)[:3])
+        for s in (solved(drive)[0], below.solutions[0])
+    ]
+    assert off[1] < off[0]
+
+
+@pytest.mark.parametrize("use", ["auto", "never", "always"])
+def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
+    drive = street(shadow_px=5)
+    one, centre = solved(drive)
+    config = replace(CONFIG, use=use)
+    tracks = Tracks([drive])
+    shares = underside_support([drive], tracks, one.state, JOINT).agreed(config)[1]
+    assert shares[VEHICLE] < CONFIG.min_concentration
+    below = with_undersides([drive], tracks, [(one, centre)], JOINT, config)
+    if use == "always":
+        assert below.joint.graph.undersides == (VEHICLE,)
+    else:
+        assert below.solutions[0] is one and below.joint == JOINT
+
+
+def test_too_few_say_nothing() -> None:
+    drive = street()
+    one, _ = solved(drive)
+    config = UndersideConfig(min_support=1e6)
+    assert underside_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}

@@ -1,0 +1,177 @@
+"""``sst-graph calibrate`` and ``demo`` as a user calls them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.cli.commands.demo import MAX_ROTATION_DEG, over_bounds
+from sst_graph.metrics import CalibrationErrors
+from sst_graph.result import read_result
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+
+ONE_FRAME = ["--frames", "0:1"]
+"""Enough for a pose, and not for a time offset."""
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A street on disk, seen in small pictures: a stop, an acceleration and a turn."""
+    folder = tmp_path_factory.mktemp("data") / "street"
+    config = SimulationConfig(
+        seed=2,
+        frames=24,
+        width=621,
+        height=188,
+        azimuth_limit_deg=50.0,
+        time_offset_s=0.05,
+        vehicle_density=0.3,
+    )
+    write_drive(simulate(config), folder)
+    return folder
+
+
+def _calibrate(data: Path, out: Path, *options: str) -> int:
+    return main(["calibrate", str(data), "--out", str(out), *options])
+
+
+def _strict_json(path: Path) -> Any:
+    return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in {path.name}"))
+
+
+def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "result"
+    code = _calibrate(street, out, "--set", "observability.offset_s=0.05")
+    captured = capsys.readouterr()
+    assert (code, captured.err) == (0, "")
+    assert "against the truth" in captured.out and "deg (QAD)" in captured.out
+    document = _strict_json(out / "calibration.json")
+    assert document["config"]["observability"]["offset_s"] == 0.05
+    assert document["camera"]["name"] == "image_2"
+    assert {frame["drive"] for frame in document["frames_used"]} == {"street/00"}
+    assert sorted(path.suffix for path in out.glob("[!.]*")) == [".json", ".md", *[".png"] * 3]
+
+    truth = street / "sequences" / "00" / "groundtruth.json"
+    assert main(["evaluate", str(out), "--truth", str(truth), "--json"]) == 0
+    errors = json.loads(capsys.readouterr().out)
+    assert errors["qad_deg"] < 0.3 and errors["atd_m"] < 0.03 and abs(errors["time_offset_s"]) < 0.02
+
+    assert main(["inspect", str(out), "--json"]) == 0
+    inspection = json.loads(capsys.readouterr().out)
+    told = [(frame["drive"], frame["frame"]) for frame in inspection["frames"]]
+    used = [(frame["drive"], frame["frame"]) for frame in document["frames_used"]]
+    assert set(told) <= set(used) and len(told) >= 0.9 * len(used)
+    assert inspection["frames"][-1]["sigma_ratio_so_far"] == [1.0] * 7
+
+
+def test_what_cannot_be_told_is_said(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "result"
+    assert _calibrate(street, out, *ONE_FRAME) == 3
+    captured = capsys.readouterr()
+    result = read_result(out / "calibration.json")
+    assert result.status == "unobservable" and result.reasons
+    assert captured.err.startswith("sst-graph: unobservable: ") and captured.err.count("\n") == 1
+    assert "time offset" in captured.err
+    assert result.sigmas().time_offset_ms > 100.0
+    assert (out / "report.md").is_file()
+
+
+def test_a_result_is_a_start(street: Path, tmp_path: Path) -> None:
+    for name, start in (("first", "dataset"), ("second", str(tmp_path / "first" / "calibration.json"))):
+        assert _calibrate(street, tmp_path / name, *ONE_FRAME, "--init", start) == 3
+    first, second = (read_result(tmp_path / name / "calibration.json") for name in ("first", "second"))
+    assert second.initial is not None and second.initial.equals(first.T_camera_lidar, 1e-9)
+    assert second.initial_offset_s == first.time_offset_s
+
+
+def test_no_guess_at_all(street: Path, tmp_path: Path) -> None:
+    assert _calibrate(street, tmp_path / "result", *ONE_FRAME, "--init", "none") in (0, 3)
+    assert read_result(tmp_path / "result" / "calibration.json").initial is None
+    assert list((tmp_path / "result").glob("*.png"))
+
+
+def test_nothing_is_replaced_unasked(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "result"
+    out.mkdir()
+    (out / "calibration.json").write_text("mine")
+    assert _calibrate(street, out) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (out / "calibration.json").read_text() == "mine"
+    assert _calibrate(street, out, "--overwrite", *ONE_FRAME) == 2
+    assert "(not from sst-graph), expected one to overwrite" in capsys.readouterr().err
+    assert (out / "calibration.json").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--init", "none.json"], "none.json: found no such file"),
+        (["--init", "none.txt"], "none.txt"),
+        (["--classes", "vehicle,ufo"], "--classes 'vehicle,ufo': expected all, or some of vehicle"),
+        (["--classes", ""], "--classes ''"),
+        (["--frames", "5"], "expected A:B"),
+        (["--frames", "50:60"], "frames"),
+        (["--sequence", "07"], "07"),
+        (["--loader", "rosbag"], "expected one of auto, kitti"),
+        (["--camera", "image_3"], "image_3"),
+        (["--image-shift", "30"], "no scan is left with an image"),
+        (["--set", "metod=paper"], "unknown setting 'metod'; did you mean 'method'?"),
+        (["--set", "method=magic"], "found 'magic', expected one of"),
+        (["--config", "none.toml"], "none.toml: found no such file"),
+    ],
+)
+def test_bad_options(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert _calibrate(street, tmp_path / "result", *options) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert message in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("calib.txt", "calib.txt"),
+        ("times.txt", "times.txt"),
+        ("velodyne/000003.bin", "000003.bin"),
+        ("labels/000003.label", "000003.label"),
+        ("semantic_2/000003.png", "000003.png"),
+        ("image_2/000003.png", "000003.png"),
+    ],
+)
+def test_a_damaged_drive_is_named(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: str, message: str
+) -> None:
+    shutil.copytree(street, tmp_path / "drive")
+    path = tmp_path / "drive" / "sequences" / "00" / damage
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2 - 1])
+    assert _calibrate(tmp_path / "drive", tmp_path / "result") == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and message in captured.err
+    assert [found.name for found in tmp_path.iterdir()] == ["drive"]
+
+
+def test_a_drive_counts_once(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", str(street), str(street / "../street"), "--out", str(tmp_path / "r")]) == 2
+    assert "given twice" in capsys.readouterr().err
+
+
+def test_no_data(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _calibrate(tmp_path / "nothing", tmp_path / "result") == 2
+    assert "nothing: found no folder" in capsys.readouterr().err
+
+
+def test_the_demo_measures_itself() -> None:
+    assert over_bounds(CalibrationErrors(0.1, 0.1, 0.01, 0.001, None)) == []
+    assert len(over_bounds(CalibrationErrors(MAX_ROTATION_DEG + 0.01, 0.1, 0.5, -0.2, None))) == 3

@@ -1,0 +1,152 @@
+"""``sst-graph evaluate`` and ``sst-graph overlay`` as a user calls them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.reference import read_reference
+from sst_graph.result import CalibrationResult, FrameId
+
+
+@pytest.fixture
+def result_file(tmp_path: Path, kitti_drive: Path) -> Path:
+    """A result of the tiny drive: turned by 1 deg about the LiDAR's z, 3 cm along its x, 4 ms late."""
+    true = read_reference(kitti_drive / "calib.txt").cTl
+    estimate = true * gtsam.Pose3(gtsam.Rot3.Rz(np.radians(1.0)), [0.03, 0.0, 0.0])
+    result = CalibrationResult(
+        estimate,
+        0.104,
+        np.diag([np.radians(0.5)] * 3 + [0.01] * 3 + [0.002]) ** 2,
+        "ok",
+        PinholeCamera(700.0, 700.0, 4.0, 3.0, 8, 6),
+        "image_2",
+        frames_used=(FrameId("kitti/00", 2),),
+        initial=true,
+    )
+    folder = tmp_path / "calibration"
+    folder.mkdir()
+    (folder / "calibration.json").write_text(result.to_json())
+    (folder / "truth.json").write_text(
+        json.dumps({"T_camera_lidar": true.matrix().tolist(), "time_offset_s": 0.1})
+    )
+    return folder / "calibration.json"
+
+
+def test_evaluate_prints_every_metric(result_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(result_file), "--truth", str(result_file.parent / "truth.json")]) == 0
+    out = capsys.readouterr().out
+    assert "1.000 deg (QAD)" in out and "0.333 deg (AEAD)" in out
+    assert "1.00 cm (ATD)" in out and "+4.00 ms" in out
+    assert "NEES" in out and "of 7" in out
+
+
+def test_evaluate_as_json(result_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    truth = str(result_file.parent / "truth.json")
+    assert main(["evaluate", str(result_file.parent), "--truth", truth, "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["qad_deg"] == pytest.approx(1.0)
+    assert values["time_offset_s"] == pytest.approx(0.004)
+    assert values["nees"]["rotation"] == pytest.approx(4.0)
+    assert values["nees"]["time_offset"] == pytest.approx(4.0)
+    assert values["status"] == "ok"
+
+
+def test_evaluate_counts_the_truths_own_error(
+    result_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truth = ["--truth", str(result_file.parent / "truth.json")]
+    assert main(["evaluate", str(result_file), *truth, "--json", "--truth-sigma", "0.5,1,2"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["qad_deg"] == pytest.approx(1.0)
+    assert values["nees"]["rotation"] == pytest.approx(4.0 / 2.0)
+    assert values["nees"]["time_offset"] == pytest.approx(4.0 / 2.0)
+    assert main(["evaluate", str(result_file), *truth, "--truth-sigma", "1,2"]) == 2
+    assert "expected three numbers" in capsys.readouterr().err
+
+
+def test_evaluate_against_a_kitti_calibration(
+    result_file: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(result_file), "--truth", str(kitti_drive / "calib.txt"), "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert values["atd_m"] == pytest.approx(0.01) and values["time_offset_s"] is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "no such file"),
+        (b"", "no JSON"),
+        (b'{"format": "sst-graph/calibration", "version": 1}', "no 'camera'"),
+        (b'{"format": "other"}', "found format 'other'"),
+    ],
+)
+def test_evaluate_bad_result(
+    result_file: Path, capsys: pytest.CaptureFixture[str], content: bytes | None, message: str
+) -> None:
+    truth = str(result_file.parent / "truth.json")
+    result_file.unlink()
+    if content is not None:
+        result_file.write_bytes(content)
+    assert main(["evaluate", str(result_file), "--truth", truth]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1
+    assert message in captured.err and "calibration.json" in captured.err
+
+
+def test_overlay_writes_a_picture(result_file: Path, kitti_drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "new" / "picture.png"
+    assert main(["overlay", str(result_file), str(kitti_drive), "--frame", "3", "--out", str(out)]) == 0
+    picture = cv2.imread(str(out))
+    assert picture.shape[1] >= 720 and picture.shape[0] > 2 * 6 * (720 // 8)
+
+
+def test_overlay_replaces_only_when_told(
+    result_file: Path, kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "picture.png"
+    out.write_bytes(b"mine")
+    command = ["overlay", str(result_file), str(kitti_drive), "--out", str(out)]
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
+    assert main([*command, "--overwrite"]) == 2
+    assert "expected a PNG to overwrite" in capsys.readouterr().err and out.read_bytes() == b"mine"
+    out.unlink()
+    assert main(command) == 0
+    assert main([*command, "--overwrite", "--before", "dataset"]) == 0
+    assert out.read_bytes() != b"mine"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--frame", "9"], "kitti/00: found no frame 9, expected one of its 5 frames"),
+        (["--image-shift", "2", "--frame", "4"], "frame 4: found no image"),
+        (["--out", "picture.jpg"], "expected a name that ends in .png"),
+        (["--before", "nothing.json"], "nothing.json: found no such file"),
+        (["--frame", "x"], "argument --frame: invalid int value: 'x'"),
+        (["--camera", "image_3"], "image_3"),
+    ],
+)
+def test_overlay_bad_input(
+    result_file: Path,
+    kitti_drive: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["overlay", str(result_file), str(kitti_drive), *options]) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err and captured.err.count("\n") == 1
+    assert not list(tmp_path.glob("*.png")) and not list(tmp_path.glob(".*partial"))

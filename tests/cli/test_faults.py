@@ -1,0 +1,169 @@
+"""Small versions of the rows of docs/faults.md: what a fault leaves, and what the exit code says of it."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.fault_matrix import (
+    COMMANDS,
+    Bench,
+    Row,
+    ended_by,
+    full_disk,
+    kill,
+    kill_overwriting,
+    read_only,
+    resume,
+    streams,
+    two_writers,
+)
+
+SIGNAL_AT_IMPORT = """
+import os, signal, sys
+number, module, sys.argv = int(sys.argv[1]), sys.argv[2], ["sst-graph", *sys.argv[3:]]
+def hook(event, arguments):
+    if event == "import" and arguments[0] == module:
+        os.kill(os.getpid(), number)
+from sst_graph.cli import main
+sys.addaudithook(hook)
+sys.exit(main())
+"""
+SIGNAL_AT_EXIT = """
+import atexit, os, signal, sys
+atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT))
+from sst_graph.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """A street and a result of it, for all commands."""
+    return Bench(tmp_path_factory.mktemp("faults"))
+
+
+def _holds(row: Row) -> None:
+    assert row.runs and row.failures == []
+
+
+def test_a_kill_leaves_nothing_or_all(bench: Bench) -> None:
+    _holds(kill(bench, COMMANDS["simulate"], [0.6, 0.9, 1.0]))
+
+
+def test_a_kill_leaves_the_old_or_the_new(bench: Bench) -> None:
+    _holds(kill_overwriting(bench, COMMANDS["export"], [0.8, 0.95, 1.0]))
+
+
+def test_a_killed_tracker_resumes_to_the_same_bytes(bench: Bench) -> None:
+    row = resume(bench, COMMANDS["track"], [0.6, 3.0])  # the second has finished
+    _holds(row)
+    assert row.finished >= 1
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_the_work_without_a_trace(bench: Bench, number: int) -> None:
+    _holds(ended_by(bench, COMMANDS["simulate"], number, [0.85]))
+
+
+@pytest.mark.parametrize("module", ["argparse", "numpy", "gtsam", "cv2", "sst_graph.batch"])
+def test_a_signal_among_the_imports(tmp_path: Path, module: str) -> None:
+    arguments = ["calibrate", str(tmp_path / "none"), "--out", str(tmp_path / "deep" / "out")]
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNAL_AT_IMPORT, str(int(signal.SIGINT)), module, *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "sst-graph: error: interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_signal_after_the_work_changes_nothing() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", SIGNAL_AT_EXIT, "inspect", "x", "--next", "0"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", ["export", "calibrate"])
+def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> None:
+    row = full_disk(bench, COMMANDS[command], [200])
+    _holds(row)
+    assert row.finished < row.runs  # a small export fits on the small file system
+
+
+@pytest.mark.parametrize("command", ["simulate", "track", "export"])
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench, command: str) -> None:
+    _holds(read_only(bench, COMMANDS[command]))
+
+
+def test_broken_streams(bench: Bench) -> None:
+    _holds(streams(bench, COMMANDS["evaluate"]))
+
+
+def test_a_full_stdout_does_not_change_what_a_calibration_is_worth(bench: Bench) -> None:
+    for unbuffered in ("", "1"):
+        desk = bench.desk()
+        ended = subprocess.run(
+            [sys.executable, "-m", "sst_graph.cli", *bench.arguments(COMMANDS["calibrate"], desk)],
+            stdout=os.open("/dev/full", os.O_WRONLY),
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=120,
+            check=False,
+            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
+        )
+        assert ended.returncode == 3, ended.stderr
+        warning, reason = ended.stderr.splitlines()
+        assert "stdout: No space left on device" in warning and "unobservable" in reason
+        assert (desk / "out" / "calibration.json").is_file()
+
+
+def test_closed_streams_do_not_become_files(bench: Bench) -> None:
+    desk = bench.desk()
+    command = [sys.executable, "-m", "sst_graph.cli", *bench.arguments(COMMANDS["export"], desk)]
+    shell = 'exec "$@" <&- >&- 2>&-'
+    done = subprocess.run(["bash", "-c", shell, "bash", *command], timeout=60, check=False)
+    assert done.returncode == 0
+    assert (desk / "out.yaml").read_bytes() == bench.whole(COMMANDS["export"])[0]["out.yaml"]
+
+
+def test_of_two_writers_one_is_refused(bench: Bench) -> None:
+    _holds(two_writers(bench, COMMANDS["simulate"], 1))
+
+
+def test_same_input_same_bytes_with_one_thread_and_two(bench: Bench) -> None:
+    digests = []
+    for threads, seed in (("1", "1"), ("2", "2")):
+        desk = bench.desk()
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "PYTHONHASHSEED": seed}
+
+        def run(*arguments: str, env: dict[str, str] = environment) -> bytes:
+            command = [sys.executable, "-m", "sst_graph.cli", *arguments]
+            done = subprocess.run(command, capture_output=True, timeout=300, check=False, env=env)
+            assert done.returncode in (0, 3), done.stderr.decode()
+            return done.stdout
+
+        run("calibrate", str(bench.data / "street"), "--out", str(desk / "out"))
+        outputs = [
+            (desk / "out" / "calibration.json").read_bytes(),
+            run("export", str(desk / "out"), "--force", "--to", "gtsam"),
+            run(*bench.arguments(COMMANDS["track"], desk)),
+            (desk / "out.json").read_bytes(),
+        ]
+        digests.append([hashlib.sha256(output).hexdigest() for output in outputs])
+    assert digests[0] == digests[1]

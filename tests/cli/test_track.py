@@ -1,0 +1,207 @@
+"""``sst-graph track`` as a user calls it: lines of JSON, exit codes, kill and resume."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.result import read_result
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+
+SOON = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+OPTIONS = [*SOON, "--set", "start_work=0"]
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short drive on disk whose nominal calibration is the true one, in small pictures."""
+    folder = tmp_path_factory.mktemp("data") / "street"
+    config = SimulationConfig(
+        seed=4,
+        frames=20,
+        width=414,
+        height=125,
+        azimuth_limit_deg=50.0,
+        azimuth_step_deg=0.35,
+        vehicle_density=0.3,
+        time_offset_s=0.0,
+        rotation_error_deg=0.3,
+        translation_error_m=0.02,
+        motion="no_stop",
+        speed_mps=6.0,
+    )
+    write_drive(simulate(config), folder)
+    return folder
+
+
+def _lines(text: str) -> list[dict[str, Any]]:
+    refuse = lambda name: pytest.fail(f"{name} in the output")  # noqa: E731
+    return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
+
+
+def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "calibration.json"
+    code = main(["track", str(street), *OPTIONS, "--out", str(out)])
+    captured = capsys.readouterr()
+    lines = _lines(captured.out)
+    assert [line["frame"] for line in lines] == list(range(20))
+    assert lines[0]["status"] == "starting" and not lines[0]["accepted"]
+    assert lines[-1]["accepted"] and lines[-1]["matches"] > 100
+    assert lines[-1]["sigma_time_offset_s"] < lines[0]["sigma_time_offset_s"]
+    result = read_result(out)
+    assert result.method == "track" and result.frames_used
+    # The file says what the last line says.
+    last = lines[-1]
+    assert last["settled"] and not any(line["settled"] for line in lines[:-1])
+    np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
+    assert last["time_offset_s"] == result.time_offset_s
+    np.testing.assert_array_equal(last["covariance"], result.covariance)
+    assert {"unconfirmed": "not_converged"}.get(last["status"], last["status"]) == result.status
+    np.testing.assert_allclose(np.sqrt(np.diag(last["covariance"]))[6], last["sigma_time_offset_s"])
+    assert lines[0]["covariance"] is None and "no estimate yet" in lines[0]["covariance_reason"]
+    assert code == {"ok": 0}.get(result.status, 3)
+    assert (captured.err == "") == (code == 0)
+    assert main(["track", str(street), "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+
+
+def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "calibration.json"
+    main(["track", str(street), *OPTIONS, "--estimate", "focal=0.01", "--out", str(out)])
+    lines, result = _lines(capsys.readouterr().out), read_result(out)
+    assert lines[0]["estimated"] == {} and lines[-1]["estimated"] == result.diagnostics["estimated"]
+    focal = lines[-1]["estimated"]["focal"]
+    assert 0.0 < focal["sigma"] < 0.01 and abs(focal["value"]) < 4.0 * focal["sigma"]
+    assert "focal" not in result.diagnostics["assumptions"] and "k1" in result.diagnostics["assumptions"]
+    assert main(["track", str(street), "--estimate", "k3"]) == 2
+    assert "'k3'" in capsys.readouterr().err
+
+
+def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """SIGKILL at some frame after a checkpoint; what is resumed does what an unbroken run does."""
+    whole, rest, checkpoint = tmp_path / "whole.json", tmp_path / "rest.json", tmp_path / "tracker.npz"
+    other = ["--checkpoint", str(tmp_path / "other.npz"), "--checkpoint-every", "3"]
+    main(["track", str(street), *OPTIONS, *other, "--out", str(whole)])
+    unbroken = _lines(capsys.readouterr().out)
+    command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *OPTIONS]
+    command += ["--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0, env={**os.environ})
+    assert process.stdout is not None
+    if hasattr(fcntl, "F_SETPIPE_SZ"):  # a full pipe keeps it from running far ahead of what is read here
+        fcntl.fcntl(process.stdout.fileno(), fcntl.F_SETPIPE_SZ, 4096)
+    for line in process.stdout:
+        if json.loads(line)["frame"] >= 7:
+            break
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert checkpoint.exists()
+    time.sleep(0.01)
+    command = ["track", str(street), *OPTIONS, "--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
+    main([*command, "--resume", "--out", str(rest)])
+    resumed = _lines(capsys.readouterr().out)
+    assert resumed[0]["frame"] in (6, 9, 12, 15, 18) and resumed[-1]["frame"] == 19
+    for line, own in zip(unbroken[-len(resumed) :], resumed, strict=True):
+        assert own.keys() == line.keys()
+        for name, value in line.items():
+            if isinstance(value, float | list) and name not in ("weak", "refused", "contradictions"):
+                np.testing.assert_allclose(own[name], value, rtol=1e-4, atol=1e-7)
+            elif name != "weak":
+                assert own[name] == value
+    a, b = read_result(whole), read_result(rest)
+    step = np.append(
+        gtsam.Pose3.Logmap(a.T_camera_lidar.between(b.T_camera_lidar)), b.time_offset_s - a.time_offset_s
+    )
+    assert np.abs(step / np.sqrt(np.diag(a.covariance))).max() < 1e-4
+
+
+@pytest.fixture(scope="module")
+def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A checkpoint after eight frames of the street."""
+    path = tmp_path_factory.mktemp("saved") / "tracker.npz"
+    main(["track", str(street), "--frames", "0:8", *OPTIONS, "--checkpoint", str(path)])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--set", "bogus=1"], "unknown setting 'bogus'"),
+        (["--set", "window=40"], "setting window = 60, expected 40"),
+        (
+            ["--classes", "vehicle,pole"],
+            "setting calibration.classes = ['vehicle'], expected ['vehicle', 'pole']",
+        ),
+        (["--init", "none"], "a start from T_camera_lidar"),
+        (["--init", "none"], "expected no guess (--init none)"),
+        (["--frames", "1:20"], "another drive (no image of 0 ns in"),
+        (["--image-shift", "1"], "another drive (another image of 0 ns in"),
+    ],
+)
+def test_resumed_on_other_frames_or_settings(
+    street: Path, saved: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    """Refused in one line before a frame is taken; the checkpoint stays as it is."""
+    before = saved.read_bytes()
+    assert main(["track", str(street), *options, "--checkpoint", str(saved), "--resume"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err
+    assert saved.read_bytes() == before
+
+
+def test_resumed_on_another_drive(
+    street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same sensors, stamps and masks, one point of the newest scan or of an early one changed."""
+    for scan in (0, 7):
+        other = tmp_path / f"other{scan}"
+        shutil.copytree(street, other)
+        path = sorted(other.rglob("velodyne/*.bin"))[scan]
+        points = np.fromfile(path, "<f4")
+        points[0] += 0.01
+        points.tofile(path)
+        assert main(["track", str(other), "--checkpoint", str(saved), "--resume"]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == "" and "another drive (another scan of" in captured.err
+
+
+def test_resumed_with_nothing_said_or_the_same_said(
+    street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Settings that are not named are the checkpoint's; those that are, are its own."""
+    for options in ([], [*OPTIONS, "--init", "dataset"]):
+        copy = tmp_path / "tracker.npz"
+        shutil.copy(saved, copy)
+        command = ["track", str(street), "--frames", "0:9", "--checkpoint", str(copy), "--resume"]
+        assert main([*command, *options]) in (0, 3)
+        assert [line["frame"] for line in _lines(capsys.readouterr().out)] == [8]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--resume"], "--resume needs --checkpoint"),
+        (["--checkpoint", "x.npz", "--checkpoint-every", "0"], "expected 1 or more"),
+        (["--set", "windw=3"], "unknown setting 'windw'; did you mean 'window'?"),
+        (["--set", "drift.epoch_s=-1"], "epoch_s"),
+        (["--init", "none.json"], "none.json: found no such file"),
+    ],
+)
+def test_bad_options(
+    street: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert main(["track", str(street), *options]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err

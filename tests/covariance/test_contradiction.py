@@ -1,0 +1,107 @@
+"""Differences of answers against their covariance: probabilities, directions that count, words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from sst_graph.covariance.contradiction import Difference, PartAnswer, combined, name_step
+
+SIGMAS = np.array([0.001] * 3 + [0.01] * 3 + [0.002])
+FORWARD = gtsam.Pose3(
+    gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])),
+    np.array([0.06, -0.08, -0.27]),
+)
+
+
+def part(step: np.ndarray, sigmas: np.ndarray = SIGMAS, clusters: float = np.inf) -> PartAnswer:
+    return PartAnswer(step, np.diag(sigmas**2), clusters)
+
+
+def test_the_length_is_chi_squared_where_covariances_are_known() -> None:
+    rng = np.random.default_rng(1)
+    lengths = [
+        Difference.of(part(SIGMAS * rng.normal(size=7)), part(SIGMAS * rng.normal(size=7))).chi2
+        for _ in range(400)
+    ]
+    assert kstest(lengths, chi2(7).cdf).pvalue > 0.01
+
+
+def test_probabilities_hold_for_covariances_from_few_clusters() -> None:
+    """Means of 14 clusters each, covariances from the same: chi-squared would be wrong one time in four."""
+    rng = np.random.default_rng(2)
+    p_values, naive = [], []
+    for _ in range(600):
+        parts = []
+        for _ in range(2):
+            samples = SIGMAS * rng.normal(size=(14, 7))
+            parts.append(PartAnswer(samples.mean(axis=0), np.cov(samples.T) / 14, 14))
+        difference = Difference.of(*parts)
+        p_values.append(difference.p_value)
+        naive.append(replace(difference, freedom=np.inf).p_value)
+    assert np.mean(np.array(naive) < 0.05) > 0.2
+    assert np.mean(np.array(p_values) < 0.05) < 0.15
+
+
+def test_the_part_that_is_known_worse_decides_the_degrees_of_freedom() -> None:
+    few, many = part(SIGMAS, 10.0 * SIGMAS, 8.0), part(np.zeros(7), SIGMAS, 100.0)
+    assert Difference.of(many, few).freedom == pytest.approx(7.0, rel=0.05)
+    alike = Difference.of(part(np.zeros(7), clusters=20.0), part(SIGMAS, clusters=20.0))
+    assert alike.freedom == pytest.approx(38.0)
+
+
+def test_a_direction_that_a_part_does_not_know_does_not_count() -> None:
+    vague = SIGMAS.copy()
+    vague[6] = 0.3
+    step = np.zeros(7)
+    step[6] = 0.2
+    assert Difference.of(part(np.zeros(7)), part(step)).p_value < 1e-12
+    assert Difference.of(part(np.zeros(7)), part(step, vague)).p_value > 0.99
+    # with a time offset each, the extrinsics alone are compared
+    assert Difference.of(part(np.zeros(7)), part(step), own_offsets=True).p_value > 0.99
+
+
+def test_combined_parts_are_weighted_by_their_information() -> None:
+    one, other = part(np.zeros(7)), part(np.full(7, 0.003), SIGMAS / 2.0)
+    both = combined([one, other])
+    np.testing.assert_allclose(both.step, 0.8 * 0.003, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(both.covariance), SIGMAS**2 / 5.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("column", "size", "words"),
+    [
+        (1, -np.radians(1.1), "rotation by 1.10° ± 0.06° about the camera's x axis (pitch)"),
+        (2, np.radians(2.0), "rotation by 2.00° ± 0.06° about the camera's y axis (yaw)"),
+        (3, 0.2, "translation by 20.0 cm ± 1.0 cm forward"),
+        (4, 0.2, "translation by 20.0 cm ± 1.0 cm left"),
+        (5, 0.2, "translation by 20.0 cm ± 1.0 cm up"),
+        (6, -0.1036, "time offset by -104 ms ± 2 ms"),
+    ],
+)
+def test_a_step_is_named_along_the_axes_of_the_camera(column: int, size: float, words: str) -> None:
+    step = np.zeros(7)
+    step[column] = size
+    named = name_step(Difference(step, np.diag(SIGMAS**2)), FORWARD)
+    assert named.sentence == words
+    assert len(named.kinds) == 1
+
+
+def test_one_number_is_preferred_where_time_and_translation_look_alike() -> None:
+    """At 8 m/s only forward - 8 offset is known: 100 ms and 80 cm are the same."""
+    way = np.array([0, 0, 0, 8.0, 0, 0, 1.0])
+    covariance = np.diag(SIGMAS**2) + 0.2**2 * np.outer(way, way)
+    step = np.array([0, 0, 0, -0.8, 0, 0, 0])
+    named = name_step(Difference(step, covariance), FORWARD)
+    assert named.kinds == ("offset",)
+    assert "+100 ms" in named.sentence
+
+
+def test_several_kinds_are_named_where_each_explains_much() -> None:
+    step = np.array([0, np.radians(1.0), 0, 0, 0, 0, 0.1])
+    named = name_step(Difference(step, np.diag(SIGMAS**2)), FORWARD)
+    assert named.kinds == ("rotation", "offset")

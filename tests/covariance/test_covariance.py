@@ -1,0 +1,203 @@
+"""The sandwich's filling by brute force, the error model from its own draws, and gtsam's marginals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from sst_graph.covariance.cluster_robust import (
+    ErrorModel,
+    MatchTable,
+    effective_views,
+    fit_error_model,
+    freedom_of_sides,
+    gram,
+    score_variance,
+    spread_beyond,
+    steps_without_objects,
+    with_floors,
+)
+from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.state import EXTRINSIC, bias_key, time_offset_key, twist_key
+from sst_graph.types import SemanticClass
+
+VEHICLE = SemanticClass.VEHICLE
+
+
+def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
+    """Matches on 4 sides, each seen in 3 frames."""
+    rng = np.random.default_rng(seed)
+    sides = rng.integers(0, 4, m)
+    frames = sides * 3 + rng.integers(0, 3, m)
+    roots = rng.uniform(0.1, 1.0, m)
+    J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
+    side_frames = np.unique(frames, return_inverse=True)[1]
+    return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, side_frames, sides // 3, 5.0)
+
+
+def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
+    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model.
+
+    A pose and a mask bias of each object (of three sides) have been fitted to them.
+    """
+    rng = np.random.default_rng(seed)
+    frames = np.repeat(np.arange(1800), 12)
+    sides = frames // 6
+    fitted = np.column_stack([np.repeat(np.eye(100), 3, axis=0), rng.normal(size=(300, 6))])
+    errors = rng.normal(0.0, np.sqrt(model.side), 300)
+    r = (
+        (errors - fitted @ np.linalg.lstsq(fitted, errors)[0])[sides]
+        + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
+        + rng.normal(0.0, np.sqrt(model.match), len(frames))
+    )
+    return MatchTable(
+        csr_array((len(r), 8)), np.ones(len(r)), np.ones(len(r)), r, sides, frames, sides // 3, 5.0
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_steps_without_objects_are_those_of_solving_again(seed: int) -> None:
+    table = replace(random_table(seed, m=60), objects=np.repeat(np.arange(5), 12))
+    J, r = table.J.toarray(), table.root_weights * table.r
+    # A prior that makes 0 the optimum of all: minimise |r + J x|^2 + |P^(1/2) (x - x0)|^2.
+    P = np.diag(np.linspace(0.5, 2.0, J.shape[1]))
+    x0 = np.linalg.solve(P, J.T @ r)
+    steps = steps_without_objects(table, np.linalg.inv(J.T @ J + P))
+    assert steps.shape == (5, J.shape[1])
+    for number, step in enumerate(steps):
+        rest = table.objects != number
+        again = np.linalg.solve(J[rest].T @ J[rest] + P, P @ x0 - J[rest].T @ r[rest])
+        np.testing.assert_allclose(step, again, rtol=1e-5, atol=1e-7)
+
+
+def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
+    """J^T Z R Z J with the residuals' covariance R (m, m) written out."""
+    R = model.side * (table.sides[:, None] == table.sides)
+    R = R + model.side_frame * (table.side_frames[:, None] == table.side_frames)
+    R = R + model.match * np.eye(len(table.r))
+    rows = table.root_weights[:, None] * table.J.toarray()
+    return rows.T @ R @ rows
+
+
+MODELS = [ErrorModel(0.7, 0.3, 1.4), ErrorModel(0.0, 0.5, 0.9), ErrorModel(0.6, 0.0, 1.0)]
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("model", MODELS)
+def test_score_variance_by_brute_force(seed: int, model: ErrorModel) -> None:
+    table = replace(random_table(seed), root_weights=np.ones(40))
+    np.testing.assert_allclose(score_variance(table, model), brute_force(table, model), atol=1e-10)
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("model", MODELS)
+def test_score_variance_of_weighted_matches(seed: int, model: ErrorModel) -> None:
+    table = random_table(seed)
+    # What the clusters share is exact; all in all the variance is never below that of the model.
+    shared = replace(model, match=0.0)
+    np.testing.assert_allclose(score_variance(table, shared), brute_force(table, shared), atol=1e-10)
+    surplus = score_variance(table, model) - brute_force(table, model)
+    assert np.linalg.eigvalsh(surplus)[0] > -1e-9
+
+
+def test_independent_matches_keep_their_information() -> None:
+    table = random_table(0)
+    np.testing.assert_allclose(score_variance(table, ErrorModel(0.0, 0.0, 1.0)), gram(table.J))
+
+
+def test_fitted_variances_are_those_drawn() -> None:
+    model = ErrorModel(1.5, 0.6, 0.9)
+    fitted = [fit_error_model(drawn_table(model, seed)) for seed in range(4)]
+    assert np.mean([f.match for f in fitted]) == pytest.approx(model.match, rel=0.03)
+    assert np.mean([f.side_frame for f in fitted]) == pytest.approx(model.side_frame, rel=0.08)
+    assert np.mean([f.side for f in fitted]) == pytest.approx(model.side, rel=0.12)
+
+
+def test_what_the_fit_swallows() -> None:
+    assert freedom_of_sides(300, 100) == pytest.approx(194 / 300)
+    assert freedom_of_sides(12, 7) == freedom_of_sides(0, 0) == 0.25
+
+
+def test_floors() -> None:
+    fitted = fit_error_model(drawn_table(ErrorModel(0.0, 0.0, 1.0), 0))
+    assert fitted == with_floors(0.0, 0.0, fitted.match, 5.0)
+    assert min(fitted.side, fitted.side_frame) > 0.1 * fitted.match
+    assert fitted.match == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_side_seen_from_one_place_is_trusted_less() -> None:
+    sides = [with_floors(0.0, 0.0, 1.0, views).side for views in (0.0, 1.0, 20.0)]
+    assert sides[0] == sides[1] > 2.0 * sides[2]
+    assert with_floors(9.0, 8.0, 1.0, 1.0) == ErrorModel(9.0, 8.0, 1.0)
+
+
+def test_effective_views() -> None:
+    """Four equal frames in motion are four views, four standing ones one; the heavier view counts alone."""
+    sides, moving = np.zeros(4, dtype=np.intp), np.ones(4, dtype=bool)
+    assert effective_views(sides, np.ones(4), moving) == pytest.approx(4.0)
+    assert effective_views(sides, np.ones(4), ~moving) == pytest.approx(1.0)
+    assert effective_views(sides, np.array([1e6, 1.0, 1.0, 1.0]), moving) == pytest.approx(1.0, abs=1e-4)
+    # Two sides of equal weight, one seen from four places and one from one: harmonic mean.
+    both = effective_views(np.repeat([0, 1], 4), np.ones(8), np.repeat([True, False], 4))
+    assert both == pytest.approx(2.0 / (1.0 / 4.0 + 1.0))
+
+
+def test_spread_beyond() -> None:
+    rng = np.random.default_rng(2)
+    groups = np.repeat(np.arange(500), 8)
+    variances = rng.uniform(0.2, 1.0, 4000)
+    means = rng.normal(0.0, 5.0, 500)[groups] + rng.normal(0.0, np.sqrt(variances + 0.8))
+    assert spread_beyond(means, variances, groups) == pytest.approx(0.8, rel=0.1)
+    quiet = rng.normal(0.0, np.sqrt(variances))
+    assert spread_beyond(quiet, variances, groups) == pytest.approx(0.0, abs=0.04)
+    one = np.zeros(4000, dtype=int)
+    assert spread_beyond(quiet + 2.0, variances, one, centre=0.0) == pytest.approx(4.0, rel=0.1)
+    # One mean in each group tells nothing of a spread.
+    assert spread_beyond(means[:5], variances[:5], np.arange(5)) == 0.0
+
+
+def small_graph() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Unknowns]:
+    """Linear ties between extrinsic, offset, a bias and two twists, with correlated noise."""
+    rng = np.random.default_rng(5)
+    twists = {twist_key(0, 3): 6, twist_key(0, 7): 6}
+    keys = {EXTRINSIC: 6, time_offset_key(): 1, bias_key(0, VEHICLE): 1, **twists}
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values.insert(EXTRINSIC, gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.2, 0.1), np.array([0.1, 0.2, 0.3])))
+    for key in list(keys)[1:]:
+        values.insert(key, rng.normal(size=keys[key]))
+    for _ in range(6):
+        blocks = [(key, rng.normal(size=(4, dim))) for key, dim in keys.items()]
+        terms = [item for block in blocks for item in block]
+        # JacobianFactors take three keys at most: tie them two at a time.
+        for k in range(0, len(terms) - 2, 2):
+            noise = gtsam.noiseModel.Isotropic.Sigma(4, rng.uniform(0.5, 2.0))
+            linear = gtsam.JacobianFactor(
+                *terms[k : k + 4],
+                rng.normal(size=4),
+                noise,
+            )
+            graph.add(gtsam.LinearContainerFactor(linear, values))
+    for key, dim in keys.items():
+        prior = gtsam.JacobianFactor(
+            key, np.eye(dim), np.zeros(dim), gtsam.noiseModel.Isotropic.Sigma(dim, 3.0)
+        )
+        graph.add(gtsam.LinearContainerFactor(prior, values))
+    return graph, values, Unknowns((EXTRINSIC, time_offset_key(), bias_key(0, VEHICLE)))
+
+
+def test_marginals_are_gtsams() -> None:
+    graph, values, unknowns = small_graph()
+    found = marginal_covariance(graph, values, unknowns)
+    joint = gtsam.Marginals(graph, values).jointMarginalCovariance(list(unknowns.keys))
+    expected = np.block([[joint.at(a, b) for b in unknowns.keys] for a in unknowns.keys])
+    assert found.shape == (8, 8) == (unknowns.size, unknowns.size)
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10)
+
+
+def test_columns_of_the_unknowns() -> None:
+    _, _, unknowns = small_graph()
+    assert [unknowns.column(key) for key in unknowns.keys] == [0, 6, 7]

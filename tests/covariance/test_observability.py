@@ -1,0 +1,110 @@
+"""Weak directions in words, from covariances made by hand."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.covariance.observability import (
+    ObservabilityConfig,
+    inseparable_directions,
+    weak_directions,
+)
+from sst_graph.result import DIRECTION_SCALES
+
+CTL = gtsam.Pose3(
+    gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])), np.array([0.0, -0.1, -0.3])
+)
+"""The camera looks along the LiDAR's x axis."""
+CONFIG = ObservabilityConfig()
+GOOD = np.diag(np.array([np.radians(0.05)] * 3 + [0.01] * 3 + [0.0005]) ** 2)
+
+
+def with_direction(step: np.ndarray) -> np.ndarray:
+    """A good covariance, but for one sigma along a step (7,) [rad, m, s]."""
+    return GOOD + np.outer(step, step)
+
+
+def test_a_good_covariance_has_none() -> None:
+    assert weak_directions(GOOD, CTL, CONFIG) == ()
+
+
+def test_forward_against_delay() -> None:
+    # At 8 m/s, 1 m forward equals 125 ms; along the LiDAR's x axis.
+    step = np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0, 0.05])
+    (weak,) = weak_directions(with_direction(step), CTL, CONFIG)
+    assert "shifted forward" in weak.sentence and "later" in weak.sentence
+    assert "1 m equals 125 ms" in weak.sentence
+    assert "40.0 cm" in weak.sentence and "50.0 ms" in weak.sentence
+    assert "stop" in weak.advice and "change of speed" in weak.advice
+    expected = step / DIRECTION_SCALES
+    assert weak.sigma == pytest.approx(np.linalg.norm(expected), rel=0.01)
+    np.testing.assert_allclose(weak.vector, expected / np.linalg.norm(expected), atol=0.01)
+
+
+def test_what_hardly_separates_must_be_known_better() -> None:
+    """4 cm alone are within the limit of 5 cm; tied to the time offset, as at constant speed, not."""
+    alone = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.0])
+    tied = np.array([0.0, 0.0, 0.0, 0.04, 0.0, 0.0, 0.005])
+    sure = np.diag(np.array([np.radians(0.05)] * 3 + [0.005] * 3 + [0.0003]) ** 2)
+    assert weak_directions(sure + np.outer(alone, alone), CTL, CONFIG) == ()
+    (weak,) = weak_directions(sure + np.outer(tied, tied), CTL, CONFIG)
+    assert "shifted forward" in weak.sentence and "4.0 cm, 5.0 ms" in weak.sentence
+    assert weak_directions(sure + np.outer(0.5 * tied, 0.5 * tied), CTL, CONFIG) == ()
+
+
+def test_what_stands_alone_must_separate_offset_and_translation() -> None:
+    """Only what ties the two as closely as constant speed counts, and only past the limits."""
+    tied = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
+    (weak,) = inseparable_directions(with_direction(tied), CTL, CONFIG)
+    assert (
+        weak.sentence.startswith("by what stands alone, the LiDAR shifted forward") and "stop" in weak.advice
+    )
+    assert inseparable_directions(with_direction(0.3 * tied), CTL, CONFIG) == ()
+    loose = with_direction(tied) + np.diag([0.0] * 6 + [0.01**2])
+    assert weak_directions(loose, CTL, CONFIG) and inseparable_directions(loose, CTL, CONFIG) == ()
+    alone = np.array([np.radians(2.0), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert len(inseparable_directions(with_direction(tied) + np.outer(alone, alone), CTL, CONFIG)) == 1
+
+
+def test_the_other_sign_of_the_delay() -> None:
+    (weak,) = weak_directions(with_direction(np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0, -0.05])), CTL, CONFIG)
+    # Forward and earlier is the same line as backward and later.
+    forward, later = "shifted forward" in weak.sentence, "later" in weak.sentence
+    assert forward != later and "1 m equals 125 ms" in weak.sentence
+
+
+@pytest.mark.parametrize(
+    ("step", "words", "advice"),
+    [
+        ([0, 0, 0, 0, 0, 0, 0.02], "the time offset is known to 20.0 ms only", "motion"),
+        ([0, 0, np.radians(2), 0, 0, 0, 0], "the rotation is known to 2.00 deg only", "all sides"),
+        ([0, 0, 0, 0, 0.3, 0, 0], "known to 30.0 cm only (one sigma), the LiDAR shifted", "nearer"),
+    ],
+)
+def test_one_kind_alone(step: list[float], words: str, advice: str) -> None:
+    (weak,) = weak_directions(with_direction(np.array(step)), CTL, CONFIG)
+    assert words in weak.sentence and advice in weak.advice
+    assert np.linalg.norm(weak.vector) == pytest.approx(1.0)
+    assert weak.vector[np.abs(weak.vector).argmax()] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("l_axis", "words"), [(0, ("forward", "backward")), (1, ("left", "right")), (2, ("up", "down"))]
+)
+def test_shifts_are_named_in_the_camera(l_axis: int, words: tuple[str, str]) -> None:
+    step = np.zeros(7)
+    step[3 + l_axis] = 0.3
+    (weak,) = weak_directions(with_direction(step), CTL, CONFIG)
+    # The vector's greatest entry is positive: the LiDAR's x, y, z axes point forward, left, up.
+    assert f"shifted {words[0]}" in weak.sentence
+
+
+def test_the_weakest_first_and_only_past_the_limits() -> None:
+    sigmas = np.array([0.001, 0.001, 0.02, 0.3, 0.01, 0.01, 0.001])
+    found = weak_directions(np.diag(sigmas**2), CTL, CONFIG)
+    # 0.3 m is six times its limit, 0.02 rad 2.3 times.
+    assert [int(np.abs(weak.vector).argmax()) for weak in found] == [3, 2]
+    wide = ObservabilityConfig(rotation_deg=2.0, translation_m=0.5, offset_s=0.01)
+    assert weak_directions(np.diag(sigmas**2), CTL, wide) == ()

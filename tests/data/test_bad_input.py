@@ -1,0 +1,341 @@
+"""KITTI drives that cannot be used: each defect is named on one line with what was found and expected."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sst_graph.data import Loader, loader_names, open_source, register_loader
+from sst_graph.drive.preparation import prepare_drive
+from sst_graph.drive.survey import image_facts
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
+
+FRAMES, POINTS, WIDTH, HEIGHT = 5, 12, 8, 6
+Damage = Callable[[Path], object]
+
+
+def read_all(path: Path, **options: Any) -> list[Any]:
+    return list(open_source(path, **options))
+
+
+@pytest.fixture
+def drive(kitti_drive: Path) -> Path:
+    return kitti_drive
+
+
+def cut(name: str, size: int) -> Damage:
+    return lambda drive: (drive / name).write_bytes((drive / name).read_bytes()[:size])
+
+
+def unlink(name: str) -> Damage:
+    return lambda drive: (drive / name).unlink()
+
+
+def remove(name: str) -> Damage:
+    return lambda drive: shutil.rmtree(drive / name)
+
+
+def emptied(name: str) -> Damage:
+    def damage(drive: Path) -> None:
+        for path in (drive / name).iterdir():
+            path.unlink()
+
+    return damage
+
+
+def text(name: str, content: str) -> Damage:
+    return lambda drive: (drive / name).write_text(content)
+
+
+def edited(name: str, old: str, new: str) -> Damage:
+    return lambda drive: (drive / name).write_text((drive / name).read_text().replace(old, new))
+
+
+def image(name: str, pixels: np.ndarray) -> Damage:
+    return lambda drive: cv2.imwrite(str(drive / name), pixels)
+
+
+def labels(values: np.ndarray) -> Damage:
+    return lambda drive: values.tofile(drive / "labels/000002.label")
+
+
+def coordinate(k: int, value: float) -> Damage:
+    def damage(drive: Path) -> None:
+        path = drive / "velodyne/000002.bin"
+        points = np.fromfile(path, "<f4").reshape(-1, 4)
+        points[k, 1] = value
+        points.tofile(path)
+
+    return damage
+
+
+def points_in_doubles(drive: Path) -> None:
+    path = drive / "velodyne/000002.bin"
+    np.fromfile(path, "<f4").astype("<f8").tofile(path)
+
+
+def flip_a_byte_of_the_image(drive: Path) -> None:
+    path = drive / "image_2/000002.png"
+    data = bytearray(path.read_bytes())
+    data[data.index(b"IDAT") + 8] ^= 0xFF
+    path.write_bytes(data)
+
+
+SCAN, MASK, PICTURE = "velodyne/000002.bin", "semantic_2/000002.png", "image_2/000002.png"
+BAD = [
+    (unlink("calib.txt"), r"calib\.txt: found no such file"),
+    (unlink("times.txt"), r"times\.txt: found no such file"),
+    (remove("velodyne"), r"velodyne: found no folder"),
+    (remove("labels"), r"labels: found no folder"),
+    (remove("image_2"), r"image_2: found no folder"),
+    (remove("semantic_2"), r"semantic_2: found no folder"),
+    (emptied("velodyne"), r"velodyne: found no file that is named by its number"),
+    (emptied("image_2"), r"image_2: found no file that is named"),
+    (text("times.txt", "0\n0.1\n0.2\n0.3\n"), r"times\.txt: found 4 stamps, expected 5, as there are frames"),
+    (text("times.txt", "0\n1\n2\n3\n4\n5\n"), r"times\.txt: found 6 stamps, expected 5"),
+    (text("times.txt", "0\n0.1\n0.1\n0.3\n0.4\n"), r"times\.txt: found equal stamps 1 and 2"),
+    (text("times.txt", "0\n0.1\n0.2\n0.15\n0.4\n"), r"times\.txt: found falling stamps 2 and 3"),
+    (edited("calib.txt", "Tr", "Rt"), r"calib\.txt: found no line Tr"),
+    (edited("calib.txt", "P2", "Q2"), r"calib\.txt: found no line P2"),
+    (cut(SCAN, 100), r"000002\.bin: found 100 bytes, expected a multiple of 16"),
+    (cut(SCAN, 96), r"000002\.label: found 12 labels, expected 6"),
+    (cut("labels/000002.label", 46), r"000002\.label: found 46 bytes, expected a multiple of 4"),
+    (cut("labels/000002.label", 44), r"000002\.label: found 11 labels, expected 12"),
+    (labels(np.full(POINTS, 10, "<u2")), r"found 6 labels, expected 12"),
+    (labels(np.full(POINTS, 7, "<u4")), r"000002\.label: found label 7 \(12 times\)"),
+    (coordinate(3, 1e20), r"a coordinate of 1e\+20 m at index 3"),
+    (points_in_doubles, r"000002\.(bin|label): found"),
+    (cut("image_2/000002.png", 60), r"000002\.png: found a PNG file truncated at byte 60"),
+    (cut("image_2/000000.png", 0), r"000000\.png: found first bytes b'' of 0, expected a PNG or JPEG"),
+    (cut("semantic_2/000002.png", -4), r"semantic_2/000002\.png: found a PNG file truncated"),
+    (text("image_2/000002.png", "<html>"), r"000002\.png: found first bytes b'<htm' of 6"),
+    (flip_a_byte_of_the_image, r"000002\.png: found a damaged PNG chunk at byte \d+"),
+    (image(MASK, np.zeros((6, 9), np.uint8)), r"000002\.png: found 9x6 px, expected 8x6 px"),
+    (image(PICTURE, np.zeros((5, 8, 3), np.uint8)), r"000002\.png: found 8x5 px, expected 8x6 px"),
+    (
+        image(MASK, np.full((HEIGHT, WIDTH), 26 * 256, np.uint16)),
+        r"000002\.png: found uint16 values up to 6656, expected 8-bit",
+    ),
+    (
+        image(MASK, np.full((HEIGHT, WIDTH, 3), (142, 0, 0), np.uint8)),
+        r"000002\.png: found 3 channels that differ",
+    ),
+    (image(MASK, np.full((HEIGHT, WIDTH), 99, np.uint8)), r"semantic_2.*: found label 99"),
+]
+
+
+@pytest.mark.parametrize(("damage", "message"), BAD)
+def test_bad_input_is_named_on_one_line(drive: Path, damage: Damage, message: str) -> None:
+    damage(drive)
+    with pytest.raises(DataError, match=message) as caught:
+        read_all(drive)
+    assert "\n" not in str(caught.value)
+    assert "expected" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.zeros(POINTS - 1, "<f4"), "found 11 times, expected 12"),
+        (np.full(POINTS, np.nan, "<f4"), "found 12 times that are NaN or beyond 1 s, first at index 0"),
+        (np.full(POINTS, 1.3e9, "<f4"), "12 times that are NaN or beyond 1 s"),
+    ],
+)
+def test_bad_point_times_are_refused(drive: Path, values: np.ndarray, message: str) -> None:
+    (drive / "velodyne_times").mkdir()
+    for k in range(FRAMES):
+        values.tofile(drive / f"velodyne_times/{k:06d}.bin")
+    with pytest.raises(DataError, match=message):
+        read_all(drive)
+    (drive / "velodyne_times/000001.bin").unlink()
+    with pytest.raises(DataError, match="velodyne_times: found no file for frame 1"):
+        open_source(drive)
+
+
+def test_two_files_of_one_number_are_refused(drive: Path) -> None:
+    shutil.copy(drive / "velodyne/000001.bin", drive / "velodyne/1.bin")
+    with pytest.raises(DataError, match=r"1\.bin: found a second file of number 1"):
+        open_source(drive)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"loader": "rosbag9"},
+        {"camera": "left"},
+        {"label_encoding": "coco"},
+        {"sweep": "spiral"},
+    ],
+)
+def test_unknown_options_are_refused(drive: Path, options: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match="expected"):
+        open_source(drive, **options)
+
+
+def test_paths_without_a_drive_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "sequences").mkdir()
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "empty").mkdir()
+    for path, message in [
+        (tmp_path / "absent", "found no folder"),
+        (tmp_path / "file", "found a file, expected the folder of a drive"),
+        (tmp_path / "empty", "found no layout that is known, expected KITTI odometry"),
+        (tmp_path, "sequences: found an empty folder"),
+    ]:
+        with pytest.raises(DataError, match=message):
+            open_source(path)
+    with pytest.raises(DataError, match="neither a folder sequences nor"):
+        open_source(tmp_path / "empty", loader="kitti")
+
+
+def test_names_of_loaders_are_unique() -> None:
+    assert "kitti" in loader_names()
+    loader = Loader(lambda path: False, lambda path, options: open_source(path), "none")
+    for name in ("kitti", "auto"):
+        with pytest.raises(ConfigError, match="taken"):
+            register_loader(name, loader)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "no JSON"),
+        ("[1]", "a JSON list"),
+        ('{"time_offset_s": 0}', "no 'T_camera_lidar'"),
+        ('{"T_camera_lidar": [[1, 2], [3, 4]]}', r"shape \(2, 2\)"),
+        ('{"T_camera_lidar": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}', "expected a rotation"),
+        (
+            '{"T_camera_lidar": [[1,0,0,0],[0,1,0,0],[0,0,1,0]], "time_offset_s": "x"}',
+            "time_offset_s: found 'x'",
+        ),
+    ],
+)
+def test_bad_ground_truth_is_refused(drive: Path, content: str, message: str) -> None:
+    (drive / "groundtruth.json").write_text(content)
+    with pytest.raises(DataError, match=rf"groundtruth\.json.*{message}"):
+        open_source(drive)
+
+
+@pytest.mark.parametrize(
+    "frames", ["3", "a:b", "-2:", "3:3", "4:2", "0:6", "5:9", slice(0, 4, 2), slice(-2, None)]
+)
+def test_bad_ranges_are_refused(drive: Path, frames: str | slice) -> None:
+    with pytest.raises(ConfigError, match=r"^frames .*(the drive has frames 0:5|expected)"):
+        open_source(drive, frames=frames)
+
+
+# --- what is missing is left out and counted --------------------------------------------------------------
+
+
+def test_missing_labels_masks_and_pictures_are_left_out_and_counted(
+    drive: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (drive / "labels/000001.label").unlink()
+    (drive / "semantic_2/000002.png").unlink()
+    (drive / "image_2/000003.png").unlink()
+    (drive / "image_2/000004.png").unlink()
+    (drive / "semantic_2/000004.png").unlink()
+    (drive / "velodyne/000000.bin").unlink()
+    source = open_source(drive)
+    frames = list(source)
+    assert [frame.scan is None for frame in frames] == [True, False, False, False, False]
+    assert [frame.image is None for frame in frames] == [False, False, False, False, True]
+    unlabelled, bare, blind = frames[1].scan, frames[2].image, frames[3].image
+    assert unlabelled is not None and not unlabelled.has_labels and len(unlabelled.points) == POINTS
+    assert bare is not None and not bare.has_mask and bare.has_picture
+    assert blind is not None and blind.has_mask and not blind.has_picture
+    with caplog.at_level("WARNING", "sst_graph"):
+        found = prepare_drive(source, (SemanticClass.VEHICLE,))
+    assert found.left_out.counts() == {
+        "scans_without_labels": 1,
+        "images_without_mask": 1,
+        "images_without_picture": 1,
+    }
+    assert len(found.image_pairs) == len(found.images) - 1
+    assert [record.getMessage() for record in caplog.records] == [
+        "kitti/00: left out: 1 scans without labels, 1 images without mask, 1 images without picture"
+    ]
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+def test_points_that_are_no_numbers_are_left_out_with_their_labels_and_times(
+    drive: Path, value: float
+) -> None:
+    (drive / "velodyne_times").mkdir()
+    times = np.linspace(-0.05, 0.05, POINTS).astype("<f4")
+    for k in range(FRAMES):
+        times.tofile(drive / f"velodyne_times/{k:06d}.bin")
+    coordinate(1, value)(drive)
+    coordinate(7, value)(drive)
+    bad = times.copy()
+    bad[[1, 7]] = np.nan  # nobody asks for the time of a point that is not there
+    bad.tofile(drive / "velodyne_times/000002.bin")
+    labels = np.fromfile(drive / "labels/000002.label", "<u4")
+    labels[7] = 7  # nor for its class
+    labels.tofile(drive / "labels/000002.label")
+    whole = np.fromfile(drive / "velodyne/000002.bin", "<f4").reshape(-1, 4)[:, :3]
+    scan = open_source(drive)[2].scan
+    assert scan is not None and scan.left_out == 2 and scan.offsets_s is not None
+    kept = np.delete(np.arange(POINTS), [1, 7])
+    assert np.array_equal(scan.points, whole[kept]) and np.array_equal(scan.offsets_s, times[kept])
+    assert (scan.classes == SemanticClass.VEHICLE).tolist() == [k in (0, 2) for k in kept]
+    drive_ = prepare_drive(open_source(drive), (SemanticClass.VEHICLE,))
+    assert drive_.left_out.counts() == {"points": 2, "scans_with_such_points": 1}
+
+
+def test_nothing_missing_is_nothing_to_say(drive: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level("INFO", "sst_graph"):
+        assert prepare_drive(open_source(drive), (SemanticClass.VEHICLE,)).left_out.counts() == {}
+    assert caplog.records == []
+
+
+def test_folders_without_any_partner_are_refused(drive: Path) -> None:
+    for path in (drive / "semantic_2").iterdir():
+        path.rename(path.with_name(f"{int(path.stem) + 5:06d}.png"))
+    (drive / "times.txt").write_text("".join(f"{0.1 * k}\n" for k in range(10)))
+    with pytest.raises(DataError, match="semantic_2: found no file with the number of one beside it"):
+        open_source(drive)
+
+
+@pytest.mark.parametrize("name", ["calib.txt", "times.txt", SCAN, "labels/000002.label", PICTURE, MASK])
+def test_what_is_no_regular_file_is_refused_at_once(drive: Path, name: str) -> None:
+    (drive / name).unlink()
+    os.mkfifo(drive / name)
+    with pytest.raises(DataError, match=f"{name}: found a FIFO"):
+        read_all(drive)
+    (drive / name).unlink()
+    (drive / name).symlink_to(Path(name).name)
+    with pytest.raises(DataError, match=f"{name}: found an unreadable file"):
+        read_all(drive)
+
+
+def test_a_folder_in_place_of_the_truth_is_refused(drive: Path) -> None:
+    (drive / "groundtruth.json").mkdir()
+    with pytest.raises(DataError, match=r"groundtruth\.json: found a folder"):
+        open_source(drive)
+
+
+def test_a_name_that_would_write_to_the_terminal_is_shown(drive: Path) -> None:
+    folder = drive.parent.parent
+    evil = folder.with_name("evil\x1b[31m\nname")
+    folder.rename(evil)
+    assert open_source(evil).name == r"evil\x1b[31m\nname/00"
+    (evil / "sequences/00/calib.txt").unlink()
+    with pytest.raises(DataError) as caught:
+        open_source(evil)
+    assert str(caught.value).isprintable()
+
+
+def test_missing_pictures_are_no_repeated_picture() -> None:
+    """What the survey compares of images without pictures is their masks."""
+    masks = [np.full((6, 8), c, np.uint8) for c in (0, 1, 1)]
+    a, b, c = (image_facts(k, CameraImage(k, mask, NO_PICTURE)) for k, mask in enumerate(masks))
+    assert a.picture_digest != b.picture_digest == c.picture_digest and not a.profiles

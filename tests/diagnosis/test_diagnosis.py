@@ -1,0 +1,285 @@
+"""Data made wrong on purpose are named for what they are; data that are right are left alone."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.wrong_drives import LIES, NAMED, shifted_masks
+from sst_graph import CalibrationConfig, calibrate
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.diagnosis import Fit, other_camera, preflight
+from sst_graph.diagnosis.cameras import image_size
+from sst_graph.diagnosis.clocks import stamps, two_clocks
+from sst_graph.diagnosis.hypotheses import best_hypothesis
+from sst_graph.diagnosis.poses import wrong_start
+from sst_graph.drive.preparation import Drive
+from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.features.mask_shift import contour_profiles, mask_shift
+from sst_graph.odometry.sweep import SweepDecision
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.sweep_timing import SweepTiming
+from sst_graph.types import SemanticClass
+
+CLASSES = (SemanticClass.VEHICLE,)
+BY_THEMSELVES = (
+    "half-size images",
+    "stamps in ms",
+    "stamps in us",
+    "stamps in ns",
+    "clouds in mm",
+    "clouds in cm",
+    "clouds in feet",
+    "Tr in mm",
+    "labels permuted",
+    "stamps a tenth",
+    "image stamps doubled",
+    "image stamps tenfold",
+    "scan stamps halved",
+    "scan stamps a tenth",
+    "scans repeated",
+    "images repeated",
+    "only background",
+    "masks shifted 3 px",
+    "masks shifted 6 px",
+)
+"""Lies that are certain before anything is solved."""
+
+
+def street(seed: int, frames: int) -> KeptDrive:
+    config = SimulationConfig(
+        seed=seed,
+        frames=frames,
+        width=621,
+        height=188,
+        azimuth_step_deg=0.35,
+        azimuth_limit_deg=60.0,
+        vehicle_density=0.25,
+        motion="no_stop",
+        speed_mps=7.0,
+    )
+    return KeptDrive.of(simulate(config), sweep="auto")
+
+
+@cache
+def drive() -> KeptDrive:
+    return street(31, 10)
+
+
+@cache
+def other() -> KeptDrive:
+    return street(32, 10)
+
+
+def causes(data: KeptDrive) -> list[str]:
+    drives = prepare_drives([data], CalibrationConfig())
+    return [finding.sentence for finding in preflight(drives, data.nominal, CLASSES)]
+
+
+def test_right_data_are_left_alone() -> None:
+    assert causes(drive()) == []
+    assert causes(other()) == []
+
+
+@pytest.mark.parametrize("lie", BY_THEMSELVES)
+def test_a_lie_is_named_before_anything_is_solved(lie: str) -> None:
+    found = causes(LIES[lie](drive(), other()))
+    assert any(NAMED[lie] in sentence for sentence in found), found
+
+
+@cache
+def prepared() -> Drive:
+    (one,) = prepare_drives([drive()], CalibrationConfig())
+    return one
+
+
+@pytest.mark.parametrize(("turn_s", "told"), [(0.1, False), (0.2, False), (1.0, True)])
+def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, told: bool) -> None:
+    """Stamps ten times too far apart: what was measured in a tenth of a second seems to take a whole one."""
+    for sense, fraction in (("clockwise", -1.0), ("counterclockwise", 1.0)):
+        decision = SweepDecision(sense, SweepTiming(fraction, np.pi, turn_s))  # type: ignore[arg-type]
+        found = stamps(replace(prepared(), sweep=decision))
+        assert (found is not None and "run too fast" in found.cause) == told
+    # Compensated clouds of a drive of which every tenth scan was kept.
+    sparse = replace(prepared(), sweep=SweepDecision("compensated", SweepTiming(0.0, np.pi, turn_s)))
+    assert stamps(sparse) is None
+
+
+@pytest.mark.parametrize(
+    ("speeds", "words"),
+    [
+        (np.full(20, 15.0), None),
+        (np.linspace(20.0, 5.0, 20), None),  # 8 m/s^2: hard braking
+        (np.linspace(28.0, 0.5, 20), "accelerations of 14 m/s2"),
+        (np.full(20, 65.0), "a speed of 65 m/s"),
+        (np.where(np.arange(20) == 7, 90.0, 15.0), None),  # one failed registration
+    ],
+)
+def test_no_vehicle_drives_like_that(speeds: np.ndarray, words: str | None) -> None:
+    motions = tuple(
+        replace(
+            prepared().lidar_motions[0],
+            from_ns=k * 100_000_000,
+            to_ns=(k + 1) * 100_000_000,
+            aTb=gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * speed, 0.0, 0.0])),
+            ok=True,
+        )
+        for k, speed in enumerate(speeds)
+    )
+    found = stamps(replace(prepared(), lidar_motions=motions))
+    if words is None:
+        assert found is None
+    else:
+        assert found is not None and words in found.evidence and "run too slowly" in found.cause
+
+
+def test_single_stamps_that_are_off_are_no_second_clock() -> None:
+    """A lost image with the numbering going on, a late frame now and then: the intervals agree otherwise."""
+    late = [0, 0, 0, 80, 0, 100, 100, 100, 100, 100]
+    images = tuple(
+        replace(image, stamp_ns=image.stamp_ns + 1_000_000 * ms)
+        for image, ms in zip(prepared().images, late, strict=True)
+    )
+    assert two_clocks(replace(prepared(), images=images)) is None
+
+
+def test_masks_of_another_size_are_refused() -> None:
+    with pytest.raises(DataError, match="a mask of 310x94 px, expected 621x188 px"):
+        causes(LIES["half-size masks"](drive(), other()))
+
+
+@pytest.mark.parametrize("lie", ["Tr inverted", "y flipped"])
+def test_what_would_make_the_labels_agree_names_the_cause(lie: str) -> None:
+    wrong = LIES[lie](drive(), other())
+    result = calibrate(wrong, wrong.nominal)
+    assert result.status != "ok"
+    assert NAMED[lie] in result.reasons[0]
+
+
+def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
+    """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
+    right = prepared().camera
+
+    def fit(one: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit:
+        if one.camera.fx > 1.5 * right.fx:
+            return Fit(CTL, offset_s, 0.68, 0.86)
+        if guess is not None and guess.equals(CTL.inverse(), 1e-9):
+            return Fit(CTL, offset_s, 0.53, 0.78)
+        return Fit(CTL, offset_s, 0.22, 0.47)
+
+    found = best_hypothesis(prepared(), CTL, 0.0, fit, fit(prepared(), CTL, 0.0))
+    assert found is not None and NAMED["half the focal length"] in found.cause
+
+
+@pytest.mark.parametrize("lie", ["masks of another drive", "clouds in camera axes"])
+def test_what_shows_only_once_a_result_is_doubted(lie: str) -> None:
+    """Neither is certain by itself: masks may be coarse, and a scanner may be mounted on its side."""
+    wrong = LIES[lie](drive(), other())
+    assert causes(wrong) == []
+    result = calibrate(wrong, wrong.nominal)
+    assert result.status != "ok" and NAMED[lie] in result.reasons[0]
+
+
+def test_without_the_search_for_causes_the_doubts_stand_alone() -> None:
+    wrong = LIES["Tr inverted"](drive(), other())
+    result = calibrate(wrong, wrong.nominal, CalibrationConfig(find_causes=False))
+    assert result.status != "ok" and not any("inverted" in reason for reason in result.reasons)
+
+
+def scene(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """A mask of ten boxes and a picture in which each box has a colour and a texture of its own."""
+    rng = np.random.default_rng(seed)
+    picture = cv2.GaussianBlur(rng.integers(0, 255, (200, 640, 3)).astype(np.uint8), (0, 0), 3.0)
+    mask = np.zeros((200, 640), np.uint8)
+    for left in range(20, 600, 60):
+        top, side = int(rng.integers(40, 100)), int(rng.integers(25, 40))
+        box = np.s_[top : top + side, left : left + side]
+        mask[box] = SemanticClass.VEHICLE
+        picture[box] = (0.3 * picture[box] + rng.integers(0, 180, 3)).astype(np.uint8)
+    return mask, picture
+
+
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (3, 0), (-5, 2), (0, -6)])
+def test_a_common_shift_is_measured(right: int, down: int) -> None:
+    mask, picture = scene(1)
+    moved = np.roll(mask, (down, right), (0, 1))
+    found = mask_shift(contour_profiles(moved, picture, SemanticClass.VEHICLE))
+    assert found is not None and found.within_reach
+    assert abs(found.right_px - right) < 4.0 * found.sigma_px[0] < 1.6
+    assert abs(found.down_px - down) < 4.0 * found.sigma_px[1] < 1.6
+
+
+def test_blank_pictures_tell_no_shift() -> None:
+    mask, picture = scene(1)
+    assert mask_shift(contour_profiles(mask, np.zeros_like(picture), SemanticClass.VEHICLE)) is None
+
+
+def test_shifted_masks_keep_what_left_the_picture_out() -> None:
+    moved = shifted_masks(drive(), 6, 0)
+    assert moved[0].image is not None
+    assert (moved[0].image.mask[:, :6] == SemanticClass.IGNORE).all()
+
+
+@pytest.mark.parametrize("crop", [0.0, 0.2, 0.4])
+def test_a_crop_is_no_other_size(crop: float) -> None:
+    """The upper part cut off, the principal point moved with it."""
+    height = round(375 * (1.0 - crop))
+    camera = PinholeCamera(721.0, 721.0, 609.6, 172.9 - 375 * crop, 1242, height)
+    assert image_size(camera) is None
+
+
+@pytest.mark.parametrize(("scale", "name"), [(0.5, "half"), (2.0, "twice"), (0.25, "about 0.26 times")])
+def test_pictures_of_another_size(scale: float, name: str) -> None:
+    camera = PinholeCamera(721.0, 721.0, 609.6, 172.9, round(1242 * scale), round(375 * scale))
+    finding = image_size(camera)
+    assert finding is not None and f"the pictures are {name} the size" in finding.cause
+    # The principal point tells the ratio to some per cent only.
+    ratio = re.search(r"\(about ([0-9.]+)\)", finding.check)
+    assert ratio is not None and abs(float(ratio[1]) / scale - 1.0) < 0.05
+
+
+CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.05, -0.08, -0.27]))
+
+
+def test_an_answer_beside_the_start_is_another_camera() -> None:
+    covariance = np.eye(7) * 0.01**2
+    right = gtsam.Pose3(gtsam.Rot3(), np.array([-0.54, 0.0, 0.0])) * CTL
+    finding = other_camera(CTL, right, covariance)
+    assert finding is not None and "54 cm to the right" in finding.cause
+    forward = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.54])) * CTL
+    assert other_camera(CTL, forward, covariance) is None
+    assert other_camera(CTL, right, np.eye(7) * 0.2**2) is None
+    assert other_camera(None, right, covariance) is None
+
+
+@pytest.mark.parametrize(
+    ("degrees", "words"),
+    [(True, "radians that were taken as degrees"), (False, "degrees that were taken as radians")],
+)
+@pytest.mark.parametrize("sequence", ["xyz", "ZYX"])
+def test_angles_in_the_wrong_unit(degrees: bool, words: str, sequence: str) -> None:
+    """Roll, pitch and yaw of a rig as designed, misread; the true one is a degree off the design."""
+    angles = Rotation.from_matrix(CTL.rotation().matrix()).as_euler(sequence, degrees=not degrees)
+    misread = gtsam.Rot3(Rotation.from_euler(sequence, angles, degrees=degrees).as_matrix())
+    true = CTL.retract(np.array([0.01, -0.015, 0.01, 0.0, 0.0, 0.0]))
+    found = wrong_start(gtsam.Pose3(misread, CTL.translation()), Fit(true, 0.0, 0.6, 0.8))
+    assert found is not None and words in found.cause
+
+
+def test_an_unclear_search_blames_no_start() -> None:
+    behind = CTL * gtsam.Pose3(gtsam.Rot3.Rz(np.pi), np.zeros(3))
+    clear, unclear = Fit(behind, 0.0, 0.6, 0.8), Fit(behind, 0.0, 0.35, 0.6)
+    found = wrong_start(CTL, clear)
+    assert found is not None and "180 deg away" in found.evidence
+    assert wrong_start(CTL, unclear) is None
+    assert wrong_start(CTL, replace(clear, cTl=CTL)) is None
+    assert wrong_start(CTL, None) is None

@@ -1,0 +1,116 @@
+"""The LiDAR's path between its stamps: exact at stamps, smooth between them, honest about its noise."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.drive.path import SensorPath
+from sst_graph.types import RelativeMotion
+
+PERIOD_NS = 100_000_000
+COVARIANCE = np.diag([1e-6] * 3 + [4e-6] * 3)
+
+
+def weaving(t: float) -> gtsam.Pose3:
+    """Pose at a time [s]: 8 m/s, swaying and turning."""
+    rotation = gtsam.Rot3.RzRyRx(0.01 * np.sin(7.0 * t), 0.01 * np.sin(8.0 * t), 0.5 * np.sin(0.8 * t))
+    return gtsam.Pose3(rotation, np.array([8.0 * t, 2.0 * np.sin(0.7 * t), 0.1 * np.sin(1.1 * t)]))
+
+
+def motions(pose: Callable[[float], gtsam.Pose3], stamps_ns: list[int]) -> list[RelativeMotion]:
+    return [
+        RelativeMotion(a, b, pose(a * 1e-9).between(pose(b * 1e-9)), COVARIANCE)
+        for a, b in itertools.pairwise(stamps_ns)
+    ]
+
+
+def evenly(count: int) -> list[int]:
+    return [k * PERIOD_NS for k in range(count)]
+
+
+def test_at_a_stamp_it_is_the_measured_pose() -> None:
+    path = SensorPath(motions(weaving, evenly(8)))
+    for k in range(8):
+        found = path.at(k * PERIOD_NS)
+        assert found is not None
+        assert found[0].equals(weaving(0.0).between(weaving(0.1 * k)), 1e-9)
+
+
+@pytest.mark.parametrize("jitter", [0, 9_000_000])
+def test_between_stamps_it_follows_the_motion(jitter: int) -> None:
+    stamps = [k * PERIOD_NS + jitter * (k % 3) for k in range(40)]
+    path = SensorPath(motions(weaving, stamps))
+    for t in np.arange(0.15, 3.6, 0.037):
+        step = path.step(round(t * 1e9), round((t + 0.1) * 1e9))
+        assert step is not None
+        error = weaving(t).between(weaving(t + 0.1)).localCoordinates(step.aTb)
+        assert np.abs(error[:3]).max() < 4e-4 and np.abs(error[3:]).max() < 4e-3
+        h = 1e-5
+        twist = gtsam.Pose3.Logmap(weaving(t - h).between(weaving(t + h))) / (2.0 * h)
+        np.testing.assert_allclose(step.twist_a[:3], twist[:3], atol=0.02)
+        np.testing.assert_allclose(step.twist_a[3:], twist[3:], atol=0.1)
+
+
+def test_twists_are_continuous_at_stamps() -> None:
+    path = SensorPath(motions(weaving, evenly(12)))
+    for k in range(2, 10):
+        before, after = path.at(k * PERIOD_NS - 1000), path.at(k * PERIOD_NS + 1000)
+        assert before is not None and after is not None
+        np.testing.assert_allclose(before[1], after[1], atol=2e-2)
+
+
+def test_steady_motion_by_hand() -> None:
+    """2 m/s along x: from 0.13 s to 0.27 s it moves 0.28 m."""
+    path = SensorPath(motions(lambda t: gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * t, 0, 0])), evenly(5)))
+    step = path.step(130_000_000, 270_000_000)
+    assert step is not None
+    np.testing.assert_allclose(step.aTb.translation(), [0.28, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(step.twist_b, [0, 0, 0, 2.0, 0, 0], atol=1e-12)
+
+
+def test_no_path_beyond_the_ends_or_over_a_failure() -> None:
+    found = motions(weaving, evenly(8))
+    path = SensorPath(found)
+    assert path.at(-1) is None and path.step(650_000_000, 710_000_000) is None
+    broken = SensorPath([replace(m, ok=k != 3) for k, m in enumerate(found)])
+    assert broken.at(350_000_000) is None
+    assert broken.step(250_000_000, 450_000_000) is None
+    assert broken.step(110_000_000, 290_000_000) is not None
+    assert broken.step(410_000_000, 690_000_000) is not None
+    assert SensorPath([]).at(0) is None
+
+
+def test_noise_between_stamps_by_simulation() -> None:
+    """White noise of the poses gives the claimed covariance of a step, at a stamp and between two."""
+    rng, sigma = np.random.default_rng(5), np.sqrt(0.5 * COVARIANCE[0, 0])
+    for fraction in (0.0, 0.3, 0.5):
+        a = round((3 + fraction) * PERIOD_NS)
+        turns, claimed, twists, of_twist = [], None, [], None
+        for _ in range(400):
+            noise = sigma * rng.standard_normal((9, 3))
+            poses = [gtsam.Pose3(gtsam.Rot3.Expmap(n), np.zeros(3)) for n in noise]
+            path = SensorPath(motions(lambda t, poses=poses: poses[round(10 * t)], evenly(9)))
+            step, later = path.step(a, a + PERIOD_NS), path.step(a + 1000, a + 1000 + PERIOD_NS)
+            assert step is not None and later is not None
+            turns.append(gtsam.Rot3.Logmap(step.aTb.rotation()))
+            twists.append((gtsam.Rot3.Logmap(later.aTb.rotation()) - turns[-1]) / 1e-6)
+            claimed, of_twist = step.covariance[0, 0], step.twist_covariance[0, 0]
+        assert np.var(turns) == pytest.approx(claimed, rel=0.15)
+        assert np.var(twists) == pytest.approx(of_twist, rel=0.15)
+
+
+def test_rate_of_the_covariance_is_its_derivative() -> None:
+    path = SensorPath(motions(weaving, evenly(9)))
+    for fraction in (0.1, 0.25, 0.4, 0.5, 0.8):
+        a, h = round((3 + fraction) * PERIOD_NS), 10_000
+        before, here, after = (path.step(t, t + PERIOD_NS) for t in (a - h, a, a + h))
+        assert before is not None and here is not None and after is not None
+        slope = (after.covariance - before.covariance) / (2e-9 * h)
+        np.testing.assert_allclose(slope, here.covariance_rate, atol=1e-9)
+    assert after.covariance[0, 0] < COVARIANCE[0, 0]

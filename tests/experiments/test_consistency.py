@@ -1,0 +1,66 @@
+"""The consistency experiment: its settings, a row by hand, and a small run."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sst_graph.batch import CalibrationConfig
+from sst_graph.errors import ConfigError
+from sst_graph.experiments import consistency
+from sst_graph.experiments.consistency import ConsistencyConfig, Run
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"drives": ("sitting",)}, "drives: found sitting, expected some of standing, stop"),
+        ({"drives": ()}, "drives: found .* expected a list of 1 to 100 values"),
+        ({"runs": 1}, "runs: found 1, expected at least 2"),
+    ],
+)
+def test_bad_settings(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        ConsistencyConfig(**changes)
+
+
+def test_errors_drawn_from_the_covariance_are_consistent() -> None:
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(7, 7)) * 0.01
+    covariance = A @ A.T + 1e-6 * np.eye(7)
+    errors = rng.multivariate_normal(np.zeros(7), covariance, 4000)
+    cells = consistency.row("drawn", [Run(e, covariance, False) for e in errors], 90.0).split("|")
+    np.testing.assert_allclose([float(cell) for cell in cells[3:7]], 1.0, atol=0.05)
+    shares = [float(cell.strip(" %")) for cell in cells[7].split(",")]
+    np.testing.assert_allclose(shares, 95.0, atol=1.5)
+
+
+def test_what_is_doubted_or_lost_is_counted_and_not_judged() -> None:
+    fine = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
+    lost = dataclasses.replace(fine, error=np.full(7, 1.0))
+    doubted = dataclasses.replace(lost, doubted=True)
+    cells = consistency.row("mixed", [fine, fine, lost, doubted], 2.0).split("|")
+    assert cells[2].strip() == "4 (1, 1)" and float(cells[3]) == pytest.approx(1.0)
+    assert float(cells[5]) == pytest.approx(1.0) and cells[7].count("%") == 3
+
+
+def test_the_offset_of_a_drive_that_stands_is_not_judged() -> None:
+    moving = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
+    error = np.append(np.full(6, 0.01), 0.0)
+    standing = Run(error, np.eye(7) * 1e-4, False, tells_offset=False)
+    cells = consistency.row("standing", [standing], 2.0).split("|")
+    assert cells[5].strip() == "–" and cells[7].count("%") == 2
+    assert float(cells[6]) == pytest.approx(1.0)
+    cells = consistency.row("all", [moving, standing], 2.0).split("|")
+    assert [float(cell) for cell in cells[3:7]] == pytest.approx([1.0] * 4) and cells[7].count("%") == 3
+
+
+def test_a_small_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = {"motion": "standing", "frames": 2, "time_offset_s": 0.0, "width": 621, "height": 188}
+    monkeypatch.setattr(consistency, "DRIVES", {"tiny": ("tiny", {**drive, "azimuth_step_deg": 0.35})})
+    config = ConsistencyConfig(runs=2, drives=("tiny",), seed=3, calibration=CalibrationConfig())
+    table = consistency.run(config)
+    assert table.count("\n") == 3 and "| tiny | 2 (" in table

@@ -1,0 +1,110 @@
+"""Arrays out of memory: they come back as they were, whatever happens to the file."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import pickle
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.files.array_store import Shelf, shape_of, shelvable
+
+
+@shelvable("values")
+@dataclass(frozen=True)
+class Holder:
+    name: str
+    values: NDArray[np.float32]
+
+
+def arrays() -> list[NDArray[np.generic]]:
+    rng = np.random.default_rng(0)
+    return [
+        rng.normal(size=(5, 3)).astype(np.float32),
+        rng.integers(0, 256, (4, 6), np.uint8),
+        np.zeros((0, 3), np.float32),
+        np.asarray(rng.normal(size=(4, 6))[:, ::2]),  # not contiguous
+        np.array([True, False]),
+    ]
+
+
+@pytest.mark.parametrize("in_memory_bytes", [0, 70, 10_000])
+def test_what_is_put_comes_back(in_memory_bytes: int) -> None:
+    shelf = Shelf(in_memory_bytes)
+    kept = [(array, shelf.put(array)) for array in arrays()]
+    for _ in range(2):
+        for array, shelved in kept:
+            found = shelved.get()
+            assert (found.dtype, found.shape) == (array.dtype, array.shape)
+            np.testing.assert_array_equal(found, array)
+    whole = sum(array.nbytes for array in arrays())
+    assert whole - in_memory_bytes <= shelf.file_bytes <= whole or in_memory_bytes > whole > shelf.file_bytes
+
+
+def test_float32_comes_back_as_float64_without_loss() -> None:
+    points = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
+    found = Shelf(0).put(points, np.float64).get()
+    assert found.dtype == np.float64
+    np.testing.assert_array_equal(found, points.astype(np.float64))
+
+
+def test_a_field_answers_the_array() -> None:
+    values = np.arange(6, dtype=np.float32)
+    plain, shelved = Holder("a", values), Holder("a", Shelf(0).put(values))
+    assert plain.values is values
+    np.testing.assert_array_equal(shelved.values, values)
+    assert shape_of(plain, "values") == shape_of(shelved, "values") == (6,)
+    np.testing.assert_array_equal(replace(shelved, name="b").values, values)
+    with pytest.raises(AttributeError):  # frozen as before
+        shelved.values = values  # type: ignore[misc]
+
+
+def test_copies_do_not_depend_on_the_file() -> None:
+    values = np.arange(6, dtype=np.float32)
+    shelf = Shelf(0)
+    holder = Holder("a", shelf.put(values))
+    copies = [pickle.loads(pickle.dumps(holder)), copy.deepcopy(holder)]
+    shelf.__del__()  # closes the file
+    with pytest.raises(ValueError):
+        _ = holder.values
+    for one in copies:
+        np.testing.assert_array_equal(one.values, values)
+
+
+def test_where_no_file_can_be_written_arrays_stay_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    shelf = Shelf(0)
+    with caplog.at_level(logging.WARNING):
+        kept = [(array, shelf.put(array)) for array in arrays()]
+    for array, shelved in kept:
+        np.testing.assert_array_equal(shelved.get(), array)
+    assert shelf.file_bytes == 0 and len(caplog.records) == 1
+
+
+def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Linux's /dev/full refuses every byte; what was written before comes back all the same."""
+    shelf = Shelf(0)
+    first, second = np.arange(4.0), np.arange(5.0)
+    kept = shelf.put(first)
+    with open("/dev/full", "r+b", buffering=0) as full:
+        monkeypatch.setattr(shelf, "_file", full, raising=True)
+        refused = shelf.put(second)
+        monkeypatch.undo()
+    np.testing.assert_array_equal(refused.get(), second)
+    np.testing.assert_array_equal(kept.get(), first)
+
+
+def test_nothing_is_left_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    shelf = Shelf(0)
+    shelf.put(np.zeros(10_000))
+    assert shelf.file_bytes == 80_000
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,196 @@
+"""The frozen problem, worked out for all images at once, against the gtsam graph of the same matches."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from streets import prepared_street, standing_street
+
+from sst_graph.drive.preparation import Drive, ScanFeatures
+from sst_graph.factors import RobustKernel
+from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph, state_from
+from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
+from sst_graph.graph.matching import DriveMatches, match_all, outlines_of
+from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.objects.tracks import Mover, ObjectId, object_tracks
+from sst_graph.objects.velocity import ObjectVelocity
+from sst_graph.types import SemanticClass
+
+VEHICLE = SemanticClass.VEHICLE
+KERNEL = RobustKernel("geman_mcclure", 5.0)
+L_TWIST = np.array([0.02, -0.03, 0.2, 5.0, 0.3, -0.1])
+PLAIN = GraphConfig(undersides=(VEHICLE,))
+FREE = replace(PLAIN, estimate=("focal", "range_scale", "skew=0.001"))
+
+
+@cache
+def moving(rolling: bool) -> Drive:
+    """The standing street as if the LiDAR had turned and driven, and with times of its points."""
+    drive = prepared_street()
+    turn = np.array([1.0, 1.2])[: len(drive.lidar_motions)]
+    motions = [
+        replace(motion, aTb=gtsam.Pose3.Expmap(motion.seconds * scale * L_TWIST))
+        for motion, scale in zip(drive.lidar_motions, turn, strict=True)
+    ]
+
+    def timed(scan: ScanFeatures) -> ScanFeatures:
+        both = [
+            {c: replace(b, offsets_s=0.05 * np.arctan2(b.lPs[:, 1], b.lPs[:, 0])) for c, b in own.items()}
+            for own in (scan.boundaries, scan.undersides)
+        ]
+        return replace(scan, boundaries=both[0], undersides=both[1])
+
+    scans = tuple(timed(scan) for scan in drive.scans) if rolling else drive.scans
+    return replace(drive, scans=scans, lidar_motions=tuple(motions))
+
+
+def matched(drives: list[Drive], state: State, config: GraphConfig, by_object: bool) -> list[DriveMatches]:
+    tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
+    return match_all(outlines_of(drives, tracks, config), state, KERNEL)
+
+
+def whole(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
+    """H and g of all unknowns, the twists last."""
+    n, f = len(system.g), len(system.g_twists)
+    H = np.zeros((n + 6 * f, n + 6 * f))
+    H[:n, :n] = system.H
+    H[n:, :n] = system.H_mixed.reshape(-1, n)
+    H[:n, n:] = H[n:, :n].T
+    for k, block in enumerate(system.H_twists):
+        H[n + 6 * k : n + 6 * k + 6, n + 6 * k : n + 6 * k + 6] = block
+    return H, np.concatenate([system.g, system.g_twists.reshape(-1)])
+
+
+@pytest.mark.parametrize(
+    ("rolling", "by_object", "config"),
+    [
+        (False, False, PLAIN),
+        (False, True, PLAIN),
+        (True, True, PLAIN),
+        (True, False, FREE),
+        (False, True, FREE),
+    ],
+)
+def test_normal_equations_are_the_graphs(rolling: bool, by_object: bool, config: GraphConfig) -> None:
+    drive = moving(rolling)
+    drives = [drive, replace(drive, scans=drive.scans[1:], lidar_motions=drive.lidar_motions[1:])]
+    cTl = standing_street().truth.cTl.retract(np.array([0.003, -0.002, 0.001, 0.02, -0.03, 0.01]))
+    known = {"focal": 0.002, "range_scale": -0.001} if config.estimate else {}
+    state = State(cTl, (0.012, -0.02), {(0, VEHICLE): 0.4, (1, VEHICLE): -0.2}, {(0, 1): 0.7}, known)
+    guess = State(cTl.retract(np.full(6, 0.01)), (0.0, 0.0))
+    matches = matched(drives, state, config, by_object)
+    pairs = [pair for own in matches for pair in own.by_pair()]
+    assert len(pairs) == 5 and sum(map(len, pairs)) == sum(map(len, matches)) > 300
+    graph, values = joint_graph(pairs, state, config, guess)
+    problem = FrozenProblem(matches, state, config, guess)
+    # At the matches, and a step away from them, where the robust weights and the rates are others.
+    system = problem.linearized(problem.start)
+    away = problem.moved(problem.start, *(0.1 * each for each in system.step(1e-6)))
+    assert set(problem.values_at(problem.start).keys()) == set(values.keys())
+    for point in (problem.start, away):
+        values = problem.values_at(point)
+        linear, system = graph.linearize(values), problem.linearized(point)
+        assert system.cost == pytest.approx(graph.error(values), rel=1e-12)
+        H, g = whole(system)
+        expected, b = linear.hessian(problem.ordering)
+        scale = 1.0 / np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(H * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-12)
+        size = np.abs(scale * b).max()
+        np.testing.assert_allclose(scale * g / size, -scale * b / size, atol=1e-12)
+        # Its covariance is the inverse's block, its step the solution.
+        inverse = np.linalg.inv(expected * np.outer(scale, scale)) * np.outer(scale, scale)
+        n = len(system.g)
+        sigmas = np.sqrt(np.diag(inverse)[:n])
+        np.testing.assert_allclose(
+            system.covariance() / np.outer(sigmas, sigmas),
+            inverse[:n, :n] / np.outer(sigmas, sigmas),
+            atol=1e-7,
+        )
+        x, twists = system.step(0.0)
+        step = np.concatenate([x, twists.reshape(-1)])
+        np.testing.assert_allclose(scale * (expected @ step) / size, scale * b / size, atol=1e-7)
+
+
+@pytest.mark.parametrize("rolling", [False, True])
+@pytest.mark.parametrize("offset_s", [0.012, -0.12])
+def test_all_scans_are_matched_as_each_by_itself(rolling: bool, offset_s: float) -> None:
+    drive = moving(rolling)
+    values = {"range_scale": -0.001, "k1": 0.01, "skew": 1e-3}
+    state = State(standing_street().truth.cTl, (offset_s,), {(0, VEHICLE): 0.4}, {}, values)
+    tracks, objects = Tracks([drive], [object_tracks(drive)]), object_tracks(drive)
+    together = {pair.pair.scan: pair for pair in associate([drive], tracks, state, KERNEL, FREE)}
+    assert len(together) >= 2
+    for scan in range(len(drive.scans)):
+        alone = associate([drive.part([scan])], tracks.part(0, [scan]), state, KERNEL, FREE)
+        assert len(alone) == (scan in together)
+        for pair in alone:
+            both, own = together[scan].matches[VEHICLE], pair.matches[VEHICLE]
+            for name in ("index", "objects", "sides"):
+                np.testing.assert_array_equal(getattr(both, name), getattr(own, name))
+            for name in ("lPs", "base_taus_s", "pixels", "normals", "sigmas_px", "weights"):
+                one, other = getattr(both.alignment, name), getattr(own.alignment, name)
+                np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+            assert both.seen == own.seen
+            assert [*pair.tracks[VEHICLE]] == [*together[scan].tracks[VEHICLE]]
+            assert {t for t in pair.tracks[VEHICLE] if t < 1000} <= set(objects.values())
+            for name, column in pair.terms[VEHICLE].items():
+                np.testing.assert_allclose(together[scan].terms[VEHICLE][name], column, rtol=1e-9, atol=1e-9)
+
+
+def test_the_optimum_is_the_graphs() -> None:
+    drive, state = moving(True), State(standing_street().truth.cTl, (0.01,))
+    matches = matched([drive], state, PLAIN, True)
+    pairs = [pair for own in matches for pair in own.by_pair()]
+    problem = FrozenProblem(matches, state, PLAIN)
+    point, system = problem.optimum(30)
+    graph, values = joint_graph(pairs, state, PLAIN)
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-12)
+    params.setAbsoluteErrorTol(1e-12)
+    optimum = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+    assert system.cost == pytest.approx(graph.error(optimum), rel=1e-6)
+    assert system.cost < problem.linearized(problem.start).cost
+    found, expected = problem.state_at(point), state_from(optimum, state, pairs)
+    sigmas = np.sqrt(np.diag(system.covariance())[:7])
+    away = np.append(
+        gtsam.Pose3.Logmap(expected.cTl.between(found.cTl)), found.offsets_s[0] - expected.offsets_s[0]
+    )
+    assert np.abs(away / sigmas).max() < 0.01
+    assert found.object_biases_px.keys() == expected.object_biases_px.keys()
+    # The length of the step in deviations, by gtsam's own covariance.
+    marginals = gtsam.Marginals(graph, problem.values_at(point))
+    joint = marginals.jointMarginalCovariance([EXTRINSIC, time_offset_key()])
+    step = np.append(
+        gtsam.Pose3.Logmap(state.cTl.between(point.cTl)), found.offsets_s[0] - state.offsets_s[0]
+    )
+    length = float(np.sqrt(step @ np.linalg.solve(joint.fullMatrix(), step)))
+    assert problem.step_sigmas(point, system) == pytest.approx(length, rel=1e-4)
+
+
+def test_a_belief_holds_the_extrinsic() -> None:
+    drive, state = moving(False), State(standing_street().truth.cTl, (0.0,))
+    there = state.cTl.retract(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
+    belief = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+    point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, belief=belief).optimum(20)
+    np.testing.assert_allclose(point.cTl.matrix(), there.matrix(), atol=1e-4)
+
+
+def test_moving_objects_are_matched_where_they_are() -> None:
+    """An object that drives along beside the LiDAR has the gradient of its own velocity in the offset."""
+    drive, state = moving(False), State(standing_street().truth.cTl, (0.03,))
+    tracks = object_tracks(drive)
+    fast = {name: Mover(8.0, ObjectVelocity(np.array([4.0, 1.0, 0.0]), 0.03)) for name in list(tracks)[::2]}
+    slow: dict[ObjectId, Mover] = {name: Mover(0.06) for name in list(tracks)[1::2]}
+    found = Tracks([drive]).seeing(tracks, fast | slow)
+    matches = match_all(outlines_of([drive], found, PLAIN), state, KERNEL)
+    pairs = [pair for own in matches for pair in own.by_pair()]
+    assert any(m.alignment.l_velocities is not None for pair in pairs for m in pair.matches.values())
+    graph, values = joint_graph(pairs, state, PLAIN)
+    problem = FrozenProblem(matches, state, PLAIN)
+    system, H = problem.linearized(problem.start), graph.linearize(values).hessian(problem.ordering)[0]
+    assert system.H[6, 6] == pytest.approx(H[6, 6], rel=1e-12)
+    assert system.cost == pytest.approx(graph.error(values), rel=1e-12)

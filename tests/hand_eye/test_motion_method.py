@@ -1,0 +1,284 @@
+"""Method motion: exact motions give the calibration back, poor ones say what they leave open."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
+from sst_graph.batch.motion_factor import belief_factor
+from sst_graph.cli import main
+from sst_graph.config import with_overrides
+from sst_graph.data import open_source
+from sst_graph.drive.preparation import Drive, ImageFeatures
+from sst_graph.errors import ConfigError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
+from sst_graph.hand_eye.initialization import MotionStartConfig, motion_starts
+from sst_graph.hand_eye.solution import MotionConfig, MotionSolution, difference, rival, solve_motion
+from sst_graph.metrics import calibration_errors
+from sst_graph.odometry.features import Tracks as ImageTracks
+from sst_graph.odometry.relative import DirectionMotion
+from sst_graph.odometry.visual import ImagePair
+from sst_graph.result import read_result
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.types import RelativeMotion
+
+TRUE = gtsam.Pose3(
+    gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])), np.array([0.1, -0.2, -0.3])
+).retract(np.array([0.03, -0.05, 0.02, 0.0, 0.0, 0.0]))
+OFFSET_S = 0.13
+PERIOD_S = 0.1
+SIGMA_RAD, SIGMA_M, SIGMA_DIRECTION = 1e-4, 2e-3, 1e-3
+PoseAt = Callable[[float], gtsam.Pose3]
+
+
+def weaving(t: float) -> gtsam.Pose3:
+    """Turns to both sides on a hilly, rough road."""
+    rotation = gtsam.Rot3.RzRyRx(0.02 * np.sin(5.0 * t), 0.1 * np.sin(1.1 * t), 0.8 * np.sin(0.9 * t))
+    return gtsam.Pose3(rotation, np.array([8.0 * t, 3.0 * np.sin(0.9 * t), 0.5 * np.sin(1.1 * t)]))
+
+
+def straight(t: float) -> gtsam.Pose3:
+    """10 m/s, dead straight, on a road as smooth as none is."""
+    return gtsam.Pose3(gtsam.Rot3(), np.array([10.0 * t, 0.0, 0.0]))
+
+
+def resting(t: float) -> gtsam.Pose3:
+    return gtsam.Pose3()
+
+
+def made_drive(wTl: PoseAt, frames: int = 50, seed: int = 0, noise: float = 1.0) -> Drive:
+    """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps."""
+    rng = np.random.default_rng(seed)
+    sigmas = noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
+    stamps = [round(k * PERIOD_S * 1e9) for k in range(frames)]
+    poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in stamps]
+    lidar = tuple(
+        RelativeMotion(a, b, p.between(q), np.diag(2.0 * np.repeat([SIGMA_RAD, SIGMA_M], 3) ** 2))
+        for a, b, p, q in zip(stamps, stamps[1:], poses, poses[1:], strict=False)
+    )
+    camera = tuple(_image_pair(a, b, wTl, rng, noise) for a, b in pairwise(stamps))
+    blank = np.zeros((1, 1), np.uint8)
+    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(stamps))
+    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), (), images, lidar, camera)
+
+
+def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: float) -> ImagePair:
+    ends = [wTl(stamp * 1e-9 + OFFSET_S) * TRUE.inverse() for stamp in (a, b)]
+    aTb = ends[0].between(ends[1])
+    turn = aTb.rotation() * gtsam.Rot3.Expmap(noise * SIGMA_RAD * rng.standard_normal(3))
+    length = float(np.linalg.norm(aTb.translation()))
+    direction = aTb.translation() / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    seen = np.asarray(
+        gtsam.Unit3(direction).retract(noise * SIGMA_DIRECTION * rng.standard_normal(2)).point3()
+    )
+    covariance = np.diag([SIGMA_RAD**2] * 3 + [SIGMA_DIRECTION**2] * 2)
+    motion = DirectionMotion(turn, turn, seen, covariance, np.ones(0, bool), 0.1, 5.0, length > 0.1)
+    return ImagePair(ImageTracks(a, b, np.zeros((0, 2)), np.zeros((0, 2))), motion)
+
+
+def off(degrees: float) -> gtsam.Pose3:
+    return TRUE.retract(np.concatenate([np.radians(degrees) * np.array([0.6, -0.6, 0.5]), [0.1, -0.1, 0.1]]))
+
+
+def error_of(solution: MotionSolution) -> np.ndarray:
+    return difference(State(TRUE, (OFFSET_S,)), solution.state)
+
+
+@pytest.mark.parametrize("guess", [None, off(20.0)])
+def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
+    solution = solve_motion([made_drive(weaving, noise=0.0)], guess, 0.0, MotionConfig())[0]
+    error = error_of(solution)
+    assert solution.converged
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.1
+    # The camera's motion has no scale: across the road only, and less well, is the lever arm seen.
+    assert np.abs(error[3:6]).max() < 0.1 and abs(error[6]) < 1e-3
+
+
+def test_covariance_fits_the_errors() -> None:
+    """NEES of rotation and offset over drives whose noise is as modelled."""
+    config = dataclasses.replace(MotionConfig(), start=MotionStartConfig(max_offset_s=0.06, contenders=1))
+    nees = []
+    for seed in range(10):
+        solution = solve_motion([made_drive(weaving, 40, seed)], off(5.0), 0.1, config)[0]
+        error, some = error_of(solution), [0, 1, 2, 6]
+        nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
+    assert 0.7 < np.mean(nees) < 8.0
+    assert max(nees) < 20.0
+
+
+def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
+    """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
+    nees, some = [], [0, 1, 2, 6]
+    for seed in range(10):
+        solution = solve_motion([made_drive(weaving, 12, seed)], TRUE, OFFSET_S, MotionConfig())[0]
+        error = error_of(solution)
+        nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
+    assert 0.45 < np.mean(nees) / len(some) < 1.6
+
+
+def test_a_straight_road_leaves_the_roll_and_the_offset_open() -> None:
+    drive = made_drive(straight)
+    result = calibrate_prepared([drive], off(3.0), _config())
+    assert result.status == "unobservable"
+    sigmas = result.sigmas()
+    # About the LiDAR's x axis it drives along; the other two axes are seen by the direction of travel.
+    assert sigmas.rotation_deg[0] > 5.0 and max(sigmas.rotation_deg[1:]) < 0.1
+    assert sigmas.time_offset_ms > 50.0 and min(sigmas.translation_cm) > 20.0
+    said = " ".join(result.reasons)
+    assert "time offset" in said and "record turns" in said and "[" in said
+    error = difference(State(TRUE, (OFFSET_S,)), State(result.T_camera_lidar, (result.time_offset_s,)))
+    assert error @ np.linalg.solve(result.covariance, error) < 20.0
+
+
+def test_noise_is_no_turning() -> None:
+    """On a straight road the LiDAR's noise alone must tell no offset, wherever between stamps it falls."""
+    found = [
+        solve_motion([made_drive(straight, seed=seed)], TRUE, OFFSET_S, MotionConfig())[0]
+        for seed in range(2)
+    ]
+    assert min(np.sqrt(s.covariance[6, 6]) for s in found) > 0.03
+
+
+def test_standing_tells_nothing() -> None:
+    result = calibrate_prepared([made_drive(resting)], off(3.0), _config())
+    assert result.status == "unobservable"
+    assert max(result.sigmas().rotation_deg) > 20.0 and result.sigmas().time_offset_ms > 30.0
+
+
+def test_too_few_frames() -> None:
+    result = calibrate_prepared([made_drive(weaving, frames=4)], off(3.0), _config())
+    assert result.status == "unobservable" and "pairs of camera and LiDAR motion" in result.reasons[0]
+    assert result.T_camera_lidar.equals(off(3.0), 1e-12)
+
+
+def test_two_drives_are_better_than_one() -> None:
+    one, two = made_drive(weaving, seed=1), made_drive(weaving, seed=2)
+    alone, both = (solve_motion(drives, TRUE, 0.1, MotionConfig())[0] for drives in ([one], [one, two]))
+    assert len(both.terms) == 2 * len(alone.terms)
+    assert both.covariance[6, 6] < 0.8 * alone.covariance[6, 6]
+
+
+def test_outliers_count_little() -> None:
+    drive = made_drive(weaving)
+    pairs = list(drive.image_pairs)
+    for k in range(0, len(pairs), 8):  # every eighth image pair saw a bus instead of the street
+        motion = dataclasses.replace(
+            pairs[k].direction,
+            rotation=pairs[k].direction.rotation * gtsam.Rot3.Rx(0.02),
+            direction=np.array([1.0, 0, 0]),
+        )
+        pairs[k] = dataclasses.replace(pairs[k], direction=motion)
+    spoilt = dataclasses.replace(drive, image_pairs=tuple(pairs))
+    error = error_of(solve_motion([spoilt], None, 0.0, MotionConfig())[0])
+    assert np.degrees(np.linalg.norm(error[:3])) < 0.3 and abs(error[6]) < 3e-3
+
+
+def test_noise_scales_follow_the_residuals() -> None:
+    state, kernel = State(TRUE, (OFFSET_S,)), RobustKernel("cauchy", 3.0)
+    scales = []
+    for noise in (1.0, 3.0):
+        drive = made_drive(weaving, frames=120, noise=noise)
+        pairs = pair_motions(camera_steps([drive], 0.02), lidar_paths([drive]), OFFSET_S)
+        scales.append(hand_eye_terms(pairs, state, kernel, 0.1)[1])
+    assert scales[0].rotation == pytest.approx(1.0, abs=0.25)
+    assert scales[1].rotation == pytest.approx(3.0, abs=0.75)
+    assert scales[1].direction > 2.0 * scales[0].direction > 0.0
+    assert NoiseScales() == NoiseScales(1.0, 1.0)
+
+
+def test_start_without_a_guess() -> None:
+    drive = made_drive(weaving)
+    starts = motion_starts(camera_steps([drive], 0.02), lidar_paths([drive]), None, 0.0, MotionStartConfig())
+    best = starts[0]
+    assert abs(best.offset_s - OFFSET_S) <= 0.02
+    assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.cRl.between(TRUE.rotation())))) < 2.0
+    assert all(a.cost <= b.cost for a, b in pairwise(starts))
+
+
+def test_a_rival_is_another_solution_that_fits_alike() -> None:
+    best = solve_motion([made_drive(weaving)], TRUE, OFFSET_S, MotionConfig())[0]
+    elsewhere = dataclasses.replace(
+        best, state=State(best.state.cTl, (OFFSET_S - 0.1,)), cost=best.cost + 1.0
+    )
+    worse = dataclasses.replace(elsewhere, cost=best.cost + 50.0)
+    assert rival([best, best], MotionConfig()) is None
+    assert rival([best, worse], MotionConfig()) is None
+    assert rival([best, elsewhere], MotionConfig()) is elsewhere
+
+
+def test_belief_by_hand() -> None:
+    """At the state it costs nothing; half of the squared whitened step beside it."""
+    covariance = np.diag(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.005]) ** 2)
+    factor = belief_factor(State(TRUE, (OFFSET_S,)), covariance)
+    values = gtsam.Values()
+    values.insert(EXTRINSIC, TRUE.retract(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])))
+    values.insert(time_offset_key(), np.array([OFFSET_S + 0.01]))
+    assert factor.error(values) == pytest.approx(0.5 * (1.0 + 4.0))
+
+
+def _config(**changes: object) -> CalibrationConfig:
+    return dataclasses.replace(CalibrationConfig(), method="motion", **changes)
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A street of turns on disk, in small pictures."""
+    folder = tmp_path_factory.mktemp("data") / "street"
+    config = SimulationConfig(
+        seed=4,
+        frames=20,
+        width=621,
+        height=188,
+        motion="turning",
+        azimuth_limit_deg=45.0,
+        azimuth_step_deg=0.4,
+        vehicle_density=0.3,
+        time_offset_s=0.08,
+    )
+    write_drive(simulate(config), folder)
+    return folder
+
+
+@pytest.mark.parametrize("start", ["dataset", "none"])
+def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None:
+    out = tmp_path / "result"
+    code = main(["calibrate", str(street), "--method", "motion", "--init", start, "--out", str(out)])
+    result = read_result(out / "calibration.json")
+    truth = open_source(street).truth
+    assert truth is not None
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    # Height and sideways shift stay open on a plane road: never a confident wrong number.
+    assert (code, result.status, result.method) == (3, "unobservable", "motion")
+    assert errors.qad_deg < 0.6 and errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.006
+    assert errors.nees is not None and errors.nees.joint < 25.0
+    assert len(result.frames_used) >= 12 and "method joint" in " ".join(result.reasons)
+
+
+def test_the_joint_method_hears_the_motion(street: Path) -> None:
+    source = open_source(street, frames="0:12")
+    # Labels that tell the offset to 11 ms, not to 3: the motion alone tells it to 32 ms.
+    weak = ["start.enabled=false", "joint.graph.match.side_sigma_px=10"]
+    settings = with_overrides(CalibrationConfig(), weak)
+    deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
+    hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="always"))
+    assert hearing.diagnostics["motion"]["fused"] is True and not deaf.diagnostics["motion"]
+    assert hearing.covariance[6, 6] < deaf.covariance[6, 6]
+    truth = source.truth
+    assert truth is not None and truth.time_offset_s is not None
+    assert abs(hearing.time_offset_s - truth.time_offset_s) < 4.0 * np.sqrt(hearing.covariance[6, 6])
+
+
+def test_one_clock_only(street: Path) -> None:
+    settings = dataclasses.replace(CalibrationConfig(), use_motion="always", delay_per_drive=True)
+    with pytest.raises(ConfigError, match="use_motion"):
+        calibrate(open_source(street), None, settings)

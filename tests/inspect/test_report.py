@@ -1,0 +1,89 @@
+"""The result in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.inspect.report import Comparison, error_lines, markdown_report, summary
+from sst_graph.metrics import FORWARD_R_OPTICAL, calibration_errors
+from sst_graph.result import CalibrationResult, DriveOffset, FrameId, WeakDirection
+from sst_graph.types import GroundTruth
+
+POSE = gtsam.Pose3(
+    FORWARD_R_OPTICAL.inverse().compose(gtsam.Rot3.RzRyRx(*np.radians([2.0, -1.0, 3.0]))), [0.1, -0.2, -0.3]
+)
+RESULT = CalibrationResult(
+    POSE,
+    0.1036,
+    np.diag([np.radians(0.02), np.radians(0.03), np.radians(0.04), 0.01, 0.02, 0.03, 0.004]) ** 2,
+    "unobservable",
+    PinholeCamera(700.0, 700.0, 4.0, 3.0, 8, 6),
+    "image_2",
+    reasons=("Only one speed was seen.",),
+    weak_directions=(WeakDirection(np.eye(7)[6], 90.0, "1 m ahead equals 118 ms.", "Record a stop."),),
+    frames_used=(FrameId("a/00", 1), FrameId("a/00", 2), FrameId("b/00", 1)),
+    initial=POSE * gtsam.Pose3(gtsam.Rot3.Rz(np.radians(5.0)), [0.0, 0.0, 0.0]),
+    initial_offset_s=0.1,
+)
+
+
+def test_summary_carries_every_number_with_its_sigma() -> None:
+    text = summary(RESULT)
+    assert "unobservable" in text and "3 frames of 2 drives (a/00, b/00)" in text
+    assert "0.020 0.030 0.040 deg" in text and "1.0 2.0 3.0 cm" in text
+    assert "+103.60 ms +- 4.0 ms   (t_lidar = t_camera_stamp + offset)" in text
+    assert "by 5.00 deg" in text and "+3.6 ms" in text
+    assert "Only one speed was seen." in text
+    assert "1 m ahead equals 118 ms." in text and "Record a stop." in text
+
+
+def test_summary_names_each_drives_offset() -> None:
+    text = summary(replace(RESULT, drive_offsets=(DriveOffset("a/00", -0.05, 0.001),)))
+    assert "a/00: -50.00 ms +- 1.0 ms" in text
+
+
+def test_errors_against_the_truth() -> None:
+    errors = calibration_errors(POSE, 0.1036, GroundTruth(POSE, 0.1), RESULT.covariance)
+    text = summary(RESULT, Comparison(errors, "the truth"))
+    assert "against the truth" in text and "+3.60 ms" in text
+    assert "0.8 of 7" in text
+
+
+def test_errors_without_an_offset_or_a_covariance() -> None:
+    lines = error_lines(calibration_errors(POSE, 0.1, GroundTruth(POSE, None)))
+    assert not any("ms" in line or "NEES" in line for line in lines)
+    six = error_lines(calibration_errors(POSE, 0.1, GroundTruth(POSE, None), RESULT.covariance))
+    assert any("of 6" in line for line in six)
+
+
+def test_report_shows_angles_on_vehicle_axes_and_pictures() -> None:
+    text = markdown_report(RESULT, None, ["overlay_1.png"])
+    for row in (
+        "| roll | 2.0000 deg | 0.020 deg |",
+        "| pitch | -1.0000 deg | 0.030 deg |",
+        "| yaw | 3.0000 deg | 0.040 deg |",
+        "| x | 10.00 cm |",
+    ):
+        assert row in text
+    assert "![overlay_1.png](overlay_1.png)" in text
+
+
+def test_translation_sigmas_are_turned_into_the_cameras_axes() -> None:
+    # The LiDAR's x (sigma 1 cm) is the camera's z, its y (2 cm) the camera's -x, its z (3 cm) its -y.
+    level = gtsam.Pose3(FORWARD_R_OPTICAL.inverse(), [0.1, -0.2, -0.3])
+    text = markdown_report(replace(RESULT, T_camera_lidar=level), None, [])
+    assert "| x | 10.00 cm | 2.0 cm |" in text
+    assert "| y | -20.00 cm | 3.0 cm |" in text
+    assert "| z | -30.00 cm | 1.0 cm |" in text
+
+
+@pytest.mark.parametrize("sigma_s", [0.0, 1e-9, 12.0, 1e6])
+def test_any_sigma_can_be_written(sigma_s: float) -> None:
+    covariance = RESULT.covariance.copy()
+    covariance[6, 6] = sigma_s**2
+    assert "time offset" in summary(replace(RESULT, covariance=covariance))

@@ -1,0 +1,126 @@
+"""Objects that are where they were a little before or after, and those that are not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.drive.preparation import ScanFeatures
+from sst_graph.features.lidar_edges import Boundaries
+from sst_graph.objects.persistence import Persistence, PersistenceConfig
+from sst_graph.types import SemanticClass
+
+VEHICLE, BUILDING = SemanticClass.VEHICLE, SemanticClass.BUILDING
+STEP = gtsam.Pose3(gtsam.Rot3.Yaw(0.02), np.array([0.7, 0.1, 0.0]))
+"""The LiDAR's own motion in 0.1 s."""
+ROOF = np.stack(np.meshgrid(np.arange(0.0, 4.2, 0.2), [0.0, 1.6], [0.0]), -1).reshape(-1, 3)
+
+
+def scan(k: int, period_s: float, corners: list[np.ndarray], c: SemanticClass = VEHICLE) -> ScanFeatures:
+    """Roofs (their edges are the boundary) with these corners in the world, seen at the k-th pose."""
+    wTl = pose(k, period_s)
+    wPs = np.concatenate([np.zeros((0, 3)), *(ROOF + corner for corner in corners)])
+    lPs = (wPs - wTl.translation()) @ wTl.rotation().matrix()
+    numbers = np.repeat(np.arange(len(corners)), len(ROOF))
+    n, nothing, small = len(lPs), np.zeros(0), np.zeros((0, 3), np.float32)
+    found = Boundaries(lPs, lPs, np.ones(n), np.zeros(n), np.zeros(n, np.uint8), numbers)
+    stamp_ns = round(k * period_s * 1e9)
+    by_class = {c: found} if n else {}
+    empty = np.zeros((0, 3))
+    return ScanFeatures(k, stamp_ns, by_class, empty, np.zeros(0, np.uint8), nothing, small, small[:, 0])
+
+
+def pose(k: int, period_s: float) -> gtsam.Pose3:
+    return gtsam.Pose3.Expmap(gtsam.Pose3.Logmap(STEP) * (k * period_s / 0.1))
+
+
+def seen(
+    scans: int, *velocities: float, period_s: float = 0.1, c: SemanticClass = VEHICLE
+) -> list[dict[int, float]]:
+    """Speeds that roofs of these velocities along x pass for [m/s], scan by scan."""
+    persistence = Persistence()
+    for k in range(scans):
+        corners = [np.array([15.0 + v * k * period_s, 6.0 * i - 9.0, 0.5]) for i, v in enumerate(velocities)]
+        persistence.add(k, scan(k, period_s, corners, c), pose(k, period_s))
+    return [{n: speed for (_, n), speed in persistence.speeds(k).items()} for k in range(scans)]
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.1, 0.15])
+def test_what_drives_away_is_not_found_again(period_s: float) -> None:
+    """A roof of 4 m: at 12 m/s it has left its place after 0.3 s; a parked one has not, though we drive."""
+    speeds = seen(12, 0.0, 12.0, period_s=period_s)
+    assert all(set(found) == {1} for found in speeds)
+    assert min(found[1] for found in speeds) > 5.0
+
+
+def test_slower_objects_overlap_with_themselves() -> None:
+    """Half a metre in 0.3 s takes a roof's edge from its place, but little of its sides."""
+    assert all(not found for found in seen(8, 0.0, 1.5))
+
+
+def test_coming_into_view_and_leaving_is_not_motion() -> None:
+    persistence = Persistence()
+    for k in range(14):
+        corner = [np.array([15.0, -4.0, 0.5])] if 4 <= k <= 8 else []
+        persistence.add(k, scan(k, 0.1, corner), pose(k, 0.1))
+    # Each is found again on the side on which it was seen; the middle one nowhere 0.3 s away.
+    assert [bool(persistence.speeds(k)) for k in range(4, 9)] == [False, False, True, False, False]
+
+
+@pytest.mark.parametrize(("speed", "told"), [(0.0, {4}), (12.0, set())])
+def test_later_scans_tell_what_was_not_known(speed: float, told: set[int]) -> None:
+    """What is new in scan 4 passes for moving; 0.3 s later the scans say otherwise of what stays."""
+    persistence = Persistence()
+    for k in range(7):
+        corners = [np.array([15.0 + 0.1 * k * speed, -4.0, 0.5])] if k >= 4 else []
+        assert persistence.add(k, scan(k, 0.1, corners), pose(k, 0.1)) == set()
+    assert persistence.speeds(4)
+    after = scan(7, 0.1, [np.array([15.0 + 0.7 * speed, -4.0, 0.5])])
+    assert persistence.add(7, after, pose(7, 0.1)) == told
+    assert bool(persistence.speeds(4)) == (speed > 0.0)
+
+
+def test_a_short_burst_tells_nothing() -> None:
+    assert seen(3, 12.0) == [{}] * 3
+
+
+def test_labels_that_go_do_not_take_the_object_along() -> None:
+    """The roof is there still, as a building; the ground below a vehicle that left does not count."""
+    for c, found in ((BUILDING, False), (SemanticClass.GROUND, True)):
+        persistence = Persistence()
+        for k in range(8):
+            whole = scan(k, 0.1, [np.array([15.0, -4.0, 0.5])])
+            if k % 2:
+                lPs = whole.boundaries[VEHICLE].lPs
+                whole = replace(whole, boundaries={}, lPs=lPs, classes=np.full(len(lPs), c, np.uint8))
+            persistence.add(k, whole, pose(k, 0.1))
+        assert bool(persistence.speeds(4)) == found
+
+
+def test_what_cannot_move_is_left_alone() -> None:
+    assert all(not found for found in seen(6, 12.0, c=BUILDING))
+    # Scans two seconds apart tell nothing of an object either.
+    assert all(not found for found in seen(4, 12.0, period_s=2.0))
+
+
+def test_speeds_rise_as_less_is_found() -> None:
+    persistence = Persistence(PersistenceConfig())
+    shares = np.linspace(0.0, 1.0, 101)
+    speeds = []
+    for k, share in enumerate(shares):
+        persistence.shares[k] = {(VEHICLE, 0): np.array([1.0, share])}
+        speeds.append(persistence.speeds(k).get((VEHICLE, 0), 0.0))
+    assert (np.diff(speeds) <= 0.0).all()
+    assert speeds[20] == 30.0 and speeds[45] == pytest.approx(0.6) and speeds[60] == 0.0
+
+
+def test_nothing_is_kept_of_scans_long_gone() -> None:
+    persistence = Persistence()
+    for k in range(40):
+        persistence.forget(k - 10)
+        persistence.add(k, scan(k, 0.1, [np.array([15.0, -4.0, 0.5])]), pose(k, 0.1))
+    assert sorted(persistence.shares) == list(range(29, 40))
+    assert len(persistence._places) <= 6

@@ -1,0 +1,107 @@
+"""Small simulated drives that several test modules look at, made once a process."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+
+import cv2
+import gtsam
+import numpy as np
+
+from sst_graph import Tracker, TrackerConfig
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
+from sst_graph.experiments.wrong_drives import with_distortion
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.types import CameraImage, SemanticClass
+
+TRACKED_STREET = SimulationConfig(
+    seed=3,
+    frames=36,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.3,
+    time_offset_s=0.03,
+    motion="no_stop",
+    speed_mps=6.0,
+    moving_fraction=0.0,
+)
+"""A drive for the tracker, at half the usual size."""
+
+
+@cache
+def standing_street(label_noise: float = 1.0) -> SimulatedDrive:
+    """Three frames of a standing drive at half the usual size."""
+    return simulate(
+        SimulationConfig(
+            seed=3,
+            frames=3,
+            width=621,
+            height=188,
+            motion="standing",
+            time_offset_s=0.0,
+            azimuth_step_deg=0.35,
+            label_noise=label_noise,
+        )
+    )
+
+
+@cache
+def prepared_street(label_noise: float = 1.0) -> Drive:
+    """:func:`standing_street`, reduced to what calibration needs of its vehicles."""
+    config = PrepareConfig(use_visual_odometry=False)
+    return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
+
+
+CROWDED_STREET = SimulationConfig(
+    seed=5000,
+    frames=20,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    vehicle_density=0.3,
+    time_offset_s=0.1,
+)
+"""A drive with a stop past many vehicles, at half the usual size."""
+
+
+@cache
+def crowded_street(k1: float = 0.0) -> KeptDrive:
+    """:data:`CROWDED_STREET`, through a lens with radial distortion."""
+    return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulate(CROWDED_STREET))
+
+
+EARLY_START = TrackerConfig(start_scans=8, start_work=0)
+"""The first estimate comes with the eighth frame, at once."""
+
+
+def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
+    """A tracker that starts from the truth, so that no search is needed."""
+    calibration = config.calibration
+    start = dataclasses.replace(calibration.start, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    return Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+
+
+def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
+    """Mahalanobis distance of a tracker's estimate from a calibration."""
+    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+
+
+def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
+    """The image of a turned camera; ``border`` says what it shows where it did not look before."""
+    K = street.camera.matrix
+    H = K @ R.matrix() @ np.linalg.inv(K)
+    size = (street.camera.width, street.camera.height)
+    mask = np.asarray(cv2.warpPerspective(image.mask, H, size, flags=cv2.INTER_NEAREST, **border), np.uint8)
+    return dataclasses.replace(image, mask=mask)
+
+
+def knocked(image: CameraImage, street: SimulatedDrive, degrees: float) -> CameraImage:
+    """The image of a camera turned about its vertical axis."""
+    return turned(image, street, gtsam.Rot3.Ry(np.radians(degrees)), borderMode=cv2.BORDER_REPLICATE)

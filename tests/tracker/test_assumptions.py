@@ -1,0 +1,307 @@
+"""What is taken for granted, in the tracker: considered, tested, estimated."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph import Tracker, TrackerConfig
+from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
+from sst_graph.batch.assumption_tests import told_by
+from sst_graph.config import with_overrides
+from sst_graph.covariance.cluster_robust import robust_covariance
+from sst_graph.covariance.considered import AssumptionConfig, consider
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.drive.preparation import ImageFeatures, prepare_drive
+from sst_graph.errors import ConfigError
+from sst_graph.experiments.wrong_drives import with_distortion, with_principal_point
+from sst_graph.graph.building import Tracks, joint_graph
+from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.state import State, nuisance_key
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.sums.score_sums import ScoreSums
+from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.window import Window
+
+FloatArray = NDArray[np.float64]
+K1 = -0.3
+
+
+def _config(*settings: str) -> TrackerConfig:
+    """Settings of a tracker that trusts its guess and does not wait for frames that confirm it."""
+    own = ["calibration.start.enabled=false", "start_scans=10", "alarm.enabled=false"]
+    return with_overrides(TrackerConfig(), [*own, *settings])
+
+
+@pytest.fixture(scope="module")
+def street() -> KeptDrive:
+    """Many vehicles, half-size pictures."""
+    config = SimulationConfig(
+        seed=5,
+        frames=24,
+        width=621,
+        height=188,
+        azimuth_limit_deg=50.0,
+        azimuth_step_deg=0.3,
+        vehicle_density=0.3,
+        time_offset_s=0.04,
+        speed_mps=6.0,
+    )
+    return KeptDrive.of(simulate(config))
+
+
+@pytest.fixture(scope="module")
+def bent(street: KeptDrive) -> KeptDrive:
+    """The same through a lens with radial distortion."""
+    return with_distortion(street, K1)
+
+
+def _tracked(drive: KeptDrive, *settings: str, settle: bool = True) -> Tracker:
+    assert drive.truth is not None
+    tracker = Tracker(drive.camera, _config(*settings), drive.truth.cTl, 0.04)
+    for frame in drive:
+        tracker.add(frame)
+    if settle:
+        tracker.settle()
+    return tracker
+
+
+@pytest.fixture(scope="module")
+def settled(street: KeptDrive) -> Tracker:
+    """The street's tracker at its end, with all frames in the window."""
+    return _tracked(street)
+
+
+@pytest.fixture(scope="module")
+def estimating(bent: KeptDrive) -> Tracker:
+    """The bent street's tracker at its end, with the distortion as a variable."""
+    return _tracked(bent, 'calibration.assumptions.estimate=["k1"]')
+
+
+@pytest.fixture(scope="module")
+def leaving(bent: KeptDrive) -> Tracker:
+    """The same while it runs; most frames have left its window."""
+    return _tracked(bent, 'calibration.assumptions.estimate=["k1"]', "window=12", settle=False)
+
+
+def _state(tracker: Tracker) -> State:
+    """The state at which all matches of a tracker's window were made."""
+    assert tracker.smoother is not None
+    points = [entry.score.belief.point for entry in tracker.smoother.entries.values()]
+    assert all(point.cTl.equals(points[0].cTl, 0.0) for point in points)
+    state = points[0].state(tracker.classes)
+    seen = [(point.tracks, point.object_biases_px.tolist()) for point in points]
+    biases = {(0, track): bias for own in seen for track, bias in zip(*own, strict=True)}
+    return dataclasses.replace(state, object_biases_px={**state.object_biases_px, **biases})
+
+
+def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> None:
+    """The batch's function on the window's own matches, at the tracker's state."""
+    assert settled.smoother is not None
+    entries = dict(sorted(settled.smoother.entries.items()))
+    assert list(entries) == list(range(len(entries))) and not settled.smoother.sums.recent
+    pairs, state = [entry.pair for entry in entries.values()], _state(settled)
+    guess = State(settled.guess.cTl or gtsam.Pose3(), (settled.guess.offset_s,))
+    graph, values = joint_graph(pairs, state, settled.matcher.graph, guess)
+    robust = robust_covariance(graph, values, pairs, state, [settled.window.objects_of(list(entries))[0]])
+    plain = consider(robust, pairs, values, state, settled.config.calibration.assumptions)
+    expected = told_by(plain, settled.tests.findings)
+    found = settled.considered()
+    assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
+    scale = np.sqrt(np.diag(settled.covariance)[:7])
+    for name, step in expected.sensitivities.items():
+        size = np.linalg.norm(step / scale)
+        np.testing.assert_allclose(found.sensitivities[name] / scale, step / scale, atol=1e-3 * size)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found.covariance(7))), np.sqrt(np.diag(expected.covariance(7))), rtol=1e-3
+    )
+    total = settled.covariance[:7, :7] + expected.covariance(7)
+    np.testing.assert_allclose(np.diag(settled.reported()), np.diag(total), rtol=1e-3)
+
+
+N, HELD = 9, 3
+
+
+def _holding(seed: int, tracks: tuple[int, ...] = ()) -> tuple[Gaussian, FloatArray]:
+    """A belief that holds parameters, and its rows."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((40, N + len(tracks) + HELD))
+    point = Point(gtsam.Pose3(), 0.1, np.zeros(2), tracks, np.zeros(len(tracks)))
+    return Gaussian(point, A.T @ A, rng.standard_normal(A.shape[1])), A
+
+
+def test_held_parameters_are_conditioned_on_and_follow_everything() -> None:
+    """Solved for as if they were unknowns, they agree with the dense problem after each operation."""
+    belief, _ = _holding(1, (4, 7))
+    assert belief.held == HELD
+    n = belief.point.size
+    np.testing.assert_array_equal(belief.without_held().information, belief.information[:n, :n])
+    covariance, mean = np.linalg.inv(belief.information), np.linalg.solve(belief.information, belief.vector)
+    smaller, T = belief.without([4])
+    kept = [*range(N), N + 1, *range(n, n + HELD)]
+    np.testing.assert_allclose(np.linalg.inv(smaller.information), covariance[np.ix_(kept, kept)], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.solve(smaller.information, smaller.vector), mean[kept], atol=1e-9)
+    np.testing.assert_allclose(T @ belief.vector, smaller.vector, atol=1e-12)
+    walk = np.linspace(0.1, 0.5, 7)
+    after = belief.drifted(walk)
+    expected = covariance + np.diag([*walk, *np.zeros(n + HELD - 7)])
+    np.testing.assert_allclose(np.linalg.inv(after.information), expected, atol=1e-8)
+    step = np.linspace(-0.01, 0.01, n)
+    step[:6] = 0.0
+    moved = belief.at(belief.point.moved(step))
+    away = np.append(step, np.zeros(HELD))
+    np.testing.assert_allclose(np.linalg.solve(moved.information, moved.vector), mean - away, atol=1e-9)
+    wider = belief.with_objects({9: 0}, 0.5)
+    assert wider.held == HELD and wider.point.tracks == (4, 7, 9)
+    again, _ = wider.without([9])
+    np.testing.assert_allclose(again.information, belief.information, atol=1e-9)
+    np.testing.assert_allclose(again.vector, belief.vector, atol=1e-9)
+
+
+def test_beliefs_that_hold_nothing_take_nothing_of_others() -> None:
+    whole, _ = _holding(2, (4,))
+    own = whole.without_held()
+    assert own.plus(whole).held == 0
+    np.testing.assert_allclose(own.plus(whole).information, 2.0 * own.information)
+    nothing = own.holding(HELD)
+    np.testing.assert_allclose(nothing.plus(whole).information[N + 1 :], whole.information[N + 1 :])
+    np.testing.assert_allclose(nothing.vector_with([whole]), nothing.plus(whole).vector)
+    np.testing.assert_allclose(nothing.information_with([whole]), nothing.plus(whole).information)
+    np.testing.assert_allclose(own.information_with([whole]), own.plus(whole).information)
+
+
+def test_new_unknowns_come_before_what_is_held() -> None:
+    sums, rng = ScoreSums.empty(4, held=2), np.random.default_rng(3)
+    A = rng.standard_normal((9, 6))
+    sums.JJ = sums.frames = sums.closed = A.T @ A
+    sums.live = {5: (A[0], 1)}
+    sums.grow(5)
+    there = [0, 1, 2, 3, 5, 6]
+    np.testing.assert_array_equal(sums.JJ[np.ix_(there, there)], A.T @ A)
+    assert not sums.JJ[4].any() and sums.live[5][0].tolist() == np.insert(A[0], 4, 0.0).tolist()
+    assert sums.objects.closed.shape == (5, 5)
+
+
+def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) -> None:
+    window = Window(street.camera, 3)
+    for number in range(5):
+        mask = np.zeros((2, 2), np.uint8)
+        window.add_image(ImageFeatures(number, 1_000_000_000 + number * 100_000_000, mask, {}))
+    window.forget_images(0, 2)
+    assert window.images[0].stamp_ns == 1_300_000_000
+    assert window.drive()[0].origin_ns == 1_000_000_000
+
+
+def test_a_clean_street_contradicts_nothing(settled: Tracker) -> None:
+    update = settled.current()
+    assert update.contradictions == () and update.status == "ok" and update.estimated == {}
+    report = tracker_result(settled).diagnostics["assumptions"]
+    assert list(report) == list(ASSUMPTIONS)
+    tested = {name for name, entry in report.items() if "estimate" in entry}
+    assert tested == {name for name, assumption in ASSUMPTIONS.items() if assumption.by_matches}
+    assert not any(entry.get("contradicted") for entry in report.values())
+
+
+def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
+    drive = with_principal_point(street, 20.0, 0.0)
+    # A dozen vehicles in half-size pictures tell it to 16 px at most: asked for one deviation.
+    tracker = _tracked(drive, "calibration.assumptions.threshold=1.0", settle=False)
+    update = tracker.current()
+    assert update.status == "contradicted" and "principal point cx" in update.contradictions[0]
+    assert update.to_dict()["contradictions"] == list(update.contradictions)
+    result = tracker_result(tracker)
+    assert result.status == "not_converged" and result.reasons[0] == update.contradictions[0]
+    found = tracker.tests.findings[0]
+    assert found.contradicted and found.score > 1.0
+    assert 10.0 < found.value < 30.0  # one step from where matches are near
+    # Not tested: nothing is found, and no more is considered than beforehand.
+    tracker.tests.restart()
+    assert tracker.current().contradictions == () and tracker.current().status != "contradicted"
+    assert tracker.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
+    assert np.all(tracker.current().sigmas < update.sigmas)
+
+
+def test_what_is_estimated_agrees_with_the_batch(
+    street: KeptDrive, bent: KeptDrive, settled: Tracker, estimating: Tracker
+) -> None:
+    """And it is the answer of the street without distortion."""
+    update = estimating.current()
+    assert update.contradictions == (), update
+    value, sigma = update.estimated["k1"]
+    assert abs(value - K1) < 3.0 * sigma and sigma < 0.05
+    assert held_at_zero(("k1",)) == tuple(estimating.considered().sigmas)
+    # The batch, with the same variable, from the same start.
+    config = estimating.config.calibration
+    drive = prepare_drive(bent, config.classes, config.prepare)
+    assert bent.truth is not None
+    tracks = object_tracks(drive)
+    joint = dataclasses.replace(
+        config.joint,
+        graph=dataclasses.replace(config.joint.graph, undersides=estimating.matcher.graph.undersides),
+    )
+    start = State(bent.truth.cTl, (0.04,))
+    solution = solve_joint([drive], start, joint, tracks=Tracks([drive], [tracks]))
+    robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
+    state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))
+    turn = gtsam.Pose3.Logmap(update.T_camera_lidar.between(state.cTl))
+    step = np.array([*turn, state.offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
+    sigmas = np.sqrt(np.diag(robust.matrix)[[*range(7), column]])
+    assert np.abs(step / sigmas).max() < 1.0, np.round(step / sigmas, 2)
+    own = np.sqrt(np.diag(estimating.covariance)[:7])
+    np.testing.assert_allclose([*own, sigma], sigmas, rtol=0.3)
+    # Without distortion.
+    clean = settled.current()
+    back = gtsam.Pose3.Logmap(update.T_camera_lidar.between(clean.T_camera_lidar))
+    assert np.abs(back / update.sigmas[:6]).max() < 3.0
+
+
+def test_a_checkpoint_holds_what_is_estimated(
+    leaving: Tracker, bent: KeptDrive, tmp_path: Path
+) -> None:
+    assert leaving.smoother is not None and leaving.smoother.sums.recent
+    save_checkpoint(leaving, tmp_path / "tracker")
+    again = load_checkpoint(tmp_path / "tracker")
+    assert again.current().to_dict() == leaving.current().to_dict()
+    assert again.current().to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
+    last = bent[len(bent) - 1]
+    assert last.scan is not None and last.image is not None
+    later = [dataclasses.replace(one, stamp_ns=one.stamp_ns + 100_000_000) for one in (last.image, last.scan)]
+    for tracker in (leaving, again):
+        tracker.add_image(later[0])  # type: ignore[arg-type]
+        tracker.add_scan(later[1])  # type: ignore[arg-type]
+    assert again.current().to_dict() == leaving.current().to_dict()
+
+
+def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None:
+    """What is estimated beside them is marginalized out."""
+    marginal = leaving.marginal()
+    covariance = np.linalg.inv(marginal.information)
+    scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
+    np.testing.assert_allclose(covariance / scale, leaving.reported() / scale, atol=1e-6)
+
+
+def shifted(sigma: float) -> AssumptionConfig:
+    return with_overrides(AssumptionConfig(), [f"sigmas.cx={sigma}", f"sigmas.cy={sigma}"])
+
+
+def test_the_principal_point_turns_the_camera(settled: Tracker) -> None:
+    """Told that it lies 1 px to the right, the answer turns back as a turn that moves all points by 1 px."""
+    camera, cTl = settled.camera, settled.point.cTl
+    step = settled.considered().sensitivities["cx"]
+    turned = np.asarray(cTl.AdjointMap() @ step[:6])  # a step of the camera
+    assert turned[1] == pytest.approx(-1.0 / camera.fx, rel=0.3), turned * camera.fx
+    assert abs(turned[0]) < 0.3 / camera.fx
+
+
+@pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
+def test_a_sigma_out_of_range_is_refused(sigma: float) -> None:
+    with pytest.raises(ConfigError, match=r"sigmas\.cx"):
+        shifted(sigma)

@@ -1,0 +1,342 @@
+"""Whatever a frame's arrays hold: nothing raises, and what is refused has changed nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from streets import tracker_from_truth
+
+from sst_graph import Tracker
+from sst_graph.errors import DataError
+from sst_graph.files.object_store import stored
+from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
+from sst_graph.validation import checked_image, checked_scan
+
+Rng = np.random.Generator
+Change = Callable[[Rng, Any], Any]
+
+LENGTHS: list[Change] = [
+    lambda rng, x: x[: rng.integers(0, len(x))],
+    lambda rng, x: np.concatenate([x, x[: rng.integers(1, len(x))]]),
+    lambda rng, x: x[:0],
+    lambda rng, x: x[None],
+    lambda rng, x: x.reshape(-1),
+    lambda rng, x: x[..., None],
+    lambda rng, x: np.float64(x.flat[0]),
+    lambda rng, x: x.reshape(len(x), -1).T,
+]
+KINDS: list[Change] = [
+    lambda rng, x: x.tolist(),
+    lambda rng, x: None,
+    lambda rng, x: "points",
+    lambda rng, x: x.astype(str),
+    lambda rng, x: x.astype(object),
+    lambda rng, x: x.astype(complex) * 1j,
+    lambda rng, x: x > x.flat[0],
+    lambda rng, x: np.zeros(x.shape, "datetime64[ns]"),
+    lambda rng, x: x.astype("f8"),
+    lambda rng, x: x.astype(">f4"),
+    lambda rng, x: x.astype("i8") - 1,
+    lambda rng, x: np.asfortranarray(x)[::-1],
+    lambda rng, x: np.zeros(x.shape, [("x", "f4")]),
+]
+VALUES: list[Change] = [
+    lambda rng, x: _filled(rng, x.astype(np.float64), np.nan),
+    lambda rng, x: _filled(rng, x.astype(np.float64), np.inf),
+    lambda rng, x: _filled(rng, x.astype(np.float64), -np.inf),
+    lambda rng, x: _filled(rng, x.astype(np.float64), 1e300),
+    lambda rng, x: _filled(rng, x.astype(np.float64), -3e38),
+    lambda rng, x: _filled(rng, x.astype(np.int64), 2**62),
+    lambda rng, x: _filled(rng, x.astype(np.int64), -(2**62)),
+    lambda rng, x: _filled(rng, x, 200),
+    lambda rng, x: np.zeros_like(x),
+    lambda rng, x: np.full_like(x, x.flat[0]),
+    lambda rng, x: rng.permutation(x),
+    lambda rng, x: rng.permuted(x, axis=0),
+    lambda rng, x: x[rng.integers(0, len(x), len(x))],
+]
+STAMPS = [None, "0", 1.5e9, np.nan, True, np.array([1]), -(2**80), 2**62 + 1, 2**61, -5, 10**30, 1 + 2j]
+
+
+def _filled(rng: Rng, array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
+    """Some entries replaced: one, a row, or all."""
+    array, some = array.copy(), rng.integers(3)
+    if some == 0:
+        array.flat[rng.integers(array.size)] = value
+    else:
+        array[rng.integers(len(array)) if some == 1 else slice(None)] = value
+    return array
+
+
+def _changed(rng: Rng, data: Scan | CameraImage, stamp_ns: int) -> Any:
+    """A scan or an image with one or two of its fields made wrong, or only unusual."""
+    data = dataclasses.replace(data, stamp_ns=stamp_ns)
+    arrays = [f.name for f in dataclasses.fields(data) if f.name != "stamp_ns"]
+    for _ in range(rng.integers(1, 3)):
+        if rng.random() < 0.15:
+            data = dataclasses.replace(data, stamp_ns=STAMPS[rng.integers(len(STAMPS))])  # type: ignore[arg-type]
+            continue
+        name = arrays[rng.integers(len(arrays))]
+        value = getattr(data, name)
+        changes = (LENGTHS, KINDS, VALUES)[rng.integers(3)]
+        if isinstance(value, np.ndarray) and value.size and value.ndim:
+            try:
+                value = changes[rng.integers(len(changes))](rng, value)
+            except (ValueError, TypeError, OverflowError):  # no such array
+                continue
+        data = dataclasses.replace(data, **{name: value})
+    return data
+
+
+@pytest.fixture(scope="module")
+def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoint of a tracker that has an estimate, after 14 frames."""
+    tracker = tracker_from_truth(street)
+    for frame in frames[:14]:
+        tracker.add(frame)
+    assert tracker.started
+    path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
+    save_checkpoint(tracker, path)
+    return path
+
+
+def _bad(rng: Rng, frames: list[Frame], count: int) -> Iterator[Frame]:
+    """Frames of which the scan, the image or both have been tampered with."""
+    for k in range(count):
+        good = frames[14 + k % 20]
+        assert good.scan is not None and good.image is not None
+        stamp = good.scan.stamp_ns + k // 20
+        scan: Any = dataclasses.replace(good.scan, stamp_ns=stamp)
+        which = rng.integers(3)
+        if which != 1:
+            scan = _changed(rng, _whole(scan), stamp)
+        image: Any = good.image
+        if which != 0:
+            image = _changed(rng, image, stamp)
+        yield Frame(k, scan, image)
+
+
+def _whole(scan: Scan) -> Scan:
+    """With the times of its points and the numbers of its rings, which the simulated ones do without."""
+    n = len(scan.points)
+    return dataclasses.replace(
+        scan,
+        offsets_s=np.linspace(-0.05, 0.05, n, dtype=np.float32),
+        rings=np.arange(n).astype(np.uint16) % 64,
+    )
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize("seed", range(2))
+def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], seed: int) -> None:
+    """Each frame is taken, or refused with a reason; then the tracker is byte for byte what it was."""
+    tracker, rng = load_checkpoint(running), np.random.default_rng(seed)
+    refused = 0
+    for frame in _bad(rng, frames, 60):
+        for add, data in ((tracker.add_image, frame.image), (tracker.add_scan, frame.scan)):
+            before = stored(tracker)
+            update = add(data)  # type: ignore[operator]
+            assert np.isfinite(update.sigmas).all() and np.isfinite(update.T_camera_lidar.matrix()).all()
+            if update.refused:
+                refused += 1
+                assert update.reason and not update.accepted
+                assert stored(tracker) == before
+    assert refused > 30
+
+
+def test_a_frame_may_be_anything(running: Path) -> None:
+    tracker = load_checkpoint(running)
+    before = stored(tracker)
+    for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
+        update = tracker.add(thing)  # type: ignore[arg-type]
+        assert not update.accepted and update.reason
+    assert stored(tracker) == before
+
+
+def test_one_sensor_s_data_are_refused_and_the_other_s_are_taken(running: Path, frames: list[Frame]) -> None:
+    tracker, good = load_checkpoint(running), frames[14]
+    assert good.image is not None
+    wrong = dataclasses.replace(good.image, mask=good.image.mask[:9])
+    scans, images = tracker.window.place[1], len(tracker.window.images)
+    update = tracker.add(Frame(14, good.scan, wrong))
+    assert update.refused == ("image",) and not update.accepted and "camera's size" in update.reason
+    assert tracker.window.place[1] == scans + 1 and len(tracker.window.images) == images
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("points", lambda s: s.points[:, :2], r"points: found shape \(\d+, 2\), expected \(n, 3\)"),
+        ("points", lambda s: s.points * 1e6, "at most 100000 m"),
+        ("points", lambda s: s.points[:0], "0 points"),
+        ("classes", lambda s: s.classes[:-1], r"classes: found shape"),
+        ("classes", lambda s: np.full(len(s.points), 77, np.uint8), "label 77"),
+        ("instances", lambda s: s.instances[:5], r"instances: found shape \(5,\)"),
+        ("offsets_s", lambda s: np.full(len(s.points), np.nan, np.float32), "NaN"),
+        ("offsets_s", lambda s: np.full(len(s.points), 1.3e9), "at most 2 s after the stamp"),
+        ("offsets_s", lambda s: np.zeros(7, np.float32), "point times: found shape"),
+        ("rings", lambda s: np.full(len(s.points), -1), "numbers -1 to -1, expected 0 to 65535"),
+        ("stamp_ns", lambda s: 1.5, "a stamp that is a float, expected whole nanoseconds"),
+        ("stamp_ns", lambda s: 2**63, "146 years"),
+    ],
+)
+def test_a_scan_s_flaw_is_named(
+    frames: list[Frame], field: str, value: Callable[[Scan], Any], message: str
+) -> None:
+    scan = frames[0].scan
+    assert scan is not None and scan.instances is not None
+    with pytest.raises(DataError, match=message):
+        checked_scan(dataclasses.replace(scan, **{field: value(scan)}))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("mask", lambda i: i.mask.T, "the camera's size"),
+        ("mask", lambda i: i.mask.astype(np.float32), "dtype float32"),
+        ("mask", lambda i: i.mask.astype(np.int32) - 300, "labels -"),
+        ("pixels", lambda i: i.pixels[..., 0], r"pixels: found shape .* in BGR"),
+        ("pixels", lambda i: i.pixels.astype(np.float32), "dtype float32, expected uint8"),
+        ("instances", lambda i: i.mask[:3].astype(np.uint16), "instances: found shape"),
+    ],
+)
+def test_an_image_s_flaw_is_named(
+    street: SimulatedDrive, frames: list[Frame], field: str, value: Callable[[CameraImage], Any], message: str
+) -> None:
+    image = frames[0].image
+    assert image is not None
+    with pytest.raises(DataError, match=message):
+        checked_image(dataclasses.replace(image, **{field: value(image)}), street.camera)
+
+
+def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, frames: list[Frame]) -> None:
+    scan, image = frames[0].scan, frames[0].image
+    assert scan is not None and image is not None
+    assert checked_scan(scan).points is scan.points  # no copy of what is right
+    wide = dataclasses.replace(
+        scan, points=np.asfortranarray(scan.points.astype(">f8")), classes=scan.classes.astype(np.int64)
+    )
+    checked = checked_scan(wide)
+    assert checked.points.dtype == np.float32 and checked.points.flags.c_contiguous
+    np.testing.assert_array_equal(checked.points, scan.points)
+    np.testing.assert_array_equal(checked.classes, scan.classes)
+    turned = dataclasses.replace(image, mask=np.asfortranarray(image.mask.astype(np.int16)))
+    np.testing.assert_array_equal(checked_image(turned, street.camera).mask, image.mask)
+
+
+def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
+    running: Path, frames: list[Frame]
+) -> None:
+    """A stamp years ahead does not shut out what follows; one that stays elsewhere begins anew there."""
+    tracker, year = load_checkpoint(running), 365 * 86_400 * 10**9
+    scans = [frame.scan for frame in frames[14:]]
+    assert all(scan is not None for scan in scans)
+    assert "by a day at most" in tracker.add_scan(_later(scans[0], year)).reason
+    assert not tracker.add(frames[14]).refused
+    updates = [tracker.add_scan(_later(scan, -year)) for scan in scans[1:9]]
+    assert [bool(update.refused) for update in updates] == [True] * 4 + [False] * 4
+    assert updates[4].alarm and "scan stamps moved by -31535999" in updates[4].reason
+    assert not tracker.started and len(tracker.window.scans) == 4
+
+
+def _later(scan: Scan | None, by_ns: int) -> Scan:
+    assert scan is not None
+    return dataclasses.replace(scan, stamp_ns=scan.stamp_ns + by_ns)
+
+
+def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frames: list[Frame]) -> None:
+    """Cars of a hair's breadth, on which every distance is the same: whatever stage fails, all is as it was.
+
+    The smoother, the window, the odometry and all counters go on as if the scan had never come.
+    """
+    tracker, other = load_checkpoint(running), load_checkpoint(running)
+    scan = frames[14].scan
+    assert scan is not None
+    before = stored(tracker)
+    for broken in _hard_to_use(scan):
+        update = tracker.add_scan(broken)
+        if update.refused:
+            assert stored(tracker) == before
+        else:  # it was of use after all
+            tracker = load_checkpoint(running)
+            before = stored(tracker)
+    for frame in frames[14:18]:
+        a, b = tracker.add(frame), other.add(frame)
+        assert a.T_camera_lidar.equals(b.T_camera_lidar, 0.0) and a.time_offset_s == b.time_offset_s
+        assert a.reason == b.reason and a.matches == b.matches
+
+
+def _hard_to_use(scan: Scan) -> Iterator[Scan]:
+    """Scans whose arrays are sound, and whose geometry is not."""
+    rng = np.random.default_rng(0)
+    n = len(scan.points)
+    yield dataclasses.replace(scan, points=np.zeros((n, 3), np.float32))
+    yield dataclasses.replace(scan, points=np.tile(scan.points[:1], (n, 1)))
+    yield dataclasses.replace(scan, points=(scan.points * np.float32([1.0, 0.0, 0.0])))
+    yield dataclasses.replace(scan, points=(scan.points * np.float32([1.0, 1.0, 0.0])))
+    yield dataclasses.replace(scan, points=(scan.points * np.float32(1e3)))
+    yield dataclasses.replace(scan, points=(scan.points * np.float32(1e-6)))
+    yield dataclasses.replace(scan, points=rng.uniform(-1e5, 1e5, (n, 3)).astype(np.float32))
+    yield dataclasses.replace(scan, classes=np.full(n, 1, np.uint8))
+    yield dataclasses.replace(scan, classes=np.full(n, 255, np.uint8))
+    yield dataclasses.replace(scan, instances=np.full(n, 65535, np.uint16))
+    yield dataclasses.replace(scan, instances=(np.arange(n) % 60_000).astype(np.uint16))
+    for few in (1, 2, 5, 50):
+        yield Scan(scan.stamp_ns, scan.points[:few], scan.classes[:few])
+    late = np.where(np.arange(n) % 2, 2.0, -2.0).astype(np.float32)
+    yield dataclasses.replace(scan, offsets_s=late)
+    yield dataclasses.replace(scan, rings=np.full(n, 65535, np.uint16))
+
+
+def test_ten_failures_in_a_row_begin_anew(running: Path, frames: list[Frame]) -> None:
+    """What is kept may be the reason: then it is given up, and the frames after it are taken again."""
+    tracker = load_checkpoint(running)
+    smoother = tracker.smoother
+    assert smoother is not None
+    # A graph that no update can be solved with.
+    smoother.past = dataclasses.replace(
+        smoother.past, information=np.full_like(smoother.past.information, np.nan)
+    )
+    updates = [tracker.add_scan(frame.scan) for frame in frames[14:25]]
+    assert all(update.refused == ("scan",) for update in updates[:10])
+    assert "begins anew" in updates[9].reason and not updates[10].refused
+    assert not tracker.started
+
+
+def test_a_tracker_still_works_after_all_that(running: Path, frames: list[Frame]) -> None:
+    """Bad frames between good ones leave no trace: the estimates are those of the good ones alone."""
+    tracker, clean, rng = load_checkpoint(running), load_checkpoint(running), np.random.default_rng(9)
+    for k, frame in enumerate(frames[14:22]):
+        wrong = _changed(rng, frame.scan, -1)  # type: ignore[arg-type]
+        tracker.add_scan(wrong)
+        tracker.add_image(_changed(rng, frame.image, -(2**61) + k))  # type: ignore[arg-type]
+        a, b = tracker.add(frame), clean.add(frame)
+        assert a.T_camera_lidar.equals(b.T_camera_lidar, 0.0) and a.time_offset_s == b.time_offset_s
+
+
+def test_a_new_tracker_survives_bad_first_frames(street: SimulatedDrive, frames: list[Frame]) -> None:
+    tracker, rng = Tracker(street.camera, initial=street.nominal), np.random.default_rng(5)
+    for frame in _bad(rng, frames, 40):
+        update = tracker.add(frame)
+        assert tracker.started == (update.status not in ("starting", "alarm"))
+
+
+def test_what_readers_leave_out_is_carried_over(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Points that were left out are counted on; a picture may be missing; a batch's scan may be empty."""
+    scan, image = frames[0].scan, frames[0].image
+    assert scan is not None and image is not None
+    assert checked_scan(dataclasses.replace(scan, left_out=3)).left_out == 3
+    with pytest.raises(DataError, match="left_out"):
+        checked_scan(dataclasses.replace(scan, left_out=-1))
+    assert not checked_image(dataclasses.replace(image, pixels=NO_PICTURE), street.camera).has_picture
+    empty = Scan(5, scan.points[:0], scan.classes[:0].astype(np.int64), left_out=2)
+    assert checked_scan(empty, fewest=0) == Scan(5, scan.points[:0], scan.classes[:0], left_out=2)
+    with pytest.raises(DataError, match="0 points, expected 1 to"):
+        checked_scan(empty)

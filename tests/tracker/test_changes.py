@@ -1,0 +1,309 @@
+"""The calibration changes under the tracker: steps, doubts, drift."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from streets import EARLY_START, knocked, sigmas_apart, tracker_from_truth, turned
+
+from sst_graph import Tracker
+from sst_graph.covariance.observability import ObservabilityConfig
+from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker.config import AlarmConfig, DriftConfig
+from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.types import Frame, SemanticClass
+
+STEP = 20
+"""Frame from which on the calibration has changed."""
+HELD = 12
+"""Frame from which on the start of the eighth frame has been checked against those that came after it."""
+
+
+BY_LABELS = AlarmConfig(warm_up=4, stamps=False)
+"""What the labels alone tell of a clock."""
+
+
+@pytest.mark.parametrize("kind", ["knock", "clock"])
+def test_a_step_raises_the_alarm_and_is_learnt(
+    street: SimulatedDrive, frames: list[Frame], kind: str
+) -> None:
+    """The camera is knocked, or its clock jumps: noticed within ten frames, though little is known yet."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(warm_up=4)))
+    alarms = []
+    for frame in frames:
+        image = frame.image
+        assert image is not None
+        if frame.index >= STEP and kind == "knock":
+            image = knocked(image, street, 1.5)
+        elif frame.index >= STEP:
+            image = dataclasses.replace(image, stamp_ns=image.stamp_ns + 100_000_000)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        if update.alarm:
+            alarms.append(frame.index)
+            assert update.status == "alarm" and not update.accepted
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
+    assert update.accepted and update.status != "alarm"
+    if kind == "clock":
+        assert sigmas_apart(tracker, street.truth.cTl, 0.03 - 0.1) < 6.0
+    else:
+        turned = gtsam.Rot3.Ry(np.radians(1.5)) * street.truth.cTl.rotation()
+        off = gtsam.Rot3.Logmap(turned.between(tracker.point.cTl.rotation()))
+        assert np.degrees(np.linalg.norm(off)) < 0.6
+
+
+def jumped(tracker: Tracker, frames: list[Frame], jump_ms: int) -> list[TrackUpdate]:
+    """What the tracker says of frames whose images have other stamps from the step on, beginning there."""
+    updates = []
+    for frame in frames:
+        assert frame.image is not None
+        late = jump_ms * 1_000_000 if frame.index >= STEP else 0
+        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + late)
+        updates.append(tracker.add(dataclasses.replace(frame, image=image)))
+    return updates[STEP:]
+
+
+@pytest.mark.parametrize("jump_ms", [-40, 40])
+def test_a_jump_in_the_first_seconds_raises_the_alarm(
+    street: SimulatedDrive, frames: list[Frame], jump_ms: int
+) -> None:
+    """Two seconds after the start: the labels tell within ten frames, though the estimate gives way."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
+    updates = jumped(tracker, frames[: STEP + 14], jump_ms)
+    alarms = [i for i, update in enumerate(updates) if update.alarm]
+    assert len(alarms) == 1 and alarms[0] < 10
+    assert tracker.started and tracker.watch.kept is None
+    assert sigmas_apart(tracker, street.truth.cTl, 0.03 - 1e-3 * jump_ms) < 3.0
+
+
+@pytest.mark.parametrize("jump_ms", [-30, 30])
+def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
+    street: SimulatedDrive, frames: list[Frame], jump_ms: int
+) -> None:
+    """With one object left out the others may tell too little for an alarm so early: there is doubt then."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
+    told = [update.alarm or bool(update.doubt) for update in jumped(tracker, frames[: STEP + 10], jump_ms)]
+    assert any(told)
+
+
+@pytest.mark.parametrize(
+    ("sensor", "jump_ms"), [("image", -30), ("image", 30), ("scan", 30), ("image", -200)]
+)
+def test_a_jump_breaks_the_rhythm_of_stamps(
+    street: SimulatedDrive, frames: list[Frame], sensor: str, jump_ms: int
+) -> None:
+    """Noticed within six frames though nothing is in view that tells it; learnt from what comes into view."""
+    tracker, updates = tracker_from_truth(street, EARLY_START), []
+    for frame in frames:
+        assert frame.image is not None and frame.scan is not None
+        image, scan = frame.image, frame.scan
+        late = jump_ms * 1_000_000 if frame.index >= STEP else 0
+        if sensor == "image":
+            image = dataclasses.replace(image, stamp_ns=image.stamp_ns + late)
+        else:
+            scan = dataclasses.replace(scan, stamp_ns=scan.stamp_ns + late)
+        if STEP <= frame.index < STEP + 6:
+            image = dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
+        updates.append(tracker.add(dataclasses.replace(frame, image=image, scan=scan)))
+    alarms = [i for i, update in enumerate(updates) if update.alarm]
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 6
+    told = updates[alarms[0]]
+    assert f"{sensor} stamps jumped" in told.reason and told.status == "alarm"
+    assert told.chi2 is not None and told.chi2 > tracker.config.alarm.chi2
+    offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
+    assert tracker.started and abs(updates[-1].time_offset_s - offset_s) < 2.0 * updates[-1].sigmas[6] < 0.03
+
+
+def test_a_jump_before_the_start_begins_the_window_anew(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Frames from before it would say something else of the offset."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=30))
+    for frame in frames[: STEP + 5]:
+        assert frame.image is not None
+        late = 30_000_000 if frame.index >= STEP else 0
+        image = dataclasses.replace(frame.image, stamp_ns=frame.image.stamp_ns + late)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+    assert not tracker.started and not update.alarm and "jumped by +30 ms" in update.reason
+    assert tracker.window.first_scan == STEP and len(tracker.window.scans) == tracker.starting.waited == 5
+    assert len(tracker.window.images) == 5
+
+
+def test_a_knock_beyond_all_matches_is_a_step_too(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The camera nods by 10 degrees: next to nothing meets the labels; it is looked for all around."""
+    tracker = tracker_from_truth(street)
+    R, alarms = gtsam.Rot3.Rx(np.radians(10.0)), []
+    for frame in frames:
+        assert frame.image is not None
+        later = frame.index >= STEP
+        image = turned(frame.image, street, R, borderValue=255) if later else frame.image
+        alarms += [frame.index] if tracker.add(dataclasses.replace(frame, image=image)).alarm else []
+    assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 10
+    assert tracker.guess.search and tracker.started
+    error = (gtsam.Pose3(R, np.zeros(3)) * street.truth.cTl).between(tracker.point.cTl)
+    assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation()))) < 0.5
+
+
+def _alone(frame: Frame, street: SimulatedDrive, instance: int) -> Frame:
+    """One vehicle is all that is known, and the image's labels around it are moved to the side."""
+    assert frame.image is not None and frame.scan is not None and frame.scan.instances is not None
+    lPs = frame.scan.points[
+        (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances == instance)
+    ]
+    uvs = street.camera.project(lPs @ street.truth.cTl.rotation().matrix().T + street.truth.cTl.translation())
+    (left, top), (right, bottom) = np.nanmin(uvs, axis=0) - 18.0, np.nanmax(uvs, axis=0) + 18.0
+    mask = np.full_like(frame.image.mask, SemanticClass.IGNORE)
+    box = (slice(max(0, int(top)), int(bottom)), slice(max(0, int(left)), int(right)))
+    mask[box] = np.roll(frame.image.mask, 9, axis=1)[box]
+    other = (frame.scan.classes == SemanticClass.VEHICLE) & (frame.scan.instances != instance)
+    return dataclasses.replace(
+        frame,
+        image=dataclasses.replace(frame.image, mask=mask),
+        scan=dataclasses.replace(
+            frame.scan, classes=np.where(other, SemanticClass.IGNORE, frame.scan.classes)
+        ),
+    )
+
+
+def _plainest(frame: Frame, street: SimulatedDrive) -> int:
+    """The vehicle with most points in view."""
+    scan, T = frame.scan, street.truth.cTl
+    assert scan is not None and scan.instances is not None
+    uvs = street.camera.project(scan.points @ T.rotation().matrix().T + T.translation())
+    in_view = (scan.classes == SemanticClass.VEHICLE) & street.camera.in_image(uvs)
+    return int(np.bincount(scan.instances[in_view]).argmax())
+
+
+def test_what_one_object_alone_tells_is_a_doubt(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """One car is in view, and its labels are off: no alarm, but it does not go unsaid, and what was believed
+    before is kept beside what the frames make of it."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(warm_up=4)))
+    instance = _plainest(frames[STEP + 7], street)
+    doubts, kept = [], []
+    for frame in frames[: STEP + 6]:
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
+        assert not update.alarm and not (update.doubt and update.adopted)
+        doubts += [frame.index] if update.doubt else []
+        kept += [tracker.watch.kept] if update.doubt else []
+    assert doubts and min(doubts) >= STEP
+    assert all(before is kept[0] for before in kept)
+    assert kept[0] is not None and kept[0].scan <= doubts[0] and kept[0].point is not tracker.point
+
+
+def _sure_tracker(street: SimulatedDrive, alarm: AlarmConfig) -> Tracker:
+    """A tracker that calls any estimate observable."""
+    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, offset_s=10.0, pair_correlation=2.0)
+    calibration = dataclasses.replace(EARLY_START.calibration, observability=limits)
+    return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration, alarm=alarm))
+
+
+def test_a_knock_that_nothing_can_show_is_not_called_ok(
+    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All that is in view moves from then on: no alarm can be raised, and the status says so."""
+    tracker, ages = _sure_tracker(street, AlarmConfig()), []
+    for frame in frames:
+        assert frame.image is not None
+        image = frame.image
+        if frame.index == STEP:
+            monkeypatch.setattr(tracker.window, "restless", lambda: set(tracker.window.objects.live))
+        if frame.index >= STEP:
+            image = knocked(image, street, 1.5)
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        ages.append(update.unconfirmed_s)
+        assert not update.alarm and not (update.adopted and frame.index > STEP + 10)
+        if HELD <= frame.index < STEP:
+            assert update.status != "unconfirmed"
+    assert ages[STEP - 1] == 0.0
+    np.testing.assert_allclose(np.diff(ages[STEP - 1 :]), 0.1036, atol=2e-3)
+    assert update.status == "unconfirmed" and update.to_dict()["unconfirmed_s"] > 1.0
+    assert tracker_result(tracker).status == "not_converged"
+    assert "no frame would have shown" in tracker_result(tracker).reasons[0]
+
+
+def test_frames_that_show_nothing_let_the_estimate_age(
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
+) -> None:
+    """The image's labels are missing for a while; when they are back, the estimate is confirmed again."""
+    tracker, status = _sure_tracker(street, AlarmConfig()), []
+    for frame in frames:
+        assert frame.image is not None
+        image = frame.image
+        if STEP <= frame.index < STEP + 12:
+            image = dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE))
+        update = tracker.add(dataclasses.replace(frame, image=image))
+        status.append(update.status)
+        if frame.index == STEP + 5:
+            save_checkpoint(tracker, tmp_path / "tracker.npz")
+            resumed = load_checkpoint(tmp_path / "tracker.npz").current()
+            assert resumed.unconfirmed_s == update.unconfirmed_s > 0.5
+            assert resumed.offset_unconfirmed_s == update.offset_unconfirmed_s > 0.5
+    assert status[HELD - 5 : HELD] == ["unconfirmed"] * 5
+    assert "unconfirmed" not in status[HELD : STEP + 8]
+    assert status[STEP + 11] == "unconfirmed"
+    assert status[-1] == "ok" and update.unconfirmed_s == 0.0
+
+
+def test_a_doubt_that_is_given_up_is_no_confirmation(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The estimate has followed the one object by then; that it agrees with it now says nothing."""
+    tracker = _sure_tracker(street, AlarmConfig(warm_up=4, patience=5))
+    instance = _plainest(frames[STEP + 7], street)
+    for frame in frames[: STEP + 14]:
+        update = tracker.add(_alone(frame, street, instance) if frame.index >= STEP else frame)
+    assert tracker.watch.confirmation.suspects and not tracker.watch.kept
+    assert update.status == "unconfirmed"
+
+
+def test_drift_mode_tells_the_history(street: SimulatedDrive, frames: list[Frame]) -> None:
+    drift = DriftConfig(enabled=True, epoch_s=0.5)
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10, drift=drift))
+    for frame in frames:
+        tracker.add(frame)
+    history = tracker.history()
+    assert len(history) >= 5
+    assert all(a.stamp_ns < b.stamp_ns for a, b in pairwise(history))
+    last = history[-1]
+    assert sigmas_apart(tracker, last.cTl, last.time_offset_s) < 1.5
+    steady = tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10))
+    for frame in frames:
+        steady.add(frame)
+    assert np.diag(tracker.covariance)[:7].sum() > np.diag(steady.covariance)[:7].sum()
+
+
+def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """The camera yaws by 0.25 deg/s: the history follows within its sigmas, one calibration cannot."""
+    drift = DriftConfig(enabled=True, epoch_s=0.5, rotation_deg=0.2)
+    follows = tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10, drift=drift))
+    steady = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=AlarmConfig(enabled=False)))
+    start_ns = frames[0].scan.stamp_ns if frames[0].scan is not None else 0
+    for frame in frames:
+        assert frame.image is not None and frame.scan is not None
+        yaw_deg = 0.25e-9 * (frame.scan.stamp_ns - start_ns)
+        for tracker in (follows, steady):
+            assert not tracker.add(
+                dataclasses.replace(frame, image=knocked(frame.image, street, yaw_deg))
+            ).alarm
+    errors = [_yaw_error(street, entry, 0.25e-9 * (entry.stamp_ns - start_ns)) for entry in follows.history()]
+    assert len(errors) >= 5
+    off, sigmas = np.array(errors).T
+    assert np.abs(off).max() < 0.25 and np.mean(np.abs(off) < 2.5 * sigmas) > 0.8
+    last_deg = 0.25e-9 * ((follows.window.last_stamp_ns or 0) - start_ns)
+    at_end = [_yaw_error(street, tracker.current(), last_deg)[0] for tracker in (follows, steady)]
+    assert abs(at_end[0]) < 0.5 * abs(at_end[1])
+
+
+def _yaw_error(
+    street: SimulatedDrive, found: HistoryEntry | TrackUpdate, yaw_deg: float
+) -> tuple[float, float]:
+    """Error about the camera's vertical axis, and its sigma [deg]."""
+    cTl = found.cTl if isinstance(found, HistoryEntry) else found.T_camera_lidar
+    truth = gtsam.Rot3.Ry(np.radians(yaw_deg)) * street.truth.cTl.rotation()
+    axis = truth.matrix().T @ np.array([0.0, 1.0, 0.0])
+    error = float(axis @ gtsam.Rot3.Logmap(truth.between(cTl.rotation())))
+    sigma = float(np.sqrt(axis @ found.covariance[:3, :3] @ axis))
+    return float(np.degrees(error)), float(np.degrees(sigma))

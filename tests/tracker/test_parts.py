@@ -1,0 +1,258 @@
+"""The parts of the tracker, each against an independent answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+
+import gtsam
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.tracker.config import AdoptionConfig, AlarmConfig, TrackerConfig
+from sst_graph.tracker.monitor.adoption import Adoption
+from sst_graph.tracker.monitor.alarm import Comparison, Joint, StepAlarm
+from sst_graph.tracker.monitor.confirmation import Confirmation, steps
+from sst_graph.tracker.sums.scan_scores import PairScore, SideSums
+from sst_graph.tracker.sums.score_sums import ScoreSums, fit_sides
+from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
+
+FloatArray = NDArray[np.float64]
+N = 9
+
+
+def _belief(seed: int) -> Gaussian:
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((20, N))
+    point = Point(gtsam.Pose3.Expmap(0.3 * rng.standard_normal(6)), 0.1, rng.standard_normal(2))
+    return Gaussian(point, A.T @ A, rng.standard_normal(N))
+
+
+def test_local_and_moved_are_inverse() -> None:
+    a, step = _belief(1).point, np.linspace(-0.2, 0.3, N)
+    np.testing.assert_allclose(a.local(a.moved(step)), step, atol=1e-12)
+
+
+def test_the_factor_is_the_belief() -> None:
+    belief, keys = _belief(2), [7, 3, 5, 11]
+    factor = pickle.loads(pickle.dumps(belief.factor(keys)))
+    graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
+    graph.add(factor)
+    insert_point(values, keys, belief.point)
+    for key in keys:
+        ordering.push_back(key)
+    H, g = graph.linearize(values).hessian(ordering)
+    np.testing.assert_allclose(H, belief.information, atol=1e-9)
+    np.testing.assert_allclose(g, belief.vector, atol=1e-9)
+    optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
+    assert optimum.atVector(3)[0] == pytest.approx(belief.mean().offset_s, abs=1e-6)
+
+
+def test_a_random_walk_adds_its_variance() -> None:
+    belief, variances = _belief(3), np.linspace(0.0, 0.4, N)
+    after = belief.drifted(variances)
+    expected = np.linalg.inv(belief.information) + np.diag(variances)
+    np.testing.assert_allclose(np.linalg.inv(after.information), expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.linalg.solve(after.information, after.vector), np.linalg.solve(belief.information, belief.vector)
+    )
+
+
+def test_beliefs_add_at_one_point() -> None:
+    a, b = _belief(4), _belief(5)
+    b = Gaussian(a.point.moved(np.full(N, 1e-3)), b.information, b.vector)
+    both = a.plus(b)
+    H = a.information + b.information
+    expected = np.linalg.solve(H, a.vector + b.vector + b.information @ np.full(N, 1e-3))
+    np.testing.assert_allclose(np.linalg.solve(both.information, both.vector), expected, atol=1e-9)
+
+
+def test_error_model_of_simulated_sides() -> None:
+    """Known variances of side, side in a frame, and match come back, though a bias an object was fitted."""
+    rng = np.random.default_rng(0)
+    rows = []
+    shared = rng.normal(0.0, 0.6, (100, 4))
+    shared = (shared - shared.mean(axis=1, keepdims=True)).ravel()
+    for side in range(400):
+        for _ in range(8):
+            r = shared[side] + rng.normal(0.0, 0.4) + rng.normal(0.0, 0.9, 12)
+            rows.append([side, r.mean(), 12.0, 12.0, ((r - r.mean()) ** 2).sum(), 1.0])
+    model = fit_sides(np.array(rows))
+    found = np.sqrt([model.side, model.side_frame, model.match])
+    np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)  # floors: 0.36, 0.32
+
+
+def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
+    """A pair of 200 matches on four sides whose residuals follow the error model (0.25, 0, 1)."""
+    J = rng.standard_normal((200, N))
+    which = np.repeat(np.arange(4), 50)
+    r = -J @ truth + rng.standard_normal(200) + 0.5 * rng.standard_normal(4)[which]
+    scores = np.zeros((4, N))
+    np.add.at(scores, which, J)
+    ones, fifty = np.ones(4), np.full(4, 50.0)
+    sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
+    point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
+    belief = Gaussian(point, J.T @ J, -J.T @ r)
+    return PairScore(belief, belief, J.T @ J, sides, scores.T @ scores, 200)
+
+
+def _model() -> ErrorModel:
+    return ErrorModel(0.25, 0.0, 1.0)
+
+
+def _chi2(scores: list[PairScore], joint: Joint) -> float:
+    return Comparison.of(scores, joint, _model(), 0.0).chi2()
+
+
+def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
+    rng, P = np.random.default_rng(1), 1e-3 * np.eye(N)
+    values = [
+        _chi2([_score(rng, x, 4 * k) for k in range(3)], Joint(P, (), N))
+        for x in rng.multivariate_normal(np.zeros(N), P, 300)
+    ]
+    assert np.mean(values) == pytest.approx(N, rel=0.12)
+    assert np.quantile(values, 0.95) == pytest.approx(16.9, rel=0.15)  # chi-square with 9 degrees
+
+
+def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
+    rng, P = np.random.default_rng(2), 1e-4 * np.eye(N)
+    alarm = StepAlarm(AlarmConfig(warm_up=5))
+    for k in range(200):
+        alarm.check([_score(rng, np.zeros(N), 4 * k)], Joint(P, (), N), _model())
+        assert not alarm.alarm
+    step = np.full(N, 0.3)
+    raised = [
+        k
+        for k in range(10)
+        if alarm.check([_score(rng, step, 9000 + 4 * k)], Joint(P, (), N), _model()) and alarm.alarm
+    ]
+    assert raised and raised[0] < 8
+
+
+def test_steps_that_would_be_seen_are_told_before_they_come() -> None:
+    """What a step is said to make is what frames with that step make, beyond the noise."""
+    rng = np.random.default_rng(5)
+    tried = np.zeros((7, 2))
+    tried[1, 0], tried[6, 1] = 0.02, 0.3
+    scores = [_score(rng, np.zeros(N), 4 * k) for k in range(4)]
+    exact = Joint(np.zeros((N, N)), (), N)
+    alarm = StepAlarm(AlarmConfig())
+    compared = alarm.compare(scores, exact, _model())
+    small, large = compared.chi2_of(tried)
+    assert small < 5.0 < 50.0 < large
+    assert alarm.shown(compared, tried).tolist() == [False, True]
+    stepped = [_score(rng, np.append(tried[:, 1], [0.0, 0.0]), 4 * k) for k in range(4)]
+    assert _chi2(stepped, exact) == pytest.approx(large + N, rel=0.3)
+
+
+def test_what_is_confirmed_is_told_apart() -> None:
+    found, T = Confirmation(), gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, 0.3]))
+    found.suspects.add(3)
+    found.wait(2.0, moving=True)
+    found.wait(1.0, moving=False)
+    assert (found.turn_s, found.offset_s) == (3.0, 2.0)
+    found.take(np.array([True, False, True]))
+    assert (found.turn_s, found.offset_s) == (3.0, 0.0) and found.suspects
+    found.wait(2.0, moving=True)
+    found.take(np.array([True, True, False]))
+    assert (found.turn_s, found.offset_s) == (0.0, 2.0) and not found.suspects
+    turned = T.retract(steps(T, 0.01, 0.02)[:6, 1])
+    assert turned.equals(gtsam.Pose3(gtsam.Rot3.Ry(0.01), np.zeros(3)) * T, 1e-9)
+    assert steps(T, 0.01, 0.02)[6].tolist() == [0.0, 0.0, 0.02]
+
+
+def test_settings_out_of_range() -> None:
+    with pytest.raises(ValueError, match="window"):
+        TrackerConfig(window=5)
+    with pytest.raises(ValueError, match="chi2"):
+        AlarmConfig(chi2=0.0)
+    with pytest.raises(ValueError, match="patience"):
+        AlarmConfig(frames=4, patience=3)
+
+
+def test_a_direction_without_information_raises_nothing() -> None:
+    """At standstill the score of the time offset is rounding only."""
+    rng = np.random.default_rng(3)
+    score = _score(rng, np.zeros(N), 0)
+    information, vector, JJ = score.belief.information.copy(), score.belief.vector.copy(), score.JJ.copy()
+    rows = score.sides.scores.copy()
+    for array in (information, JJ):
+        array[6, :] = array[:, 6] = 0.0
+    rows[:, 6], vector[6], information[6, 6] = 0.0, 1e-15, 1e-20
+    belief = Gaussian(score.belief.point, information, vector)
+    still = dataclasses.replace(
+        score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
+    )
+    assert _chi2([still], Joint(1e-6 * np.eye(N), (), N)) < 40.0
+
+
+def test_objects_come_and_go_without_loss() -> None:
+    """Marginalized out one by one, objects leave what the whole problem says, and how surely."""
+    rng, belief, sigma = np.random.default_rng(4), _belief(6), 0.5
+    whole = belief.with_objects({40: 0, 41: 1, 42: 0}, sigma)
+    assert whole.point.tracks == (40, 41, 42) and whole.point.size == N + 3
+    np.testing.assert_allclose(whole.core().information, belief.information, atol=1e-9)
+    np.testing.assert_allclose(whole.core().vector, belief.vector, atol=1e-9)
+    A = rng.standard_normal((30, N + 2))
+    seen = belief.point.seen({42: 0, 40: 0})
+    whole = whole.plus(Gaussian(seen, A.T @ A, rng.standard_normal(N + 2)))
+    S = np.cov(rng.standard_normal((N + 3, 50)))
+    rows = np.linalg.inv(whole.information)
+    first, T = whole.without([41])
+    last, U = first.without([42, 40])
+    assert last.point.tracks == ()
+    np.testing.assert_allclose(np.linalg.inv(last.information), rows[:N, :N], atol=1e-9)
+    expected = (rows @ whole.vector)[:N]
+    np.testing.assert_allclose(np.linalg.solve(last.information, last.vector), expected, atol=1e-9)
+    robust = np.linalg.inv(last.information)
+    robust = robust @ (U @ T @ S @ T.T @ U.T) @ robust
+    np.testing.assert_allclose(robust, (rows @ S @ rows)[:N, :N], atol=1e-9)
+
+
+def test_score_sums_follow_the_objects() -> None:
+    rng = np.random.default_rng(5)
+    score, sums, model = _score(rng, np.zeros(N), 0), ScoreSums.empty(N), ErrorModel(0.25, 0.1, 2.0)
+    columns = np.arange(N)
+    sums.add(score, columns, 0)
+    expected = sums.surplus([], [], model)
+    sums.grow(N + 2)
+    grown = sums.surplus([], [], model)
+    np.testing.assert_allclose(grown[:N, :N], expected)
+    assert not grown[N:].any()
+    # A pair counts the same in the window as when it has left it.
+    again = _score(rng, np.zeros(N), 2)
+    both = sums.surplus([again], [columns], model)
+    sums.add(again, columns, 1)
+    np.testing.assert_allclose(sums.surplus([], [], model), both, rtol=1e-9)
+    T = rng.standard_normal((N, N + 2))
+    sums.transform(T)
+    np.testing.assert_allclose(sums.surplus([], [], model), T @ both @ T.T, rtol=1e-9)
+
+
+def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
+    P = np.diag(np.arange(1.0, N + 3.0))
+    found = Joint(P, (7, 9), N).seeing({9: 0, 12: 1}, 0.5)
+    assert found.shape == (N + 2, N + 2)
+    assert found[N, N] == P[N + 1, N + 1]
+    assert found[N + 1, N + 1] == P[8, 8] + 0.25 and found[8, N + 1] == P[8, 8]
+
+
+def test_a_worse_candidate_is_refused() -> None:
+    """A covariance within the limits, and held-out costs that are no worse, over enough frames."""
+    good, bad = _belief(1).point, _belief(2).point
+    adoption = Adoption(AdoptionConfig(held_out=5, margin=0.02))
+    for _ in range(4):
+        adoption.compare(1.0, 2.0)
+    assert not adoption.offer(good, trusted=True)  # too few frames
+    adoption.compare(1.0, 2.0)
+    assert not adoption.offer(good, trusted=False)  # a covariance past the limits
+    assert adoption.offer(good, trusted=True) and adoption.adopted is good
+    adoption.restart()
+    for _ in range(5):
+        adoption.compare(1.1, 1.0)  # a confident candidate that explains held-out frames worse
+    assert not adoption.offer(bad, trusted=True) and adoption.adopted is good
+    for _ in range(5):
+        adoption.compare(1.01, 1.0)
+    assert adoption.offer(bad, trusted=True) and adoption.adopted is bad

@@ -1,0 +1,219 @@
+"""The tracker on a short simulated drive: start, refusals, retirement, checkpoint."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from streets import EARLY_START, sigmas_apart, tracker_from_truth
+
+from sst_graph import Tracker
+from sst_graph.covariance.cluster_robust import robust_covariance
+from sst_graph.errors import DataError, EstimationError
+from sst_graph.graph.building import Tracks, associate, joint_graph, state_from
+from sst_graph.inspect.gained import gained_of
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.result import CalibrationResult
+from sst_graph.simulator import SimulatedDrive
+from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.window.epochs import Found
+from sst_graph.types import Frame
+
+
+@pytest.fixture(scope="module")
+def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoint of a tracker after 20 frames."""
+    tracker = tracker_from_truth(street)
+    for frame in frames[:20]:
+        tracker.add(frame)
+    assert tracker.started
+    path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
+    save_checkpoint(tracker, path)
+    return path
+
+
+def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[Frame]) -> None:
+    tracker = Tracker(street.camera, EARLY_START, street.nominal)
+    updates = [tracker.add(frame) for frame in frames]
+    assert updates[0].status == "starting" and not updates[0].accepted
+    assert updates[0].sigmas[6] == 1.0
+    assert updates[-1].accepted and updates[-1].status in ("ok", "unobservable")
+    assert updates[-1].sigmas[6] < 0.02
+    assert not any(update.alarm for update in updates)
+    assert (
+        sigmas_apart(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+    )  # chi-square of 7: 24
+
+
+def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Of the same matches: those towards the ground included, where the tracker makes any."""
+    tracker = tracker_from_truth(street)
+    for frame in frames[:20]:
+        tracker.add(frame)
+    tracker.settle()
+    drive, _ = tracker.window.drive()
+    state, config = tracker.point.state(tracker.classes), tracker.matcher.graph
+    tracks = object_tracks(drive)
+    kernel = tracker.matcher.kernel
+    pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, config)
+    graph, values = joint_graph(pairs, state, config)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    state = state_from(values, state, pairs)
+    expected = robust_covariance(graph, values, pairs, state, [tracks]).matrix
+    ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
+    np.testing.assert_allclose(ratio, 1.0, atol=0.02)
+
+
+def test_the_result_tells_what_each_scan_brought(running: Path) -> None:
+    tracker = load_checkpoint(running)
+    gained = gained_of(CalibrationResult.from_json(tracker_result(tracker, "drive").to_json()))
+    assert gained is not None and gained.kind == "as they came"
+    first, *rest = gained.gains
+    assert first.bits is None and len(rest) > 5
+    assert sum(gain.bits or 0.0 for gain in rest) > 3.0
+    np.testing.assert_allclose(rest[-1].values, tracker.current().sigmas, rtol=1e-3)
+
+
+def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
+    whole, short = (
+        tracker_from_truth(street),
+        tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10)),
+    )
+    for frame in frames:
+        whole.add(frame)
+        short.add(frame)
+    assert short.smoother is not None and whole.smoother is not None
+    assert len(short.smoother.entries) <= 10 < len(whole.smoother.entries)
+    assert sigmas_apart(whole, short.point.cTl, short.point.offset_s) < 2.5
+    ratio = np.sqrt(np.diag(short.covariance) / np.diag(whole.covariance))
+    assert ratio.min() > 0.7 and ratio.max() < 1.5
+
+
+def test_bad_frames_leave_the_estimate(running: Path, frames: list[Frame]) -> None:
+    tracker, good = load_checkpoint(running), frames[20]
+    before = tracker.point
+    assert good.scan is not None and good.image is not None
+    points = good.scan.points.copy()
+    points[3, 1] = np.nan
+    wrong = [
+        (Frame(20, None, None), "without scan and without image"),
+        (Frame(20, dataclasses.replace(good.scan, stamp_ns=frames[3].scan.stamp_ns), None), "one after"),
+        (Frame(20, dataclasses.replace(good.scan, points=points), None), "NaN"),
+        (Frame(20, None, dataclasses.replace(good.image, mask=good.image.mask[:9])), "camera's size"),
+        (Frame(20, None, frames[19].image), "second image"),
+    ]
+    for frame, message in wrong:
+        update = tracker.add(frame)
+        assert not update.accepted and message in update.reason
+        assert tracker.point is before
+    assert tracker.add(good).accepted
+
+
+def test_images_and_scans_at_their_own_rates(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Every other image missing, and one late: all scans are used or say why."""
+    tracker = tracker_from_truth(street)
+    late = frames[10].image
+    for frame in frames:
+        if frame.index % 2 == 0 and frame.index != 10:
+            assert tracker.add_image(frame.image).accepted
+        update = tracker.add_scan(frame.scan)
+        if frame.index == 12:
+            assert tracker.add_image(late).accepted
+    assert update.accepted
+    assert sigmas_apart(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+
+
+def test_gaps_and_half_as_many_scans(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """Scans at half the images' rate, and a second in which nothing comes."""
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=6, restart_scans=6))
+    for frame in frames:
+        if 20 <= frame.index < 29:
+            continue
+        scan = frame.scan if frame.index % 2 == 0 else None
+        update = tracker.add(Frame(frame.index, scan, frame.image))
+    assert tracker.started and update.status in ("ok", "unobservable")
+    assert sigmas_apart(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
+
+
+def test_what_comes_too_late_or_out_of_order_is_refused(running: Path, frames: list[Frame]) -> None:
+    """An image that is late but not too late is sorted in; older ones, and any older scan, are refused."""
+    tracker = load_checkpoint(running)
+    before, images = tracker.point, [image.stamp_ns for image in tracker.window.images]
+    old = frames[1].image
+    assert old is not None and frames[10].scan is not None and frames[19].image is not None
+    update = tracker.add_image(dataclasses.replace(old, stamp_ns=old.stamp_ns + 7))
+    assert not update.accepted and "behind the newest scan" in update.reason and "1.5 s" in update.reason
+    update = tracker.add_scan(frames[10].scan)
+    assert not update.accepted and "one after" in update.reason
+    assert tracker.point is before and [image.stamp_ns for image in tracker.window.images] == images
+    between = dataclasses.replace(frames[19].image, stamp_ns=frames[19].image.stamp_ns - 30_000_000)
+    assert tracker.add_image(between).accepted
+    stamps = [image.stamp_ns for image in tracker.window.images]
+    assert between.stamp_ns in stamps and stamps == sorted(stamps)
+
+
+def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]) -> None:
+    tracker = load_checkpoint(running)
+    smoother = tracker.smoother
+    assert smoother is not None
+    scan, entry = next(iter(smoother.entries.items()))
+    assert entry.pair.l_twist is not None
+    broken = dataclasses.replace(entry.pair.l_twist, covariance=-np.eye(6))
+    pair = dataclasses.replace(entry.pair, l_twist=broken)
+    before, entries = smoother.point, dict(smoother.entries)
+    with pytest.raises(EstimationError, match="covariance"):
+        smoother.update({scan: Found(pair, entry.score, 0, entry.image)}, set(), 0)
+    assert smoother.point is before and smoother.entries == entries
+    assert tracker.add(frames[20]).accepted
+
+
+def test_a_checkpoint_resumes_to_the_same_estimates(
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
+) -> None:
+    kept = tracker_from_truth(street)
+    for frame in frames[:20]:
+        kept.add(frame)
+    save_checkpoint(kept, tmp_path / "tracker.npz")
+    resumed = load_checkpoint(tmp_path / "tracker.npz")
+    assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
+    assert resumed.point.offset_s == kept.point.offset_s
+    np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)
+    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.undersides
+    for (_, a), (_, b) in zip(resumed.window.scans, kept.window.scans, strict=True):
+        assert {c: len(points) for c, points in a.undersides.items()} == {
+            c: len(points) for c, points in b.undersides.items()
+        }
+    for frame in frames[20:]:
+        kept.add(frame)
+        resumed.add(frame)
+        assert sigmas_apart(kept, resumed.point.cTl, resumed.point.offset_s) < 1e-5
+    np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-5)
+    assert resumed.watch.alarm.recent and resumed.watch.alarm.usual == pytest.approx(kept.watch.alarm.usual)
+
+
+def test_saving_hardly_moves_what_follows(
+    street: SimulatedDrive, frames: list[Frame], tmp_path: Path
+) -> None:
+    """It relinearizes: a further Gauss-Newton step, which the frames to come would have brought, too."""
+    saved, unsaved = tracker_from_truth(street), tracker_from_truth(street)
+    for k, frame in enumerate(frames):
+        saved.add(frame)
+        unsaved.add(frame)
+        if k % 10 == 9:
+            before = saved.point
+            save_checkpoint(saved, tmp_path / "tracker.npz")
+            assert saved.point is before
+    assert sigmas_apart(unsaved, saved.point.cTl, saved.point.offset_s) < 0.2
+
+
+def test_a_broken_checkpoint_is_named(tmp_path: Path, running: Path) -> None:
+    with pytest.raises(DataError, match="no such file"):
+        load_checkpoint(tmp_path / "none.npz")
+    half = tmp_path / "half.npz"
+    half.write_bytes(running.read_bytes()[:5000])
+    with pytest.raises(DataError, match=r"half\.npz: found no readable checkpoint"):
+        load_checkpoint(half)

@@ -1,0 +1,122 @@
+"""Overlays: what is drawn where."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
+from sst_graph.viz import Placement, before_after, draw_overlay
+from sst_graph.viz.overlay import CONTOUR, IN_MASK, MIN_WIDTH_PX, NOT_ASKED, OUT_OF_MASK
+
+CAMERA = PinholeCamera(500.0, 500.0, 400.0, 100.0, 800, 200)
+WHERE = gtsam.Pose3()
+"""The scan is given in the camera's own axes here."""
+
+
+def _frame(points: list[list[float]], classes: list[int], **scan: object) -> Frame:
+    mask = np.zeros((200, 800), np.uint8)
+    mask[80:121, 380:421] = SemanticClass.VEHICLE
+    mask[:, 700:] = SemanticClass.IGNORE
+    picture = np.full((200, 800, 3), 120, np.uint8)
+    values = {"stamp_ns": 10**9, **scan}
+    return Frame(
+        7,
+        Scan(points=np.array(points, np.float32), classes=np.array(classes, np.uint8), **values),  # type: ignore[arg-type]
+        CameraImage(10**9, mask, picture),
+    )
+
+
+def _pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> set[tuple[int, int]]:
+    """(u, v) of the pixels of this colour in the image below the strip."""
+    image = picture[len(picture) - 200 :]
+    return {(int(u), int(v)) for v, u in np.argwhere((image == colour).all(axis=2))}
+
+
+def test_vehicle_points_are_green_inside_and_red_outside_the_mask() -> None:
+    frame = _frame([[0, 0, 10], [2, 0, 10], [0, 1, 10]], [SemanticClass.VEHICLE] * 2 + [SemanticClass.GROUND])
+    picture = draw_overlay(frame, CAMERA, WHERE, 0.0)
+    assert _pixels_of(picture, IN_MASK) == {(400, 100), (401, 100), (400, 101), (401, 101)}
+    assert _pixels_of(picture, OUT_OF_MASK) == {(500, 100), (501, 100), (500, 101), (501, 101)}
+
+
+def test_the_contour_follows_the_picture_and_is_dark_where_it_shows_nothing() -> None:
+    """The object is drawn two pixels inside its mask's left side, and has no lower side to be seen."""
+    frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
+    assert frame.image is not None
+    pixels = frame.image.pixels.copy()
+    pixels[80:, 382:421] = 220
+    picture = draw_overlay(replace(frame, image=replace(frame.image, pixels=pixels)), CAMERA, WHERE, 0.0)
+    found, dark = _pixels_of(picture, CONTOUR), _pixels_of(picture, NOT_ASKED)
+    assert {u for u, v in found if v == 100} == {382, 420}
+    assert {u for u, v in dark if v == 120} >= set(range(390, 410)) and not any(v < 110 for _, v in dark)
+
+
+def test_points_behind_or_beside_the_image_are_left_out() -> None:
+    frame = _frame([[0, 0, -10], [20, 0, 10], [np.float32(6.4), 0, 10]], [SemanticClass.VEHICLE] * 3)
+    picture = draw_overlay(frame, CAMERA, WHERE, 0.0)
+    assert _pixels_of(picture, IN_MASK) == set()
+    # The third falls where the mask says nothing: neither right nor wrong.
+    assert _pixels_of(picture, OUT_OF_MASK) == set()
+
+
+def test_a_camera_driving_forward_sees_points_nearer() -> None:
+    # tau = offset = 0.2 s at 10 m/s: the point at 10 m is seen at 8 m, u = 400 + 500 * 0.16 / 8 = 410.
+    frame = _frame([[0.16, 0, 10]], [SemanticClass.VEHICLE])
+    c_twist = np.array([0, 0, 0, 0, 0, 10.0])
+    assert (410, 100) in _pixels_of(draw_overlay(frame, CAMERA, WHERE, 0.2, c_twist), IN_MASK)
+    assert (408, 100) in _pixels_of(draw_overlay(frame, CAMERA, WHERE, 0.2), IN_MASK)
+
+
+def test_points_are_moved_from_their_own_times() -> None:
+    # Offsets of -0.1 and +0.1 s within the sweep: tau = 0.2 and 0 s.
+    frame = _frame(
+        [[0.16, 0, 10], [-0.16, 0, 10]],
+        [SemanticClass.VEHICLE] * 2,
+        offsets_s=np.array([-0.1, 0.1], np.float32),
+    )
+    c_twist = np.array([0, 0, 0, 0, 0, 10.0])
+    drawn = _pixels_of(draw_overlay(frame, CAMERA, WHERE, 0.1, c_twist), IN_MASK)
+    assert {(410, 100), (392, 100)} <= drawn and (390, 100) not in drawn
+
+
+def test_the_image_stamp_counts() -> None:
+    frame = _frame([[0.16, 0, 10]], [SemanticClass.VEHICLE])
+    assert frame.image is not None
+    later = replace(frame, image=replace(frame.image, stamp_ns=10**9 + 2 * 10**8))
+    picture = draw_overlay(later, CAMERA, WHERE, 0.0, np.array([0, 0, 0, 0, 0, 10.0]))
+    assert (410, 100) in _pixels_of(picture, IN_MASK)
+
+
+def test_before_stands_above_after() -> None:
+    frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
+    aside = gtsam.Pose3(gtsam.Rot3(), [2.0, 0.0, 0.0])
+    picture = before_after(frame, CAMERA, Placement(aside, 0.0, "before"), Placement(WHERE, 0.0, "after"))
+    rows_red = np.argwhere((picture == OUT_OF_MASK).all(axis=2)[:, 500])[:, 0]
+    rows_green = np.argwhere((picture == IN_MASK).all(axis=2)[:, 400])[:, 0]
+    assert rows_red.max() < len(picture) / 2 < rows_green.max()
+
+
+def test_small_pictures_are_enlarged() -> None:
+    camera = PinholeCamera(7.0, 7.0, 4.0, 3.0, 8, 6)
+    image = CameraImage(0, np.zeros((6, 8), np.uint8), np.zeros((6, 8, 3), np.uint8))
+    frame = Frame(0, Scan(0, np.zeros((0, 3), np.float32), np.zeros(0, np.uint8)), image)
+    assert draw_overlay(frame, camera, WHERE, 0.0).shape[1] >= MIN_WIDTH_PX
+
+
+@pytest.mark.parametrize("missing", ["scan", "image"])
+def test_half_a_frame_cannot_be_drawn(missing: str) -> None:
+    frame = replace(_frame([[0, 0, 10]], [SemanticClass.VEHICLE]), **{missing: None})
+    with pytest.raises(DataError, match=f"frame 7: found no {missing}"):
+        draw_overlay(frame, CAMERA, WHERE, 0.0)
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    frame = _frame([[0, 0, 10]], [SemanticClass.VEHICLE])
+    with pytest.raises(DataError, match="found an image of 800x200, expected 640x200"):
+        draw_overlay(frame, replace(CAMERA, width=640), WHERE, 0.0)
