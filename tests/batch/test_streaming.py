@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from streets import standing_street
 
-from sst_graph import open_source, shelf
+from sst_graph import open_source
 from sst_graph.batch import CalibrationConfig, prepare_drives
 from sst_graph.cli.outputs import write_calibration
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files import array_store as shelf
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.types import Frame, SemanticClass

@@ -119,7 +119,8 @@ def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, told: 
     [
         (np.full(20, 15.0), None),
         (np.linspace(20.0, 5.0, 20), None),  # 8 m/s^2: hard braking
-        (np.linspace(28.0, 0.5, 20), "accelerations of 14 m/s2"),
+        (np.linspace(28.0, 0.5, 20), None),  # 14 m/s^2: a simulated drive may brake so
+        (np.linspace(48.0, 0.5, 20), "accelerations of 25 m/s2"),
         (np.full(20, 65.0), "a speed of 65 m/s"),
         (np.where(np.arange(20) == 7, 90.0, 15.0), None),  # one failed registration
     ],
