@@ -502,6 +502,10 @@ def cases(inputs: Path, seed: int, numbers: list[tuple[int, str]]) -> Iterator[C
                 case = ours.recv()
                 todo.pop(0)
                 yield case
+        except GeneratorExit:  # no more cases are asked for; else the worker would wait for a reader for ever
+            worker.kill()
+            worker.join()
+            raise
         except EOFError:
             worker.join()
             number, kind = todo.pop(0)
