@@ -51,28 +51,28 @@ if TYPE_CHECKING:
         pixel_to_point_factor,
         point_to_pixel_factor,
         residuals,
+        silhouette_factor,
         weighted_residuals,
     )
     from .camera import MIN_DEPTH_M, PinholeCamera
     from .camera_motion import Between, camera_motion_factor
-    from .check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
-    from .cloning import GncParams, GncSolution, PackedGraph, clone_factor, clone_graph, gnc, rekeyed
     from .condensed import condense
-    from .custom import FactorRecipe, custom_factor, recipe_of
-    from .delay import extrinsic_drift, time_offset_drift, time_offset_prior
+    from .custom.cloning import PackedGraph, clone_factor, clone_graph, rekeyed
+    from .custom.factor import FactorRecipe, custom_factor, recipe_of
+    from .custom.gnc import GncParams, GncSolution, gnc
+    from .custom.jacobian_check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
+    from .custom.variables import Kind, Vector
     from .errors import FactorError
     from .hand_eye import hand_eye_factor, rotation_hand_eye
     from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
-    from .regularizer import beta_regularizer
+    from .pose_alignment import pose_alignment_factor
+    from .priors import beta_regularizer, extrinsic_drift, time_offset_drift, time_offset_prior
     from .robust import KernelKind, RobustKernel
-    from .silhouette import silhouette_factor
-    from .slam import pose_alignment_factor
-    from .twist_transfer import twist_transfer_factor
-    from .variables import Kind, Vector
     from .velocity import (
         mean_velocity_factor,
         twist_jerk_factor,
         twist_smoothness_factor,
+        twist_transfer_factor,
         velocity_direction_factor,
         velocity_factor,
     )
@@ -131,63 +131,36 @@ __all__ = [
     "weighted_residuals",
 ]
 
-_HOMES = {
-    "Alignment": "alignment",
-    "Between": "camera_motion",
-    "FactorError": "errors",
-    "FactorRecipe": "custom",
-    "GncParams": "cloning",
-    "GncSolution": "cloning",
-    "GroupedBias": "alignment",
-    "JacobianBlock": "check",
-    "JacobianReport": "check",
-    "KernelKind": "robust",
-    "Kind": "variables",
-    "LinearTerm": "alignment",
-    "MIN_DEPTH_M": "camera",
-    "MotionModel": "motion",
-    "PackedGraph": "cloning",
-    "PinholeCamera": "camera",
-    "PointwiseMoved": "motion",
-    "RigidlyMoved": "motion",
-    "RobustKernel": "robust",
-    "Vector": "variables",
-    "alignment_cost": "alignment",
-    "beta_regularizer": "regularizer",
-    "camera_motion_factor": "camera_motion",
-    "check_gradient": "check",
-    "check_jacobians": "check",
-    "clone_factor": "cloning",
-    "clone_graph": "cloning",
-    "condense": "condensed",
-    "custom_factor": "custom",
-    "time_offset_drift": "delay",
-    "time_offset_prior": "delay",
-    "extrinsic_drift": "delay",
-    "frame_factor": "alignment",
-    "gnc": "cloning",
-    "hand_eye_factor": "hand_eye",
-    "mean_velocity_factor": "velocity",
-    "move_points": "motion",
-    "pixel_to_point_factor": "alignment",
-    "point_to_pixel_factor": "alignment",
-    "pose_alignment_factor": "slam",
-    "recipe_of": "custom",
-    "rekeyed": "cloning",
-    "residuals": "alignment",
-    "rotation_hand_eye": "hand_eye",
-    "silhouette_factor": "silhouette",
-    "twist_jerk_factor": "velocity",
-    "twist_smoothness_factor": "velocity",
-    "twist_transfer_factor": "twist_transfer",
-    "velocity_direction_factor": "velocity",
-    "velocity_factor": "velocity",
-    "weighted_residuals": "alignment",
+_MODULES = {
+    "alignment": (
+        "Alignment GroupedBias LinearTerm alignment_cost frame_factor pixel_to_point_factor "
+        "point_to_pixel_factor residuals silhouette_factor weighted_residuals"
+    ),
+    "camera": "MIN_DEPTH_M PinholeCamera",
+    "camera_motion": "Between camera_motion_factor",
+    "condensed": "condense",
+    "custom.cloning": "PackedGraph clone_factor clone_graph rekeyed",
+    "custom.factor": "FactorRecipe custom_factor recipe_of",
+    "custom.gnc": "GncParams GncSolution gnc",
+    "custom.jacobian_check": "JacobianBlock JacobianReport check_gradient check_jacobians",
+    "custom.variables": "Kind Vector",
+    "errors": "FactorError",
+    "hand_eye": "hand_eye_factor rotation_hand_eye",
+    "motion": "MotionModel PointwiseMoved RigidlyMoved move_points",
+    "pose_alignment": "pose_alignment_factor",
+    "priors": "beta_regularizer extrinsic_drift time_offset_drift time_offset_prior",
+    "robust": "KernelKind RobustKernel",
+    "velocity": (
+        "mean_velocity_factor twist_jerk_factor twist_smoothness_factor twist_transfer_factor "
+        "velocity_direction_factor velocity_factor"
+    ),
 }
+"""The public names of each module."""
+_HOMES = {name: module for module, names in _MODULES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for when it is asked for: the exceptions alone need no gtsam."""
+    """Import what is asked for when it is asked for: the exceptions need neither gtsam nor NumPy."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"sst_graph.factors.{_HOMES[name]}"), name)

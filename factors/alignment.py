@@ -12,20 +12,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import accumulate, pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import checked_array, described
 from .condensed import condense, condense_root, cost_rows
-from .custom import custom_factor
-from .errors import FactorError, checked_array, described
+from .custom.factor import custom_factor
+from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
+from .errors import FactorError
 from .matches import Alignment
 from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
-from .variables import Kind, Vector, checked_key, dimension, is_key, key_name, number_or_key, pose_or_key
 
 __all__ = [
     "Alignment",
@@ -36,6 +35,7 @@ __all__ = [
     "pixel_to_point_factor",
     "point_to_pixel_factor",
     "residuals",
+    "silhouette_factor",
     "weighted_residuals",
 ]
 
@@ -108,6 +108,30 @@ def pixel_to_point_factor(
     return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)
 
 
+def silhouette_factor(
+    alignment: Alignment,
+    cTl: int | gtsam.Pose3,
+    offset_s: int | float = 0.0,
+    c_twist: int | FloatArray | None = None,
+    bias_px: int | float | None = None,
+    *,
+    condensed: bool = True,
+) -> gtsam.CustomFactor:
+    """r_i = n_i . (uv(cP_i) - q_i) + bias: signed distance to the true outline [px].
+
+    q_i is the contour's point nearest to the predicted pixel and n_i its outward unit normal; frozen,
+    they are the contour's tangent line. ``bias_px`` is how far a class's masks reach outside the true
+    outline (dilation positive): the outline lies that far inside the contour. The arguments are those of
+    :func:`sst_graph.factors.frame_factor`.
+
+    Raises:
+        FactorError: the alignment has no normals.
+    """
+    if alignment.normals is None:
+        raise FactorError("alignment of a silhouette", "no normals", "unit normals (n, 2)")
+    return frame_factor([alignment], cTl, offset_s, c_twist, bias_px, condensed=condensed)
+
+
 def _require_points(alignment: Alignment) -> None:
     if alignment.normals is not None:
         raise FactorError("alignment", "normals", "none: silhouettes have silhouette_factor")
@@ -123,7 +147,7 @@ def frame_factor(
     terms: Sequence[Sequence[LinearTerm]] | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
-    """All alignments of one image as one factor.
+    """1/2 |error|^2 = sum_i weight_i rho(|r_i| / sigma_i), r_i of all alignments of one image [px].
 
     Args:
         alignments: one or more, over the same image (one twist).
@@ -143,9 +167,15 @@ def frame_factor(
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
     frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px, terms)
-    rows = frame.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
+    rows = row_count(frame.variables, alignments, condensed)
     function = _FrameError(frame, condensed, rows)
-    return custom_factor(gtsam.noiseModel.Unit.Create(rows), frame.named, function, frame.kinds, rows, _NAME)
+    noise = gtsam.noiseModel.Unit.Create(rows)
+    return custom_factor(noise, frame.variables.named, function, frame.variables.kinds, rows, _NAME)
+
+
+def row_count(variables: Variables, alignments: Sequence[Alignment], condensed: bool) -> int:
+    """Rows of a factor: one more than [J r] has columns, or one more than its matches have rows."""
+    return variables.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
 
 
 @dataclass(frozen=True)
@@ -163,7 +193,7 @@ class _FrameError:
                 values
             ), None
         error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
-        return error, [J[:, start:end] for start, end in frame.bounds]
+        return error, frame.variables.blocks(J)
 
 
 @dataclass(frozen=True)
@@ -223,33 +253,17 @@ class _Part:
 
 @dataclass(frozen=True)
 class FrameResidual:
-    """The frozen data behind a frame's factor; ``values`` are those of ``keys``, in their order."""
+    """The frozen data behind a frame's factor; ``values`` are those of the variables, in their order."""
 
     parts: tuple[_Part, ...]
     cTl: _Source
     offset_s: _Source
     c_twist: _Source
-    keys: tuple[int, ...]
-    kinds: tuple[Kind, ...]
-    names: tuple[str, ...]
-
-    @cached_property
-    def dims(self) -> tuple[int, ...]:
-        return tuple(dimension(kind) for kind in self.kinds)
-
-    @cached_property
-    def bounds(self) -> list[tuple[int, int]]:
-        """Where each variable's columns begin and end."""
-        return list(pairwise(accumulate(self.dims, initial=0)))
-
-    @property
-    def named(self) -> dict[str, int]:
-        """Keys by the argument that each came as."""
-        return dict(zip(self.names, self.keys, strict=True))
+    variables: Variables
 
     @property
     def cols(self) -> int:
-        return sum(self.dims)
+        return self.variables.cols
 
     def _state(self, values: Sequence[Any]) -> tuple[gtsam.Pose3, float, FloatArray]:
         return self.cTl.value(values), _scalar(self.offset_s.value(values)), self.c_twist.value(values)
@@ -327,36 +341,48 @@ def frame_residual(
         if alignment.c_acceleration.ndim > 1:
             found = f"shape {alignment.c_acceleration.shape}"
             raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")
-    variables = _Variables(name)
-    pose = variables.source("cTl", pose_or_key(name, "cTl", cTl), gtsam.Pose3)
-    offset = variables.source("offset_s", number_or_key(name, "offset_s", offset_s), Vector(1))
-    twist = variables.source("c_twist", _twist_or_key(name, c_twist), Vector(6))
-    biases = [_bias_sources(bias, variables) for bias in _bias_of_each(alignments, biases_px)]
-    scalars = [
-        tuple(
-            (term, variables.source("term", checked_key(name, "terms", term.key), Vector(1)))
-            for term in of_one
-        )
-        for of_one in _terms_of_each(alignments, terms)
+    pose, offset = pose_or_key(name, "cTl", cTl), number_or_key(name, "offset_s", offset_s)
+    twist = _twist_or_key(name, c_twist)
+    biases = [_biases_and_groups(name, bias) for bias in _bias_of_each(alignments, biases_px)]
+    terms_of_each = _terms_of_each(alignments, terms)
+    arguments = [
+        Argument("cTl", pose, gtsam.Pose3),
+        Argument("offset_s", offset, Vector(1)),
+        Argument("c_twist", twist, Vector(6)),
+        *_numbered("bias", [bias for own, _ in biases for bias in own]),
+        *_numbered("term", [checked_key(name, "terms", term.key) for own in terms_of_each for term in own]),
     ]
+    variables = Variables.of(name, arguments)
     if not variables.keys:
         raise FactorError(f"keys of {name}", "constants only", "the key of one variable or more")
-    cols = sum(variables.dims)
+
+    def source(value: Any) -> _Source:
+        return _Source(variables.keys.index(value)) if isinstance(value, int) else _Source(None, value)
+
     parts = []
-    for alignment, (sources, groups), own_terms in zip(alignments, biases, scalars, strict=True):
+    for alignment, (own_biases, groups), own_terms in zip(alignments, biases, terms_of_each, strict=True):
         columns, targets = [], []
         named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["offset_s"]), (twist, _COLUMNS["c_twist"])]
-        singles = [*(source for _, source in own_terms), *sources]
-        named += [(source, range(13 + i, 14 + i)) for i, source in enumerate(singles)]
-        for source, own in named:
-            if source.slot is not None:
+        singles = [*(term.key for term in own_terms), *own_biases]
+        named += [(value, range(13 + i, 14 + i)) for i, value in enumerate(singles)]
+        for value, own in named:
+            if isinstance(value, int):
                 columns += list(own)
-                start = sum(variables.dims[: source.slot])
-                targets += list(range(start, start + len(own)))
-        columns, targets = [*columns, 13 + len(singles)], [*targets, cols]
-        parts.append(_Part(alignment, sources, groups, columns, targets, own_terms))
-    kinds, names = tuple(variables.kinds), tuple(variables.names)
-    return FrameResidual(tuple(parts), pose, offset, twist, tuple(variables.keys), kinds, names)
+                place = variables.columns[value]
+                targets += list(range(place.start, place.stop))
+        columns, targets = [*columns, 13 + len(singles)], [*targets, variables.cols]
+        terms_here = tuple((term, source(term.key)) for term in own_terms)
+        parts.append(
+            _Part(alignment, [source(each) for each in own_biases], groups, columns, targets, terms_here)
+        )
+    return FrameResidual(tuple(parts), source(pose), source(offset), source(twist), variables)
+
+
+def _numbered(name: str, values: Sequence[int | float]) -> list[Argument]:
+    """Arguments of which a factor may have several, and which may share a key."""
+    return [
+        Argument(f"{name} {i}", value, Vector(1), shared_with=name) for i, value in enumerate(values, start=1)
+    ]
 
 
 def _twist_or_key(name: str, c_twist: Any) -> int | FloatArray:
@@ -365,15 +391,12 @@ def _twist_or_key(name: str, c_twist: Any) -> int | FloatArray:
     return checked_array(f"c_twist of {name}", np.zeros(6) if c_twist is None else c_twist, (6,))
 
 
-def _bias_sources(
-    bias: int | float | GroupedBias | None, variables: _Variables
-) -> tuple[list[_Source], NDArray[np.intp] | None]:
-    def source(each: int | float) -> _Source:
-        return variables.source("bias", number_or_key(variables.factor, "biases_px", each), Vector(1))
-
+def _biases_and_groups(
+    name: str, bias: int | float | GroupedBias | None
+) -> tuple[list[int | float], NDArray[np.intp] | None]:
     if isinstance(bias, GroupedBias):
-        return [source(each) for each in bias.biases], bias.groups
-    return ([] if bias is None else [source(bias)]), None
+        return [number_or_key(name, "biases_px", each) for each in bias.biases], bias.groups
+    return ([] if bias is None else [number_or_key(name, "biases_px", bias)]), None
 
 
 def _bias_of_each(alignments: Sequence[Alignment], biases_px: Any) -> list[int | float | GroupedBias | None]:
@@ -417,41 +440,6 @@ def _terms_of_each(
         for term in own:
             checked_array("coefficients of a linear term", term.coefficients, (len(alignment),))
     return list(terms)
-
-
-_SEVERAL = ("bias", "term")
-"""Arguments that a factor may have more than one of."""
-
-
-class _Variables:
-    """Collects the keys of a factor, their kinds, and the arguments that they came as."""
-
-    def __init__(self, factor: str) -> None:
-        self.factor = factor
-        self.keys: list[int] = []
-        self.kinds: list[Kind] = []
-        self.names: list[str] = []
-
-    @property
-    def dims(self) -> list[int]:
-        return [dimension(kind) for kind in self.kinds]
-
-    def source(self, name: str, key_or_value: Any, kind: Kind) -> _Source:
-        """Of a key or constant that has been checked; biases may share a key, and terms, others may not."""
-        if not isinstance(key_or_value, int):
-            return _Source(None, key_or_value)
-        key = key_or_value
-        if key in self.keys:
-            before = self.names[self.keys.index(key)]
-            if name not in _SEVERAL or not before.startswith(name):
-                both = f"{key_name(key)} for {before} and {name}"
-                raise FactorError(f"keys of {self.factor}", both, "distinct keys")
-        else:
-            count = sum(each.startswith(name) for each in self.names)
-            self.keys.append(key)
-            self.kinds.append(kind)
-            self.names.append(f"{name} {count + 1}" if name in _SEVERAL else name)
-        return _Source(self.keys.index(key))
 
 
 def _scalar(value: Any) -> float:

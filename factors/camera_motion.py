@@ -1,4 +1,4 @@
-"""Visual odometry in somebody else's graph: the camera's motion between two images on his own poses.
+"""Visual odometry in a user's own graph: the camera's motion between two images, on trajectory poses.
 
     c1Tc2 = cTl . lTb . wTb(t_1 + D)^-1 . wTb(t_2 + D) . bTl . cTl^-1
     wTb(t) = X_a Exp(s Log(X_a^-1 X_b)),      s = (t - t_a) / (t_b - t_a)
@@ -18,10 +18,20 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .custom import custom_factor
-from .errors import FactorError, checked_positive, described
+from .arguments import checked_positive
+from .custom.factor import custom_factor
+from .custom.variables import (
+    Argument,
+    Variables,
+    Vector,
+    body_in_lidar,
+    checked_key,
+    key_name,
+    number_or_key,
+    pose_or_key,
+)
+from .errors import FactorError
 from .hand_eye import MotionError, camera_motion_error
-from .variables import Kind, Vector, checked_key, key_name, number_or_key, pose_or_key
 
 FloatArray = NDArray[np.float64]
 _NAME = "camera_motion_factor"
@@ -62,7 +72,7 @@ def camera_motion_factor(
     bTl: gtsam.Pose3 | None = None,
     scale_known: bool = True,
 ) -> gtsam.CustomFactor:
-    """Log(measured^-1 . predicted) of the camera's motion c1Tc2 [rad, m]; the equation is the module's.
+    """Log(c1Tc2^-1 . cTl . l1Tl2(X, D) . cTl^-1), predicted - measured [rad, m]; l1Tl2 as in the module.
 
     Args:
         first, second: where the two images fall; they may share poses.
@@ -83,23 +93,16 @@ def camera_motion_factor(
     """
     error_of, noise = camera_motion_error(c1Tc2, covariance, scale_known)
     E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
-    if bTl is not None and not isinstance(bTl, gtsam.Pose3):
-        raise FactorError(f"bTl of {_NAME}", described(bTl), "a gtsam.Pose3, or None")
-    variables: dict[int, tuple[str, Kind]] = {}
-    for name, where in (("first", first), ("second", second)):
-        for end, key in (("X_a", where.X_a), ("X_b", where.X_b)):
-            variables.setdefault(key, (f"{end} of the {name}", gtsam.Pose3))
-    own: list[tuple[str, Any, Kind]] = [("cTl", E, gtsam.Pose3), ("offset_s", D, Vector(1))]
-    for name, key, kind in own:
-        if isinstance(key, int):
-            if key in variables:
-                both = f"{key_name(key)} for {variables[key][0]} and {name}"
-                raise FactorError(f"keys of {_NAME}", both, "distinct keys")
-            variables[key] = (name, kind)
-    chain = _Chain(first, second, E, D, gtsam.Pose3() if bTl is None else bTl.inverse())
-    named = {name: key for key, (name, _) in variables.items()}
-    kinds = [kind for _, kind in variables.values()]
-    return custom_factor(noise, named, partial(_error, tuple(variables), chain, error_of), kinds, 6, _NAME)
+    arguments = [
+        Argument(f"{end} of the {name}", getattr(where, end), gtsam.Pose3, shared_with="X_")
+        for name, where in (("first", first), ("second", second))
+        for end in ("X_a", "X_b")
+    ]
+    arguments += [Argument("cTl", E, gtsam.Pose3), Argument("offset_s", D, Vector(1))]
+    variables = Variables.of(_NAME, arguments)
+    chain = _Chain(first, second, E, D, body_in_lidar(_NAME, bTl))
+    function = partial(_error, variables.keys, chain, error_of)
+    return custom_factor(noise, variables.named, function, variables.kinds, 6, _NAME)
 
 
 def _error(

@@ -4,7 +4,7 @@
 
 The camera moves from its stamp t1 to t2, on the LiDAR's clock from t1 + D to t2 + D. The LiDAR's motion
 l1Tl2 was measured over [t1 + offset_0, t2 + offset_0] and is carried by d = D - offset_0 at both ends
-with the LiDAR's twist there. Turns tie the rotation, and turns that begin or end tie the delay;
+with the LiDAR's twist there. Turns determine the rotation, and turns that begin or end the time offset;
 translation along the axis of a plane motion stays free. Sources: Taylor & Nieto, Motion-based calibration
 of multimodal sensor extrinsics and timing offset estimation, T-RO 2016; Park et al., Spatiotemporal
 camera-LiDAR calibration, 2020.
@@ -20,9 +20,10 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .custom import ResidualFunction, custom_factor
-from .errors import FactorError, checked_array, checked_covariance
-from .variables import Kind, Vector
+from .arguments import checked_array, checked_covariance
+from .custom.factor import ResidualFunction, custom_factor
+from .custom.variables import Kind, Vector
+from .errors import FactorError
 
 FloatArray = NDArray[np.float64]
 

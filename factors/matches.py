@@ -9,8 +9,9 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from .arguments import checked_array
 from .camera import PinholeCamera
-from .errors import FactorError, checked_array
+from .errors import FactorError
 from .motion import MotionModel
 from .robust import RobustKernel
 

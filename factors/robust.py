@@ -8,7 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import FactorError, checked_positive
+from .arguments import checked_positive
+from .errors import FactorError
 
 FloatArray = NDArray[np.float64]
 KernelKind = Literal["none", "huber", "cauchy", "geman_mcclure", "tukey"]

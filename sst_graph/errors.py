@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sst_graph.factors.exceptions import SstGraphError, printable
+from sst_graph.factors.errors import SstGraphError, printable
 
 __all__ = [
     "CheckpointError",

@@ -9,11 +9,12 @@ from functools import cache
 
 import gtsam
 import numpy as np
+from stored import simulated, stored
 
 from sst_graph import AlignmentKeys, AlignmentTerm, IncrementalTerms, Trajectory
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.factors import PinholeCamera, time_offset_prior
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.simulator.config import Motion
 from sst_graph.slam.align import features_of
 from sst_graph.slam.incremental_terms import IncrementalUpdate, Solver
@@ -132,7 +133,11 @@ def isam2_params() -> gtsam.ISAM2Params:
 @cache
 def simulated_street(seed: int = 4, frames: int = 24, motion: Motion = "mixed") -> Street:
     """A drive with parked vehicles only, odometry with the noise of a good LiDAR."""
-    drive = simulate(
+    return stored(("a user's street", seed, frames, motion), lambda: _new_street(seed, frames, motion))
+
+
+def _new_street(seed: int, frames: int, motion: Motion) -> Street:
+    drive = simulated(
         SimulationConfig(
             seed=seed,
             frames=frames,

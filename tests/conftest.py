@@ -1,15 +1,18 @@
-"""A tiny KITTI drive on disk, and the simulated drive that the tracker is tried on."""
+"""A tiny KITTI drive on disk, the simulated drive that the tracker is tried on, and the session's folder."""
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from stored import FOLDER, simulated
 from streets import TRACKED_STREET
 
-from sst_graph.simulator import SimulatedDrive, simulate
+from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import Frame
 
 CALIB = """P0: 700 0 4 0 0 700 3 0 0 0 1 0
@@ -17,6 +20,14 @@ P2: 700 0 4 35 0 700 3 0 0 0 1 0
 P3: 700 0 4 -350 0 700 3 0 0 0 1 0
 Tr: 0 -1 0 0 0 0 -1 -0.08 1 0 0 -0.27
 """
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """The folder of :mod:`stored`, removed at the end; the workers inherit it by the environment."""
+    if not hasattr(config, "workerinput"):
+        folder = tempfile.TemporaryDirectory(prefix="sst-graph-tests-")
+        os.environ[FOLDER] = folder.name
+        config.add_cleanup(folder.cleanup)
 
 
 @pytest.fixture
@@ -49,7 +60,7 @@ def kitti_drive(tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def street() -> SimulatedDrive:
     """Of :data:`streets.TRACKED_STREET`; modules with a street of their own hide it."""
-    return simulate(TRACKED_STREET)
+    return simulated(TRACKED_STREET)
 
 
 @pytest.fixture(scope="module")

@@ -8,12 +8,13 @@ from functools import cache
 import cv2
 import gtsam
 import numpy as np
+from stored import simulated, stored
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.experiments.wrong_drives import with_distortion
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import CameraImage, SemanticClass
 
 TRACKED_STREET = SimulationConfig(
@@ -35,7 +36,7 @@ TRACKED_STREET = SimulationConfig(
 @cache
 def standing_street(label_noise: float = 1.0) -> SimulatedDrive:
     """Three frames of a standing drive at half the usual size."""
-    return simulate(
+    return simulated(
         SimulationConfig(
             seed=3,
             frames=3,
@@ -52,8 +53,9 @@ def standing_street(label_noise: float = 1.0) -> SimulatedDrive:
 @cache
 def prepared_street(label_noise: float = 1.0) -> Drive:
     """:func:`standing_street`, reduced to what calibration needs of its vehicles."""
-    config = PrepareConfig(use_visual_odometry=False)
-    return prepare_drive(standing_street(label_noise), [SemanticClass.VEHICLE], config)
+    config, classes = PrepareConfig(use_visual_odometry=False), [SemanticClass.VEHICLE]
+    street = standing_street(label_noise)
+    return stored((street.config, config), lambda: prepare_drive(street, classes, config))
 
 
 CROWDED_STREET = SimulationConfig(
@@ -72,7 +74,7 @@ CROWDED_STREET = SimulationConfig(
 @cache
 def crowded_street(k1: float = 0.0) -> KeptDrive:
     """:data:`CROWDED_STREET`, through a lens with radial distortion."""
-    return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulate(CROWDED_STREET))
+    return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulated(CROWDED_STREET))
 
 
 EARLY_START = TrackerConfig(start_scans=8, start_work=0)

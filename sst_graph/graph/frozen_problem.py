@@ -1,7 +1,7 @@
 """The problem of :func:`~sst_graph.graph.building.joint_graph`, optimised without building its graph.
 
 The factors are the same, and so are their formulas (:func:`sst_graph.factors.reprojection.evaluate`,
-:func:`sst_graph.factors.twist_transfer.transferred`), but those of all images are worked out at once: with
+:func:`sst_graph.factors.velocity.transferred`), but those of all images are worked out at once: with
 the few hundred matches of one image a call costs more than what it does. Each twist meets the matches of its
 own image and one measurement, so it is eliminated there (Schur complement), and what is left is a small
 dense system in the extrinsic, the clocks, the parameters of assumptions and the mask biases. Their priors
@@ -21,7 +21,7 @@ from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.trajectory import camera_covariances
 from sst_graph.factors.matches import Alignment
 from sst_graph.factors.reprojection import evaluate, weigh
-from sst_graph.factors.twist_transfer import transferred
+from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import prior_graph
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (

@@ -17,7 +17,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.drive.path import PathStep, SensorPath
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors import hand_eye_factor, rotation_hand_eye, time_offset_prior
-from sst_graph.factors.custom import recipe_of
+from sst_graph.factors.custom.factor import recipe_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.odometry.relative import DirectionMotion

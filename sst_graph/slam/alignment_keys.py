@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
-from sst_graph.factors.variables import checked_key, number_or_key, pose_or_key
+from sst_graph.factors.custom.variables import checked_key, number_or_key, pose_or_key
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
-from sst_graph.factors.delay import time_offset_prior
+from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
 from sst_graph.slam.config import RematchConfig

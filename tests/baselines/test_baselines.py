@@ -9,6 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph.association.nearest import ClassView
 from sst_graph.baselines.nearest_pixel_frames import (
@@ -131,7 +132,7 @@ def test_velocities_are_those_of_the_street(drive: Drive, truth: GroundTruth) ->
     odometry = CalibrationConfig().prepare.visual_odometry
     first = camera_motions([drive], at, [None], odometry)
     motions = camera_motions([drive], at, first, odometry)[0]
-    source = simulate(STREET)
+    source = simulated(STREET)
     stamps = source.stamps_ns * 1e-9
     for k in range(10, STREET.frames):
         step = source.wTc(stamps[k - 1]).between(source.wTc(stamps[k])).translation()

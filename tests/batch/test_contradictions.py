@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
@@ -24,7 +25,7 @@ from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import Frame, Source
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -46,7 +47,7 @@ STREET = SimulationConfig(
 
 @cache
 def street(motion: str = "no_stop", frames: int = 24) -> SimulatedDrive:
-    return simulate(replace(STREET, motion=motion, frames=frames))
+    return simulated(replace(STREET, motion=motion, frames=frames))
 
 
 @cache

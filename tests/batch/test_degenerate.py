@@ -10,11 +10,12 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stored import simulated
 from streets import TRACKED_STREET
 
 from sst_graph import CalibrationConfig, CalibrationResult, calibrate
 from sst_graph.config import with_overrides
-from sst_graph.simulator import SimulatedDrive, simulate
+from sst_graph.simulator import SimulatedDrive
 from sst_graph.types import Frame, Scan, SemanticClass, Source
 
 VEHICLE, IGNORE = int(SemanticClass.VEHICLE), int(SemanticClass.IGNORE)
@@ -53,7 +54,7 @@ def vehicles_of(scan: Scan) -> dict[int, NDArray[np.float32]]:
 
 
 def street(**settings: object) -> SimulatedDrive:
-    return simulate(dataclasses.replace(TRACKED_STREET, **{"frames": 14, **settings}))  # type: ignore[arg-type]
+    return simulated(dataclasses.replace(TRACKED_STREET, **{"frames": 14, **settings}))  # type: ignore[arg-type]
 
 
 def checked(

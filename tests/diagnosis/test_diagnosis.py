@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from stored import simulated
 
 from benchmarks.wrong_drives import LIES, NAMED, shifted_masks
 from sst_graph import CalibrationConfig, calibrate
@@ -26,7 +27,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_shift import contour_profiles, mask_shift
 from sst_graph.odometry.sweep import SweepDecision
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import SemanticClass
 
@@ -67,7 +68,7 @@ def street(seed: int, frames: int) -> KeptDrive:
         motion="no_stop",
         speed_mps=7.0,
     )
-    return KeptDrive.of(simulate(config), sweep="auto")
+    return KeptDrive.of(simulated(config), sweep="auto")
 
 
 @cache

@@ -12,6 +12,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.errors import ContradictionError, DataError, EstimationError
@@ -30,7 +31,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
 from sst_graph.graph.state import State
 from sst_graph.result import CalibrationResult
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 CAMERA = PinholeCamera(718.0, 718.0, 607.0, 185.0, 1242, 375)
@@ -301,7 +302,7 @@ def _matched(number: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
         motion=("constant", "no_stop")[number],
         speed_mps=(8.0, 3.0)[number],
     )
-    source = simulate(street)
+    source = simulated(street)
     prepared = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
     state = State(source.truth.cTl.retract(np.full(6, 2e-3)), (street.time_offset_s,))
     config = GraphConfig(object_bias_sigma_px=0.0)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from sst_graph.factors import (
+    Alignment,
     FactorError,
     GroupedBias,
+    PinholeCamera,
     RobustKernel,
     alignment_cost,
     check_gradient,
@@ -23,6 +25,7 @@ from sst_graph.factors import (
 )
 
 E, D, V, B, B2 = (gtsam.symbol(*name) for name in (("e", 0), ("d", 0), ("v", 0), ("b", 0), ("b", 1)))
+CAMERA = PinholeCamera(100.0, 100.0, 50.0, 40.0, 101, 81)
 FACTORIES = {"point_to_pixel": point_to_pixel_factor, "pixel_to_point": pixel_to_point_factor}
 
 
@@ -225,3 +228,46 @@ def test_refuses_what_makes_no_factor(make_scene):
         point_to_pixel_factor(contour, E)
     with pytest.raises(FactorError, match=r"shape \(3,\)"):
         point_to_pixel_factor(points, E, 0.1, np.zeros(3))
+
+
+def test_outside_is_positive_and_a_dilated_mask_hides_more_of_it():
+    # predicted at u = 60, contour at u = 57 with the outside to the right, mask dilated by 2 px: the
+    # outline is at u = 55
+    alignment = Alignment(CAMERA, [[1.0, 0.0, 10.0]], 0.0, [[57.0, 40.0]], 1.0, [[1.0, 0.0]])
+    values = gtsam.Values()
+    values.insert(E, gtsam.Pose3())
+    values.insert(B, np.array([2.0]))
+    factor = silhouette_factor(alignment, E, bias_px=B, condensed=False)
+    np.testing.assert_allclose(factor.unwhitenedError(values), [5.0, 0.0], atol=1e-12)
+    assert silhouette_factor(alignment, E, bias_px=2.0).error(values) == pytest.approx(12.5)
+    assert silhouette_factor(alignment, E).error(values) == pytest.approx(4.5)
+
+
+def test_silhouette_jacobians_at_100_states(make_scene):
+    for seed in range(100):
+        alignment, cTl, offset_s, twist = make_scene(seed, 4, normals=True, per_point=bool(seed % 2))
+        values = gtsam.Values()
+        values.insert(E, cTl.retract(np.full(6, 0.01)))
+        values.insert(D, np.array([offset_s + 0.01]))
+        values.insert(V, twist)
+        values.insert(B, np.array([0.4]))
+        check_jacobians(silhouette_factor(alignment, E, D, V, B, condensed=False), values, 1e-6)
+
+
+def test_silhouettes_of_a_circle_give_the_distance_to_it():
+    # nearest contour points and normals of a circular mask: the factor's error is |uv - centre| - radius
+    rng, centre, radius = np.random.default_rng(0), np.array([50.0, 40.0]), 20.0
+    lPs = rng.uniform([-4, -3, 8], [4, 3, 12], (50, 3))
+    outward = CAMERA.project(lPs) - centre
+    distance = np.linalg.norm(outward, axis=1)
+    normals = outward / distance[:, None]
+    alignment = Alignment(CAMERA, lPs, 0.0, centre + radius * normals, 1.0, normals)
+    values = gtsam.Values()
+    values.insert(E, gtsam.Pose3())
+    error = silhouette_factor(alignment, E, condensed=False).unwhitenedError(values)
+    np.testing.assert_allclose(error[:-1], distance - radius, atol=1e-9)
+
+
+def test_a_silhouette_needs_normals(make_scene):
+    with pytest.raises(FactorError, match="no normals"):
+        silhouette_factor(make_scene(0)[0], E)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sst_graph.factors import FactorError, check_jacobians, twist_transfer_factor
-from sst_graph.factors.twist_transfer import transferred
+from sst_graph.factors.velocity import transferred
 
 V, E, D = gtsam.symbol("V", 0), gtsam.symbol("E", 0), gtsam.symbol("D", 0)
 

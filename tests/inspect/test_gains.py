@@ -7,6 +7,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph.covariance.cluster_robust import (
     ErrorModel,
@@ -26,7 +27,7 @@ from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import FrameInformation
 from sst_graph.objects.tracks import ObjectId, object_tracks
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 CONFIG = GraphConfig()
@@ -35,7 +36,7 @@ CONFIG = GraphConfig()
 @cache
 def matched(motion: str) -> tuple[Drive, State, list[PairMatches], list[dict[ObjectId, int]]]:
     """A small drive of three frames, matched at the truth."""
-    source = simulate(
+    source = simulated(
         SimulationConfig(
             seed=3, frames=3, width=621, height=188, motion=motion, time_offset_s=0.0, azimuth_step_deg=0.35
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 from scipy.stats import spearmanr
+from stored import simulated
 
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
@@ -14,7 +15,7 @@ from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 NOISE = 0.003
@@ -26,7 +27,7 @@ def bits(without: np.ndarray, full: np.ndarray) -> float:
 
 
 def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
-    source = simulate(
+    source = simulated(
         SimulationConfig(
             seed=21,
             frames=42,

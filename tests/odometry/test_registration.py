@@ -7,17 +7,18 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph.errors import DataError
 from sst_graph.odometry import LoopConfig, RegisteredScan, loop_closures, scan_to_scan
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import Scan
 
 
 @cache
 def drive() -> tuple[SimulatedDrive, list[RegisteredScan], list[gtsam.Pose3]]:
     """Every third frame of a drive of 4 s: its scans, ready, and their true poses."""
-    source = simulate(
+    source = simulated(
         SimulationConfig(
             seed=3,
             frames=13,

@@ -8,6 +8,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 import sst_graph
 from sst_graph.association.edge_matching import MatchConfig
@@ -15,7 +16,7 @@ from sst_graph.drive.preparation import PrepareConfig, ScanFeatures, image_featu
 from sst_graph.errors import DataError
 from sst_graph.factors import RobustKernel, frame_factor, pose_alignment_factor, residuals
 from sst_graph.features.lidar_edges import Boundaries
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.slam.align import FrameAlignments
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
@@ -25,7 +26,7 @@ NARROW = RobustKernel("geman_mcclure", 5.0)
 
 @cache
 def drive() -> SimulatedDrive:
-    return simulate(
+    return simulated(
         SimulationConfig(
             seed=4,
             frames=8,

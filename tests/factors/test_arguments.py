@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.factors.errors import FactorError, checked_covariance
+from sst_graph.factors.arguments import checked_covariance
+from sst_graph.factors.errors import FactorError
 
 
 def test_rounding_is_no_asymmetry() -> None:

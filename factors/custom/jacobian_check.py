@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FactorError
+from ..errors import FactorError
 
 FloatArray = NDArray[np.float64]
 

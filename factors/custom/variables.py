@@ -8,17 +8,22 @@ either arrives as a (1,) array.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
+from itertools import accumulate, pairwise
 from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from .errors import FactorError, described
+from ..arguments import described
+from ..errors import FactorError
 
-_MOST = 2**64
+FloatArray = NDArray[np.float64]
+
+_KEYS = 2**64
 """gtsam's keys are unsigned numbers of 64 bits."""
 _FIRST_SYMBOL = 2**56
 """Keys of ``gtsam.symbol`` carry their letter above these bits."""
@@ -45,7 +50,7 @@ def checked_key(factor: str, argument: str, value: Any) -> int:
         return int(value.key())
     if not isinstance(value, int | np.integer) or isinstance(value, bool | np.bool_):
         raise FactorError(f"{argument} of {factor}", described(value), _A_KEY)
-    if not 0 <= int(value) < _MOST:
+    if not 0 <= int(value) < _KEYS:
         raise FactorError(f"{argument} of {factor}", f"{value}", f"{_A_KEY} from 0 to 2^64 - 1")
     return int(value)
 
@@ -65,6 +70,15 @@ def pose_or_key(factor: str, argument: str, value: Any) -> int | gtsam.Pose3:
     if is_key(value):
         return checked_key(factor, argument, value)
     raise FactorError(f"{argument} of {factor}", described(value), f"a gtsam.Pose3, or {_A_KEY}")
+
+
+def body_in_lidar(factor: str, bTl: Any) -> gtsam.Pose3:
+    """lTb from the pose of the LiDAR in the body; None where both are one."""
+    if bTl is None:
+        return gtsam.Pose3()
+    if isinstance(bTl, gtsam.Pose3):
+        return bTl.inverse()
+    raise FactorError(f"bTl of {factor}", described(bTl), "a gtsam.Pose3, or None")
 
 
 def number_or_key(factor: str, argument: str, value: Any) -> int | float:
@@ -135,6 +149,75 @@ def _tangent_dimension(value: Any) -> int:
     values = gtsam.Values()
     values.insert(0, value)
     return int(values.dim())
+
+
+@dataclass(frozen=True)
+class Argument:
+    """One argument of a factor that brings a variable, or a constant in its place.
+
+    Attributes:
+        name: of the argument, for messages.
+        value: a key, checked; anything but an int is a constant.
+        kind: what the factor wants of the variable.
+        shared_with: start of the names of earlier arguments whose key this one may repeat.
+    """
+
+    name: str
+    value: Any
+    kind: Kind
+    shared_with: str | None = None
+
+
+@dataclass(frozen=True)
+class Variables:
+    """The distinct variables of a factor, in the order of its arguments.
+
+    Attributes:
+        keys, names, kinds: of each variable; the name is that of the first argument that brought it.
+    """
+
+    keys: tuple[int, ...]
+    names: tuple[str, ...]
+    kinds: tuple[Kind, ...]
+
+    @staticmethod
+    def of(factor: str, arguments: Iterable[Argument]) -> Variables:
+        """Collect the variables among a factor's arguments.
+
+        Raises:
+            FactorError: one key for two arguments that are no shared variable.
+        """
+        found: dict[int, Argument] = {}
+        for new in arguments:
+            if not isinstance(new.value, int):
+                continue
+            first = found.setdefault(new.value, new)
+            may_share = new.shared_with is not None and first.name.startswith(new.shared_with)
+            if first is not new and not may_share:
+                both = f"{key_name(new.value)} for {first.name} and {new.name}"
+                raise FactorError(f"keys of {factor}", both, "distinct keys")
+        each = found.values()
+        return Variables(tuple(found), tuple(a.name for a in each), tuple(a.kind for a in each))
+
+    @property
+    def named(self) -> dict[str, int]:
+        """Keys by the argument that each came as."""
+        return dict(zip(self.names, self.keys, strict=True))
+
+    @cached_property
+    def columns(self) -> dict[int, slice]:
+        """Columns of each variable in the factor's Jacobian, by key."""
+        bounds = pairwise(accumulate((dimension(kind) for kind in self.kinds), initial=0))
+        return {key: slice(*bound) for key, bound in zip(self.keys, bounds, strict=True)}
+
+    @cached_property
+    def cols(self) -> int:
+        """Columns of the factor's Jacobian."""
+        return sum(dimension(kind) for kind in self.kinds)
+
+    def blocks(self, J: FloatArray) -> list[FloatArray]:
+        """The Jacobian (rows, cols) by variable."""
+        return [J[:, columns] for columns in self.columns.values()]
 
 
 @dataclass

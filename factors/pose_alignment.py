@@ -1,4 +1,4 @@
-"""Alignment in somebody else's graph: on the poses of a trajectory instead of a twist.
+"""Alignment in a user's own graph: on the poses of a trajectory instead of a twist.
 
     cP_i = Exp(-tau_i c_twist) . cTl . lTs . lP_i,      residuals as in :mod:`sst_graph.factors.reprojection`
     c_twist = Ad(cTl) Ad(lTb) Log(wTb_a^-1 wTb_b) / seconds
@@ -14,20 +14,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import FrameResidual, GroupedBias, frame_residual
+from .alignment import FrameResidual, GroupedBias, frame_residual, row_count
+from .arguments import checked_positive, described
 from .condensed import condense, cost_rows
-from .custom import custom_factor
-from .errors import FactorError, checked_positive, described
+from .custom.factor import custom_factor
+from .custom.variables import (
+    Argument,
+    Variables,
+    Vector,
+    body_in_lidar,
+    checked_key,
+    number_or_key,
+    pose_or_key,
+)
+from .errors import FactorError
 from .matches import Alignment
 from .motion import se3_left_jacobian, twist_ad
-from .variables import Kind, Vector, checked_key, dimension, key_name, number_or_key, pose_or_key
 
 FloatArray = NDArray[np.float64]
 
@@ -47,10 +55,12 @@ def pose_alignment_factor(
     noise: gtsam.noiseModel.Base | None = None,
     condensed: bool = True,
 ) -> gtsam.CustomFactor:
-    """All alignments of one image as one factor on the user's own keys; the equation is the module's.
+    """1/2 |error|^2 = sum_i weight_i rho(|r_i| / sigma_i), r_i as in the module, of one image [px].
+
+    All alignments of the image stand in one factor on the user's own keys.
 
     Goes into any ``NonlinearFactorGraph``, LM, iSAM2 or fixed-lag smoother. Its matches are frozen: make
-    it anew when the estimate has moved by more than about a pixel.
+    a new one when the estimate has moved by more than about a pixel.
 
     Args:
         alignments: one or more, over the same image. With ``X_scan`` their points count as taken at the
@@ -81,10 +91,10 @@ def pose_alignment_factor(
     frame = _on_poses(
         alignments, X_a, X_b, cTl, offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s
     )
-    rows = sum(frame.dims) + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
-
+    variables = frame.variables
+    rows = row_count(variables, alignments, condensed)
     function = _PoseFrameError(frame, condensed, rows)
-    return custom_factor(_over_rows(noise, rows), frame.named, function, frame.kinds, rows, _NAME)
+    return custom_factor(_over_rows(noise, rows), variables.named, function, variables.kinds, rows, _NAME)
 
 
 def _over_rows(noise: gtsam.noiseModel.Base | None, rows: int) -> gtsam.noiseModel.Base:
@@ -114,7 +124,7 @@ class _PoseFrameError:
         if not jacobians:
             return frame.error(values, self.condensed, self.rows), None
         error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
-        return error, np.split(J, np.cumsum(frame.dims)[:-1], axis=1)
+        return error, frame.variables.blocks(J)
 
 
 @dataclass(frozen=True)
@@ -124,7 +134,7 @@ class _PoseFrame:
     Attributes:
         inner: residuals over extrinsic (in effect, with the scan's motion), offset, twist and biases. The
             twist goes under the key X_a there; the extrinsic is always a variable.
-        keys, names, kinds: of the factor's variables.
+        variables: of the factor.
         X_a, X_b, X_s: keys of the poses.
         cTl, offset_s: key or constant.
         lTb: pose of the body in the LiDAR.
@@ -134,9 +144,7 @@ class _PoseFrame:
     """
 
     inner: FrameResidual
-    keys: tuple[int, ...]
-    names: tuple[str, ...]
-    kinds: tuple[Kind, ...]
+    variables: Variables
     X_a: int
     X_b: int
     X_s: int
@@ -147,15 +155,6 @@ class _PoseFrame:
     c_acceleration: FloatArray
     image_after_middle_s: float
 
-    @cached_property
-    def dims(self) -> tuple[int, ...]:
-        return tuple(dimension(kind) for kind in self.kinds)
-
-    @property
-    def named(self) -> dict[str, int]:
-        """Keys by the argument that each came as."""
-        return dict(zip(self.names, self.keys, strict=True))
-
     def error(self, values: Sequence[Any], condensed: bool, rows: int) -> FloatArray:
         """(rows,) error, without the work for its Jacobian."""
         inner = self.inner_values(values)
@@ -163,8 +162,7 @@ class _PoseFrame:
 
     def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         G, constant = self.inner.gram(self.inner_values(values))
-        cols = sum(self.dims)
-        lift = np.zeros((len(G), cols + 1))
+        lift = np.zeros((len(G), self.variables.cols + 1))
         lift[:-1, :-1], lift[-1, -1] = self.lift(values), 1.0
         return condense(lift.T @ G @ lift, constant)
 
@@ -173,12 +171,12 @@ class _PoseFrame:
         return error, J @ self.lift(values)
 
     def _by_key(self, values: Sequence[Any]) -> dict[int, Any]:
-        return dict(zip(self.keys, values, strict=True))
+        return dict(zip(self.variables.keys, values, strict=True))
 
     def _extrinsic(self, named: dict[int, Any]) -> gtsam.Pose3:
         return self.cTl if isinstance(self.cTl, gtsam.Pose3) else cast(gtsam.Pose3, named[self.cTl])
 
-    def _late_s(self, named: dict[int, Any]) -> float:
+    def _after_middle_s(self, named: dict[int, Any]) -> float:
         """True time of the image after the middle between X_a and X_b [s]."""
         offset_s = named[self.offset_s][0] if isinstance(self.offset_s, int) else self.offset_s
         return float(offset_s) + self.image_after_middle_s
@@ -199,15 +197,15 @@ class _PoseFrame:
         c_twist = np.asarray(cTl.AdjointMap()) @ l_twist
         special = {
             _EXTRINSIC: cTl if self.X_s == self.X_a else cTl * self._lTs(named),
-            self.X_a: c_twist + self._late_s(named) * self.c_acceleration,
+            self.X_a: c_twist + self._after_middle_s(named) * self.c_acceleration,
         }
-        return [special[key] if key in special else named[key] for key in self.inner.keys]
+        return [special[key] if key in special else named[key] for key in self.inner.variables.keys]
 
     def lift(self, values: Sequence[Any]) -> FloatArray:
         """(inner cols, cols) derivative of the inner variables by those of the factor."""
         named = self._by_key(values)
-        outer, inner = _places(self.keys, self.dims), _places(self.inner.keys, self.inner.dims)
-        L = np.zeros((self.inner.cols, sum(self.dims)))
+        outer, inner = self.variables.columns, self.inner.variables.columns
+        L = np.zeros((self.inner.cols, self.variables.cols))
         for key, place in inner.items():
             if key not in (_EXTRINSIC, self.X_a):
                 L[place, outer[key]] += np.eye(place.stop - place.start)
@@ -248,11 +246,6 @@ _EXTRINSIC = 2**64 - 1
 _NAME = "pose_alignment_factor"
 
 
-def _places(keys: Sequence[int], dims: Sequence[int]) -> dict[int, slice]:
-    ends = np.cumsum(dims).tolist()
-    return {key: slice(end - dim, end) for key, dim, end in zip(keys, dims, ends, strict=True)}
-
-
 def _on_poses(
     alignments: Sequence[Alignment],
     X_a: int,
@@ -268,36 +261,28 @@ def _on_poses(
     X_a, X_b = checked_key(_NAME, "X_a", X_a), checked_key(_NAME, "X_b", X_b)
     X_s = X_a if X_scan is None else checked_key(_NAME, "X_scan", X_scan)
     E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
-    if X_a == X_b:
-        raise FactorError(f"keys of {_NAME}", f"{key_name(X_a)} for X_a and X_b", "distinct keys")
     inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, name=_NAME)
-    variables: dict[int, tuple[str, Kind]] = {X_a: ("X_a", gtsam.Pose3), X_b: ("X_b", gtsam.Pose3)}
-    variables.setdefault(X_s, ("X_scan", gtsam.Pose3))
-    own: list[tuple[Any, str, Kind]] = [(E, "cTl", gtsam.Pose3), (D, "offset_s", Vector(1))]
-    own += [
-        (key, name, kind)
-        for key, name, kind in zip(inner.keys, inner.names, inner.kinds, strict=True)
+    arguments = [
+        Argument("X_a", X_a, gtsam.Pose3),
+        Argument("X_b", X_b, gtsam.Pose3),
+        Argument("X_scan", X_s, gtsam.Pose3, shared_with="X_"),
+        Argument("cTl", E, gtsam.Pose3),
+        Argument("offset_s", D, Vector(1)),
+    ]
+    arguments += [
+        Argument(name, key, Vector(1))
+        for name, key in inner.variables.named.items()
         if name.startswith("bias")
     ]
-    for key, name, kind in own:
-        if isinstance(key, int):
-            if key in variables:
-                both = f"{key_name(key)} for {variables[key][0]} and {name}"
-                raise FactorError(f"keys of {_NAME}", both, "distinct keys")
-            variables[key] = (name, kind)
-    if bTl is not None and not isinstance(bTl, gtsam.Pose3):
-        raise FactorError(f"bTl of {_NAME}", described(bTl), "a gtsam.Pose3, or None")
     return _PoseFrame(
         inner,
-        tuple(variables),
-        tuple(name for name, _ in variables.values()),
-        tuple(kind for _, kind in variables.values()),
+        Variables.of(_NAME, arguments),
         X_a,
         X_b,
         X_s,
         E,
         D,
-        gtsam.Pose3() if bTl is None else bTl.inverse(),
+        body_in_lidar(_NAME, bTl),
         checked_positive("seconds between the poses", seconds),
         np.zeros(6) if image_after_middle_s is None else _common_acceleration(alignments),
         image_after_middle_s or 0.0,

@@ -19,7 +19,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import FactorError, described
+from ..arguments import described
+from ..errors import FactorError
 from .variables import Kind, Reader, checked_keys, dimension, key_name
 
 FloatArray = NDArray[np.float64]

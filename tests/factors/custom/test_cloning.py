@@ -139,7 +139,7 @@ def test_gnc_finds_the_outliers():
     for graph in (custom, native):
         found = gnc(graph, values, GncParams(inlier_cost=0.5 * 3.0**2))
         np.testing.assert_array_equal(found.weights > 0.5, np.arange(17) < 12)
-        assert found.settled
+        assert found.converged
         assert found.values.atVector(7)[0] == pytest.approx(targets[:12].mean(), abs=1e-6)
     theirs = gtsam.GncLMOptimizer(native, values, gtsam.GncLMParams())
     theirs.optimize()
@@ -172,7 +172,13 @@ def test_gnc_leaves_out_an_image_of_another_place(bench, make_scene):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"growth": 1.0}, {"growth": float("nan")}, {"most_rounds": 0}, {"most_rounds": 1.5}, {"settled": 0.0}],
+    [
+        {"mu_step": 1.0},
+        {"mu_step": float("nan")},
+        {"max_iterations": 0},
+        {"max_iterations": 1.5},
+        {"weights_tolerance": 0.0},
+    ],
 )
 def test_settings_out_of_range_are_refused(wrong):
     with pytest.raises(FactorError, match=next(iter(wrong))):

@@ -1,0 +1,104 @@
+"""Copies of graphs that hold this package's factors: clones, other keys, pickles.
+
+gtsam 4.3 has no ``clone()`` for a ``CustomFactor``: ``graph.clone()``, ``copy.deepcopy``, ``rekey``, pickling
+and ``gtsam.GncLMOptimizer`` fail on it, and on any graph that holds one. A factor of this package gives its
+recipe (:func:`sst_graph.factors.recipe_of`), from which it is built anew.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+
+from ..errors import FactorError
+from .factor import FactorRecipe, recipe_of
+from .variables import checked_key
+
+
+def clone_factor(factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:
+    """A factor that shares nothing with this one: gtsam's own clone, or one built anew from its recipe.
+
+    Raises:
+        FactorError: a ``CustomFactor`` that another made.
+    """
+    if not isinstance(factor, gtsam.CustomFactor):
+        return factor.clone()
+    return copy.deepcopy(own_recipe(factor)).build()
+
+
+def clone_graph(graph: gtsam.NonlinearFactorGraph) -> gtsam.NonlinearFactorGraph:
+    """What ``graph.clone()`` is where all factors can; empty slots stay empty."""
+    cloned = gtsam.NonlinearFactorGraph()
+    cloned.resize(graph.size())
+    for i in range(graph.size()):
+        if graph.exists(i):
+            cloned.replace(i, clone_factor(graph.at(i)))
+    return cloned
+
+
+def rekeyed(factor: gtsam.NonlinearFactor, new_keys: Mapping[int, int]) -> gtsam.NonlinearFactor:
+    """The factor on other keys, what ``factor.rekey`` is where it can; keys that are not named stay.
+
+    A condensed factor looks its variables up by position, so only its keys change.
+
+    Raises:
+        FactorError: two variables on one key, or a ``CustomFactor`` that another made.
+    """
+    if not isinstance(factor, gtsam.CustomFactor):
+        return factor.rekey([new_keys.get(int(key), int(key)) for key in list(factor.keys())])
+    recipe = own_recipe(factor)
+    keys = [checked_key("rekeyed", "new_keys", new_keys.get(key, key)) for key in recipe.keys]
+    if len(set(keys)) != len(keys):
+        raise FactorError("new_keys of rekeyed", "one key for two variables", "distinct keys")
+    return replace(recipe, keys=dict(zip(keys, recipe.keys.values(), strict=True))).build()
+
+
+@dataclass(frozen=True)
+class PackedGraph:
+    """A graph as ``pickle`` and ``copy.deepcopy`` take it: recipes of this package's factors, the others as
+    they are. Unpack only what you packed yourself: a pickle may run any code.
+
+    Attributes:
+        factors: by slot; None where it is empty.
+    """
+
+    factors: tuple[FactorRecipe | Any | None, ...]
+
+    @staticmethod
+    def of(graph: gtsam.NonlinearFactorGraph) -> PackedGraph:
+        """Pack a graph.
+
+        Raises:
+            FactorError: it holds a ``CustomFactor`` that another made.
+        """
+        slots = [graph.at(i) if graph.exists(i) else None for i in range(graph.size())]
+        return PackedGraph(
+            tuple(own_recipe(each) if isinstance(each, gtsam.CustomFactor) else each for each in slots)
+        )
+
+    def unpack(self) -> gtsam.NonlinearFactorGraph:
+        """The graph."""
+        graph = gtsam.NonlinearFactorGraph()
+        graph.resize(len(self.factors))
+        for i, each in enumerate(self.factors):
+            if each is not None:
+                graph.replace(i, each.build() if isinstance(each, FactorRecipe) else each)
+        return graph
+
+
+def own_recipe(factor: gtsam.CustomFactor) -> FactorRecipe:
+    """The recipe of one of this package's factors.
+
+    Raises:
+        FactorError: another made it.
+    """
+    recipe = recipe_of(factor)
+    if recipe is None:
+        keys = ", ".join(gtsam.DefaultKeyFormatter(key) for key in list(factor.keys()))
+        expected = "one of sst_graph.factors.custom_factor"
+        raise FactorError(f"CustomFactor on {keys}", "one that another made", expected)
+    return recipe

@@ -1,0 +1,59 @@
+"""What is made once a test session, for all its processes."""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import os
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import TypeVar, cast
+
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.types import Frame
+
+FOLDER = "SST_GRAPH_TEST_FOLDER"
+"""Environment variable: folder of the session, made by conftest.py before the workers start."""
+T = TypeVar("T")
+
+
+def stored(key: object, make: Callable[[], T]) -> T:
+    """What ``make`` gives, made by the first that asks in a session and read from disk by all others.
+
+    Args:
+        key: says all that the result depends on, by its ``repr``.
+        make: its result must pickle.
+    """
+    folder = os.environ.get(FOLDER)
+    if folder is None:  # outside pytest
+        return make()
+    path = Path(folder, hashlib.sha256(repr(key).encode()).hexdigest())
+    with open(path, "a+b") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        file.seek(0)
+        content = file.read()
+        if content:
+            return cast(T, pickle.loads(content))
+        result = make()
+        file.write(pickle.dumps(result, pickle.HIGHEST_PROTOCOL))
+        return result
+
+
+@dataclass(frozen=True)
+class StoredDrive(SimulatedDrive):
+    """A simulated drive whose frames are :func:`stored`."""
+
+    def __getitem__(self, position: int) -> Frame:
+        if simulated(self.config) is not self:  # changed since: a drive of its own
+            return super().__getitem__(position)
+        index = self._checked(position)
+        return stored((self.config, index), lambda: super(StoredDrive, self).__getitem__(index))
+
+
+@cache
+def simulated(config: SimulationConfig) -> StoredDrive:
+    """As :func:`sst_graph.simulator.simulate`, but each frame is rendered once a session."""
+    return StoredDrive(**vars(simulate(config)))
