@@ -20,9 +20,9 @@ _INTRODUCTION = """# Settings
 
 Made by `sst-graph settings --markdown > docs/settings.md`.
 
-`calibrate` has {calibrate} settings. `track` takes them as `calibration.NAME`, and {track} of its own. Give them with
-`--set NAME=VALUE`, or with `--config FILE` in JSON or TOML. An unknown name is refused with the nearest known
-one, a value out of its range with the bounds. What is no setting is a named constant in the module that uses it.
+`calibrate` has {calibrate} settings. `track` takes them as `calibration.NAME`, and {track} of its own. Give them
+with `--set NAME=VALUE`, or with `--config FILE` in JSON or TOML. An unknown name is refused with the nearest
+known one, a value out of its range with the bounds. All else is a named constant in the module that uses it.
 """
 
 
@@ -50,17 +50,12 @@ def settings_page(of_calibrate: list[SettingEntry], of_track: list[SettingEntry]
 
 def _json(of_calibrate: list[SettingEntry], of_track: list[SettingEntry]) -> str:
     """The settings of each command as JSON, defaults as values."""
-    commands = {"calibrate": of_calibrate, "track": of_track}
-    return json.dumps(
-        {
-            command: [
-                {**dataclasses.asdict(entry), "default": json.loads(entry.default)} for entry in entries
-            ]
-            for command, entries in commands.items()
-        },
-        indent=1,
-        ensure_ascii=False,
-    )
+    lists = {"calibrate": list(map(_plain, of_calibrate)), "track": list(map(_plain, of_track))}
+    return json.dumps(lists, indent=1, ensure_ascii=False)
+
+
+def _plain(entry: SettingEntry) -> dict[str, Any]:
+    return {**dataclasses.asdict(entry), "default": json.loads(entry.default)}
 
 
 def _is_shared(entry: SettingEntry) -> bool:
