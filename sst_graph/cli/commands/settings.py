@@ -20,9 +20,9 @@ _INTRODUCTION = """# Settings
 
 Made by `sst-graph settings --markdown > docs/settings.md`.
 
-`calibrate` has {calibrate} settings. `track` takes them as `calibration.NAME`, and {track} of its own. Give them
-with `--set NAME=VALUE`, or with `--config FILE` in JSON or TOML. An unknown name is refused with the nearest
-known one, a value out of its range with the bounds. All else is a named constant in the module that uses it.
+`calibrate` has {calibrate} settings. `track` takes them as `calibration.NAME`, and has {track} of its own.
+Give them with `--set NAME=VALUE`, or with `--config FILE` in JSON or TOML. An unknown name is refused with
+the nearest known one, a value out of its range with the bounds. All else is a constant beside its use.
 """
 
 
