@@ -49,6 +49,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_inspect,
         _add_overlay,
         _add_export,
+        _add_settings_command,
         _add_experiment,
     ):
         command = add(commands)
@@ -277,6 +278,18 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
         "--lidar-frame", default="lidar", metavar="NAME", help="the LiDAR's frame (default %(default)s)"
     )
     return export
+
+
+def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "list the settings of calibrate and track: default, unit, range, and when to change them"
+    settings = commands.add_parser("settings", help=text, description=text)
+    settings.add_argument(
+        "name", metavar="NAME", nargs="?", default="", help="only those whose dotted name contains this"
+    )
+    form = settings.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print JSON")
+    form.add_argument("--markdown", action="store_true", help="print Markdown (docs/settings.md)")
+    return settings
 
 
 def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

@@ -39,17 +39,19 @@ class Bounds(TypedDict, total=False):
     choices: Collection[str]
 
 
-def setting(default: T, **bounds: Unpack[Bounds]) -> T:
+def setting(default: T, *, doc: str = "", unit: str | None = None, **bounds: Unpack[Bounds]) -> T:
     """A dataclass field with its default and range. For a tuple, the range is that of each element.
 
     Args:
+        doc: what it is, and when to change it, for ``sst-graph settings``.
+        unit: of the numbers, where the end of the field's name (``_px``, ``_s``, ...) does not say it.
         at_least, more_than: lower bound that is allowed, or that is not.
         at_most, less_than: upper bound that is allowed, or that is not.
         length: fewest and most elements of a tuple.
         order: each element of a tuple above ("increasing") or below ("decreasing") the one before it.
         choices: the texts that are allowed.
     """
-    return dataclasses.field(default=default, metadata=dict(bounds))
+    return dataclasses.field(default=default, metadata={**bounds, "doc": doc, "unit": unit})
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +64,7 @@ class Range:
         length: fewest and most elements of a tuple.
         order: of the elements of a tuple.
         choices: the texts that are allowed.
-        unit: of the numbers, by the field's name.
+        unit: of the numbers, as declared or by the end of the field's name.
     """
 
     low: float | None = None
@@ -98,6 +100,7 @@ class Range:
 @functools.cache
 def _range_of(field: dataclasses.Field[Any]) -> Range:
     given = field.metadata
+    unit = given.get("unit")
     return Range(
         low=given.get("more_than", given.get("at_least")),
         high=given.get("less_than", given.get("at_most")),
@@ -106,7 +109,7 @@ def _range_of(field: dataclasses.Field[Any]) -> Range:
         length=given.get("length"),
         order=given.get("order"),
         choices=given.get("choices"),
-        unit=unit_of(field.name),
+        unit=unit_of(field.name) if unit is None else unit,
     )
 
 

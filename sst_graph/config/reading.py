@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sst_graph.config.names import refuse_unknown
+from sst_graph.config.old_names import with_new_names
 from sst_graph.config.ranges import Range
 from sst_graph.config.settings import join, settings_fields
 from sst_graph.config.values import checked, printable, shown
@@ -21,9 +22,12 @@ T = TypeVar("T")
 def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
     """A ``cls`` with the values of ``data``; what is not named keeps its default, in nested tables too.
 
+    Old names of settings (:mod:`sst_graph.config.renamed`) are accepted with a warning in the log.
+
     Raises:
         ConfigError: an unknown key, a value of a wrong type or out of its range, a missing key.
     """
+    data = with_new_names(cls, data)
     refuse_unknown(cls, data, cls, "")
     return _built(cls, data, "")
 
@@ -60,6 +64,7 @@ def with_overrides(config: T, overrides: Sequence[str]) -> T:
         value = _parsed(name.strip(), text.strip())
         for key in reversed(path):
             value = {key: value}
+        value = with_new_names(cls, value)
         refuse_unknown(cls, value, cls, "")
         _merge(changes, value)
     return _built(cls, changes, "", config)

@@ -42,39 +42,75 @@ _MASKS_TO_JUDGE = 8
 
 
 @dataclass(frozen=True, eq=False)
-class KittiSource:
-    """A KITTI drive that satisfies :class:`~sst_graph.types.Source`; a slice of it is one as well.
+class KittiDrive:
+    """What holds for every frame of a drive.
 
     Attributes:
-        name: data set and sequence, "kitti/00".
         camera: intrinsics of the chosen camera.
         nominal: cTl of ``calib.txt``.
         truth: from ``groundtruth.json``, or else the published calibration as a reference.
         truth_is_reference: the truth is the published calibration: itself good to a tenth of a
             degree or so, not known to hold.
-        files: paths of the drive.
-        stamps_ns: (n,) stamps of times.txt [ns]; scan k and image k share the stamp k.
-        indices: scan index of each frame.
-        image_shift: frame k shows image k + image_shift.
         encoding: of the masks.
-        sweep: how per-point times are found.
-        sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
-        timing: times by azimuth, where ``sweep`` names a sense of rotation.
+        timing: times of the points by azimuth, where the options name a sense of rotation.
     """
 
-    name: str
     camera: PinholeCamera
     nominal: gtsam.Pose3
     truth: GroundTruth
     truth_is_reference: bool
+    encoding: MaskEncoding
+    timing: SweepTiming | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class KittiSource:
+    """A KITTI drive that satisfies :class:`~sst_graph.types.Source`; a slice of it is one as well.
+
+    Made by :func:`open_kitti`.
+
+    Attributes:
+        name: data set and sequence, "kitti/00".
+        drive: what holds for every frame.
+        files: paths of the drive.
+        stamps_ns: (n,) stamps of times.txt [ns]; scan k and image k share the stamp k.
+        indices: scan index of each frame.
+        options: how the drive is read: frame k shows image k + ``options.image_shift``.
+    """
+
+    name: str
+    drive: KittiDrive
     files: KittiFiles
     stamps_ns: NDArray[np.int64]
     indices: tuple[int, ...]
-    image_shift: int
-    encoding: MaskEncoding
-    sweep: Sweep
-    sweep_stamp: SweepStamp = "forward"
-    timing: SweepTiming | None = None
+    options: SourceOptions
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.drive.camera
+
+    @property
+    def nominal(self) -> gtsam.Pose3:
+        return self.drive.nominal
+
+    @property
+    def truth(self) -> GroundTruth:
+        return self.drive.truth
+
+    @property
+    def truth_is_reference(self) -> bool:
+        """Whether the truth is the published calibration, not known to hold."""
+        return self.drive.truth_is_reference
+
+    @property
+    def sweep(self) -> Sweep:
+        """How the times of the points are found."""
+        return self.options.sweep
+
+    @property
+    def sweep_stamp(self) -> SweepStamp:
+        """The instant that a scan's stamp names where times follow from azimuths."""
+        return self.options.sweep_stamp
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -144,14 +180,14 @@ class KittiSource:
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
     ) -> NDArray[np.float32] | None:
-        if self.timing is not None:
-            return self.timing.offsets_s(points)
+        if self.drive.timing is not None:
+            return self.drive.timing.offsets_s(points)
         if self.sweep == "auto" and self.files.point_times is not None:
             return read_offsets(self.files.point_times[index], used)
         return None
 
     def _image(self, index: int) -> CameraImage | None:
-        number = index + self.image_shift
+        number = index + self.options.image_shift
         if number not in self.files.image_numbers:
             return None
         return CameraImage(
@@ -168,13 +204,13 @@ class KittiSource:
         """Classes (h, w); where there is no mask every pixel may be anything."""
         if path is None:
             return np.full((self.camera.height, self.camera.width), SemanticClass.IGNORE, np.uint8)
-        return classes_of_mask(read_mask(path, self._size), self.encoding, path)
+        return classes_of_mask(read_mask(path, self._size), self.drive.encoding, path)
 
     def _pixels(self, path: Path | None) -> NDArray[np.uint8]:
         return NO_PICTURE if path is None else read_picture(path, self._size)
 
     def _instances(self, index: int) -> NDArray[np.uint16] | None:
-        path = self.files.instances.get(index + self.image_shift)
+        path = self.files.instances.get(index + self.options.image_shift)
         return None if path is None else read_instances(path, self._size)
 
 
@@ -198,21 +234,15 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
         _LOG.info("%s: %s", printable(folder), missing)
     truth, is_reference = drive_truth(folder, calibration, options.camera)
     pairs = [k for k in indices if k in files.scans and k + options.image_shift in files.image_numbers]
-    return KittiSource(
-        name=_name(folder),
+    drive = KittiDrive(
         camera=calibration.camera(options.camera, *size),
         nominal=nominal,
         truth=_shifted(truth, stamps_ns, pairs, options.image_shift),
         truth_is_reference=is_reference,
-        files=files,
-        stamps_ns=stamps_ns,
-        indices=indices,
-        image_shift=options.image_shift,
         encoding=_encoding(files, options, size),
-        sweep=options.sweep,
-        sweep_stamp=options.sweep_stamp,
         timing=_timing(options, stamps_ns),
     )
+    return KittiSource(_name(folder), drive, files, stamps_ns, indices, options)
 
 
 def _timing(options: SourceOptions, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:

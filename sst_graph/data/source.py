@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypedDict, Unpack, get_args
 
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.sweep_timing import SweepStamp
@@ -22,7 +22,7 @@ LABEL_ENCODINGS: tuple[LabelEncoding, ...] = ("auto", "ids", "trainids")
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """How a drive is to be read.
+    """How a drive is to be read; made by :func:`open_source`.
 
     Attributes:
         sequence: name of the sequence within the data set, or None for the only one.
@@ -96,52 +96,45 @@ def loader_names() -> tuple[str, ...]:
     return tuple(_LOADERS)
 
 
-def open_source(
-    path: str | Path,
-    *,
-    loader: str = "auto",
-    sequence: str | None = None,
-    frames: str | slice | None = None,
-    image_shift: int = 0,
-    camera: str = "image_2",
-    cloud: str = "velodyne",
-    label_encoding: LabelEncoding = "auto",
-    sweep: Sweep = "auto",
-    sweep_start_deg: float = 180.0,
-    sweep_stamp: SweepStamp = "forward",
-) -> Source:
-    """Open a drive; frames are read when asked for. Options as in :class:`SourceOptions`.
+class ReadOptions(TypedDict, total=False):
+    """The fields of :class:`SourceOptions` by keyword; ``frames`` also as text, "A:B"."""
+
+    sequence: str | None
+    frames: str | slice | None
+    image_shift: int
+    camera: str
+    cloud: str
+    label_encoding: LabelEncoding
+    sweep: Sweep
+    sweep_start_deg: float
+    sweep_stamp: SweepStamp
+
+
+def open_source(path: str | Path, *, loader: str = "auto", **options: Unpack[ReadOptions]) -> Source:
+    """Open a drive; frames are read when asked for.
 
     Args:
         path: root of the data set, or the folder of one sequence.
         loader: a registered format, or "auto" for the one that recognizes the path.
-        frames: "A:B" (scan indices A..B-1; either may be left out) or a slice.
+        options: the fields of :class:`SourceOptions`; ``frames`` is a slice or "A:B" (scan indices A..B-1;
+            either may be left out).
 
     Raises:
         DataError: nothing there, or data that cannot be used.
         ConfigError: an option that is unknown or out of range.
     """
-    options = SourceOptions(
-        sequence=sequence,
-        frames=parse_frames(frames) if isinstance(frames, str) else frames,
-        image_shift=image_shift,
-        camera=camera,
-        cloud=cloud,
-        label_encoding=label_encoding,
-        sweep=sweep,
-        sweep_start_deg=sweep_start_deg,
-        sweep_stamp=sweep_stamp,
-    )
+    frames = options.pop("frames", None)
+    chosen = SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
     path = Path(path)
     if loader != "auto":
         if loader not in _LOADERS:
             raise ConfigError(f"loader {loader!r}: expected one of auto, {', '.join(_LOADERS)}")
-        return _LOADERS[loader].open(path, options)
+        return _LOADERS[loader].open(path, chosen)
     if not path.is_dir():
         raise DataError(path, "no folder" if not path.exists() else "a file", "the folder of a drive")
     for candidate in _LOADERS.values():
         if candidate.recognizes(path):
-            return candidate.open(path, options)
+            return candidate.open(path, chosen)
     raise DataError(path, "no layout that is known", "; or ".join(c.layout for c in _LOADERS.values()))
 
 

@@ -1,0 +1,100 @@
+"""Settings that are given by a name they do not have any more."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from sst_graph.config.renamed import CONSTANTS, RENAMED
+from sst_graph.config.settings import join, walk_settings
+from sst_graph.config.values import printable
+from sst_graph.errors import ConfigError
+
+_LOG = logging.getLogger(__name__)
+
+CALIBRATION = "calibration."
+"""What the names of ``calibrate``'s settings begin with in other commands; the tables leave it out."""
+
+_MAX_DEPTH = 12
+"""Levels of a table that are searched for old names: more than any name has, fewer than recursion allows."""
+
+
+def with_new_names(
+    cls: Any,
+    data: Mapping[str, Any],
+    renamed: Mapping[str, str] = RENAMED,
+    constants: Mapping[str, str] = CONSTANTS,
+) -> Mapping[str, Any]:
+    """Nested settings for ``cls`` under the names that they have; each old name is logged as a warning.
+
+    A name that ``cls`` does not have, and the tables do not, stays: whoever reads it refuses it.
+
+    Args:
+        renamed, constants: as the tables of :mod:`sst_graph.config.renamed`.
+
+    Raises:
+        ConfigError: a setting that is a constant, or one that is given under both names.
+    """
+    known = {name for name, _, _ in walk_settings(cls)}
+    old = {name: value for name, value in _leaves(data, known) if name not in known}
+    moved = {}
+    for name, value in old.items():
+        short = name.removeprefix(CALIBRATION)
+        prefix = name[: len(name) - len(short)]
+        if short in constants:
+            raise ConfigError(f"'{printable(name)}' is not a setting any more: {constants[short]}")
+        new = prefix + renamed.get(short, short)
+        if new != name and new in known:
+            if _has(data, new):
+                raise ConfigError(f"'{printable(name)}' and '{new}': found both, expected the second alone")
+            _LOG.warning("setting '%s' is called '%s': use that name", name, new)
+            moved[name] = (new, value)
+    if not moved:
+        return data
+    tree = _without(data, moved)
+    for new, value in moved.values():
+        _put(tree, new, value)
+    return tree
+
+
+def _leaves(data: Mapping[str, Any], known: set[str], where: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted name and value of each single setting in a nested table."""
+    for key, value in data.items():
+        name = join(where, str(key))
+        if isinstance(value, Mapping) and value and name not in known and name.count(".") < _MAX_DEPTH:
+            yield from _leaves(value, known, name)
+        else:
+            yield name, value
+
+
+def _has(data: Any, name: str) -> bool:
+    for key in name.split("."):
+        if not isinstance(data, Mapping) or key not in data:
+            return False
+        data = data[key]
+    return True
+
+
+def _without(data: Mapping[str, Any], names: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+    """A copy of the table without some settings, and without the tables that held nothing else."""
+    kept: dict[str, Any] = {}
+    for key, value in data.items():
+        name = join(where, str(key))
+        if name in names:
+            continue
+        if isinstance(value, Mapping) and any(moved.startswith(f"{name}.") for moved in names):
+            value = _without(value, names, name)
+            if not value:
+                continue
+        kept[key] = value
+    return kept
+
+
+def _put(tree: dict[str, Any], name: str, value: Any) -> None:
+    """Enter a value; not below a single value that stands in a table's place, which is refused later."""
+    *tables, last = name.split(".")
+    for key in tables:
+        below = tree.setdefault(key, {})
+        tree = below if isinstance(below, dict) else {}
+    tree[last] = value

@@ -1,0 +1,134 @@
+"""Settings by names that they do not have any more."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from sst_graph.batch import CalibrationConfig
+from sst_graph.config import Settings, from_dict, setting, to_dict, walk_settings
+from sst_graph.config.old_names import with_new_names
+from sst_graph.config.renamed import CONSTANTS, RENAMED
+from sst_graph.errors import ConfigError
+from sst_graph.tracker.config import TrackerConfig
+
+
+@dataclass(frozen=True)
+class Edges(Settings):
+    sigma_px: float = setting(1.0, at_least=0.1, at_most=9.0)
+    use: bool = True
+
+
+@dataclass(frozen=True)
+class Method(Settings):
+    time_offset_s: float = setting(0.1, at_least=0.0, at_most=1.0)
+    lower_edges: Edges = field(default_factory=Edges)
+
+
+@dataclass(frozen=True)
+class Online(Settings):
+    window: int = setting(6, at_least=1, at_most=9)
+    calibration: Method = field(default_factory=Method)
+
+
+OLD = {"delay_s": "time_offset_s", "undersides.use": "lower_edges.use", "scans": "window"}
+GONE = {"undersides.support": "sst_graph.edges.SUPPORT = 30.0"}
+
+
+def new(cls: Any, data: dict[str, Any]) -> Any:
+    return with_new_names(cls, data, OLD, GONE)
+
+
+def test_an_old_name_is_the_new_one_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        found = new(Method, {"delay_s": 0.2, "undersides": {"use": False}, "lower_edges": {"sigma_px": 2}})
+    assert from_dict(Method, found) == Method(0.2, Edges(2.0, False))
+    assert [record.getMessage() for record in caplog.records] == [
+        "setting 'delay_s' is called 'time_offset_s': use that name",
+        "setting 'undersides.use' is called 'lower_edges.use': use that name",
+    ]
+
+
+def test_names_below_the_calibration_of_another_command() -> None:
+    found = new(Online, {"scans": 3, "calibration": {"undersides": {"use": False}}})
+    assert from_dict(Online, found) == Online(3, Method(lower_edges=Edges(use=False)))
+
+
+def test_known_names_pass_without_a_word(caplog: pytest.LogCaptureFixture) -> None:
+    given = {"time_offset_s": 0.3, "lower_edges": {"use": False}}
+    assert new(Method, given) is given and not caplog.records
+
+
+@pytest.mark.parametrize("name", ["undersides.support", "calibration.undersides.support"])
+def test_a_constant_is_named_with_its_value(name: str) -> None:
+    tree: Any = 3.0
+    for key in reversed(name.split(".")):
+        tree = {key: tree}
+    message = f"'{name}' is not a setting any more: sst_graph.edges.SUPPORT = 30.0"
+    with pytest.raises(ConfigError, match=f"^{message}$"):
+        new(Online if "calibration" in name else Method, tree)
+
+
+def test_old_and_new_name_together_are_refused() -> None:
+    with pytest.raises(ConfigError, match="'delay_s' and 'time_offset_s': found both"):
+        new(Method, {"delay_s": 0.2, "time_offset_s": 0.3})
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {"foo": 3, "undersides": {}},
+        {"undersides": 3},
+        {"undersides": {"use": {"x": 1}}},
+        {"scans": 3},  # a name of another command
+    ],
+)
+def test_what_the_tables_do_not_know_stays_to_be_refused(data: dict[str, Any]) -> None:
+    assert new(Method, data) == data
+    with pytest.raises(ConfigError, match="unknown setting"):
+        from_dict(Method, new(Method, data))
+
+
+def test_a_value_in_the_place_of_the_new_table_is_refused() -> None:
+    with pytest.raises(ConfigError, match="lower_edges: found 3, expected a table"):
+        from_dict(Method, new(Method, {"lower_edges": 3, "undersides": {"use": True}}))
+
+
+def test_tables_nested_hundreds_deep_are_no_recursion_error() -> None:
+    deep = json.loads('{"a":' * 500 + "1" + "}" * 500)
+    assert new(Method, deep) is deep
+
+
+def known_names() -> set[str]:
+    return {name for cls in (CalibrationConfig, TrackerConfig) for name, _, _ in walk_settings(cls)}
+
+
+def test_every_old_name_leads_to_a_setting() -> None:
+    assert set(RENAMED.values()) <= known_names()
+    assert not (set(RENAMED) | set(CONSTANTS)) & known_names()
+    assert not set(RENAMED) & set(CONSTANTS)
+
+
+def test_every_constant_is_where_the_table_says() -> None:
+    for name, text in CONSTANTS.items():
+        place, equals, _ = text.partition(" = ")
+        if equals:
+            module, _, constant = place.rpartition(".")
+            assert hasattr(importlib.import_module(module), constant), (name, text)
+
+
+@pytest.mark.parametrize("old", RENAMED)
+def test_the_default_under_an_old_name_is_the_default(old: str) -> None:
+    of_calibrate = RENAMED[old] in {name for name, _, _ in walk_settings(CalibrationConfig)}
+    default: Any = CalibrationConfig() if of_calibrate else TrackerConfig()
+    value = to_dict(default)
+    for key in RENAMED[old].split("."):
+        value = value[key]
+    for key in reversed(old.split(".")):
+        value = {key: value}
+    assert from_dict(type(default), value) == default
