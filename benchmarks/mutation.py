@@ -240,7 +240,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{total} mutants, {len(mutants)} tried (seed {chosen.seed})", flush=True)
     if outcome(None, 10 * chosen.seconds) != "survived":
         sys.exit("the tests fail on the package as it is")
-    known = _tried(chosen.out) if chosen.out else {}
+    known = {}
+    if chosen.out:
+        chosen.out.parent.mkdir(parents=True, exist_ok=True)
+        known = _tried(chosen.out)
     found: Counter[str] = Counter()
     for mutant in mutants:
         if not mutant.is_one():
