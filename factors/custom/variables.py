@@ -100,7 +100,7 @@ def number_or_key(factor: str, argument: str, value: Any) -> int | float:
         array = np.zeros(0)
     if value is None or array.shape not in ((), (1,)) or not np.isfinite(array).all():
         raise FactorError(f"{argument} of {factor}", described(value), f"a finite float, or {_A_KEY}")
-    return float(array.reshape(()))
+    return float(array.item())
 
 
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:
