@@ -139,6 +139,8 @@ def test_a_limit_for_each_factor_and_known_inliers():
     wide = gnc(graph, at(0.0), GncParams(lambda position: 1000.0 if position == 3 else 100.0))
     assert wide.values.atVector(7)[0] == pytest.approx(0.25)
     narrow = gnc(graph, at(0.0), GncParams(lambda position: 4.5))
+    # mu begins at 1 / (2 * 6.25 - 1) and grows by 1.4 at each iteration until it has passed 1
+    assert narrow.iterations == 2 + np.ceil(np.log(11.5) / np.log(1.4))
     np.testing.assert_array_equal(narrow.weights, [1.0, 1.0, 1.0, 0.0])
     known = gnc(graph, at(0.0), GncParams(4.5), known_inliers=[3])
     assert known.weights[3] == 1.0
