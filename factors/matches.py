@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 class Alignment:
     """Matches (lP_i, q_i) of one image, frozen for an inner optimisation.
 
-    One alignment may hold the matches of many images of one camera, where each match has its own ``c_acceleration``;
+    One alignment may hold the matches of many images of one camera, each match with its ``c_acceleration``;
     :func:`sst_graph.factors.residuals` then takes a twist for each. A factor has the matches of one image.
 
     Shapes are checked and arrays copied (read-only) once, here. No match at all (n = 0) is allowed.
