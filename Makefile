@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test lint demo bench lock clean
+.PHONY: setup test lint demo bench mutate lock clean
 
 setup: $(INSTALLED)
 
@@ -33,6 +33,13 @@ demo: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -n 0
+
+# How many small faults in factors/ its tests find; SAMPLE mutants, at random.
+SAMPLE ?= 600
+
+mutate: $(INSTALLED)
+	$(PIP) install -c constraints.txt --no-build-isolation -e '.[mutation]'
+	$(BIN)/python benchmarks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
 
 # Fresh versions of everything, in a throw-away environment.
 lock:

@@ -27,8 +27,8 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -364,7 +364,9 @@ DRIVE_FILES: tuple[tuple[str, m.Mutation], ...] = (
     ("velodyne_times/*.bin", m.array("<f4", m.FLOATS)),
 )
 
-KINDS: dict[str, tuple[Callable[[Ground, Rng], None], float]] = {
+Kinds = Mapping[str, tuple[Callable[[Ground, Rng], None], float]]
+
+KINDS: Kinds = {
     "calib": (_of_drive("calib.txt", m.text), 1.0),
     "times": (_of_drive("times.txt", m.text), 1.0),
     "velodyne": (_of_drive("velodyne/*.bin", m.array("<f4", m.FLOATS)), 1.0),
@@ -425,11 +427,29 @@ def _command(ground: Ground, rng: Rng, words: list[str]) -> None:
     raise Ended(f"exit {code}")
 
 
-def tried(number: int, kind: str, seed: int, ground: Ground, noise: int) -> Case:
+@dataclass(frozen=True)
+class Trials:
+    """What is tried, and for how long at most.
+
+    Attributes:
+        seed: of all cases.
+        kinds: as :data:`KINDS`.
+        max_seconds: of a case that calibrates nothing.
+    """
+
+    seed: int
+    kinds: Kinds = field(default_factory=lambda: KINDS)
+    max_seconds: float = MAX_SECONDS
+
+    def limit_s(self, kind: str) -> float:
+        return CALIBRATE_SECONDS if kind == "calibrate" else self.max_seconds
+
+
+def tried(number: int, kind: str, trials: Trials, ground: Ground, noise: int) -> Case:
     """Make one case, try it, and judge how it ended."""
-    rng = np.random.default_rng([seed, number])
-    attempt, _ = KINDS[kind]
-    limit = CALIBRATE_SECONDS if kind == "calibrate" else MAX_SECONDS
+    rng = np.random.default_rng([trials.seed, number])
+    attempt, _ = trials.kinds[kind]
+    limit = trials.limit_s(kind)
     os.ftruncate(noise, 0)
     os.lseek(noise, 0, os.SEEK_SET)
     # Of the process's own time, so that a busy machine does not count; and what blocks is ended, too.
@@ -465,7 +485,7 @@ def _too_long(signum: int, frame: object) -> None:
     raise TooLong
 
 
-def _work(inputs: Path, seed: int, numbers: list[tuple[int, str]], answers: Connection) -> None:
+def _work(inputs: Path, trials: Trials, numbers: list[tuple[int, str]], answers: Connection) -> None:
     """A worker: its own copy of the valid inputs, its own limits."""
     with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile() as noise:
         ground = Ground(Path(shutil.copytree(inputs, Path(folder) / "inputs")))
@@ -478,25 +498,22 @@ def _work(inputs: Path, seed: int, numbers: list[tuple[int, str]], answers: Conn
             present = int(stream.read().split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (present + MAX_BYTES, present + MAX_BYTES))
         for number, kind in numbers:
-            answers.send(tried(number, kind, seed, ground, noise.fileno()))
+            answers.send(tried(number, kind, trials, ground, noise.fileno()))
         answers.send(None)
 
 
-def cases(inputs: Path, seed: int, numbers: list[tuple[int, str]]) -> Iterator[Case]:
+def cases(inputs: Path, trials: Trials, numbers: list[tuple[int, str]]) -> Iterator[Case]:
     """Verdicts of the cases, in order, from a worker that is replaced when it dies."""
     todo = list(numbers)
     context = multiprocessing.get_context("fork")
     while todo:
         ours, theirs = context.Pipe(duplex=False)
-        worker = context.Process(target=_work, args=(inputs, seed, todo, theirs))
+        worker = context.Process(target=_work, args=(inputs, trials, todo, theirs))
         worker.start()
         theirs.close()
         try:
             while todo:
-                patience = (
-                    1.5 * PATIENCE * (CALIBRATE_SECONDS if todo[0][1] == "calibrate" else MAX_SECONDS) + 20.0
-                )
-                if not ours.poll(patience):
+                if not ours.poll(1.5 * PATIENCE * trials.limit_s(todo[0][1]) + 20.0):
                     worker.kill()
                     raise EOFError
                 case = ours.recv()
@@ -538,7 +555,7 @@ def main() -> int:
         numbers = plan(args.seed, args.count, args.kind or usual)
         if args.only is not None:
             numbers = [numbers[args.only]]
-        for case in cases(Path(folder), args.seed, numbers):
+        for case in cases(Path(folder), Trials(args.seed), numbers):
             found[case.kind, case.verdict] += 1
             done += 1
             slowest = max(slowest, case, key=lambda each: each.seconds)

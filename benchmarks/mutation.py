@@ -1,17 +1,18 @@
 """How many small faults in ``factors/`` the tests of ``tests/factors`` find.
 
-    python benchmarks/mutation.py [--sample 600] [--seed 0] [--only hand_eye] [--seconds 60] [--out tried.jsonl]
+    python benchmarks/mutation.py [--sample 600] [--seed 0] [--only hand_eye] [--out tried.jsonl]
 
-A mutant is the source of one module with one place changed by an operator of mutmut: a number, an operator, a
-comparison, a keyword, an argument, an assignment, an arm of a conditional. Each runs the tests in a forked process,
-those of the module's own name first, until one fails (killed), all pass (survived) or the time is out (killed).
-gtsam, NumPy and pytest are imported once, before the fork.
+A mutant is the source of one module with one place changed by an operator of mutmut: a number, an operator,
+a comparison, a keyword, an argument, an assignment, an arm of a conditional. Each runs the tests in a forked
+process, those of the module's own name first, until one fails (killed), all pass (survived) or the time is
+out (killed). gtsam, NumPy and pytest are imported once, before the fork.
 
 No mutants are made of what only messages, types and names are made of, which no test need pin down:
 
-- string literals;
+- string literals, and constants that are one;
 - ``raise`` statements, and functions that return text or an error;
-- arguments of ``checked_*``, ``*_or_key``, ``body_in_lidar`` and ``custom_factor`` that are names for messages;
+- arguments that are names for messages: of ``checked_*``, ``*_or_key``, ``custom_factor``, ``Variables.of``;
+- ``strict=True`` of ``zip``, and ``assert``, which guard against faults of the package itself;
 - annotations, decorators, ``__all__``, blocks under ``TYPE_CHECKING`` and ``@overload``.
 """
 
@@ -46,9 +47,16 @@ from mutmut.mutation import mutators
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = "sst_graph.factors"
 TESTS = ROOT / "tests" / "factors"
-OPERATORS = [(kind, make) for kind, make in mutators.mutation_operators if make is not mutators.operator_string]
-NAMED_FOR_MESSAGES = ("checked_", "pose_or_key", "number_or_key", "body_in_lidar", "_checked", "_twist_or_key")
-"""Calls whose first argument is a name for messages; starts of their names."""
+OPERATORS = [
+    (kind, make) for kind, make in mutators.mutation_operators if make is not mutators.operator_string
+]
+MESSAGE_ARGUMENTS = {
+    **{name: {0} for name in ["checked_array", "checked_covariance", "checked_positive", "checked_keys"]},
+    **{name: {0, 1} for name in ["checked_key", "pose_or_key", "number_or_key"]},
+    **{name: {0} for name in ["body_in_lidar", "_checked", "_twist_or_key", "_biases_and_groups", "_factor"]},
+    **{"of": {0}, "Argument": {0}, "custom_factor": {5}, "Reader": {2, 3}},
+}
+"""Positions of the arguments of a function, by its name, that are names for messages."""
 TEXT = m.Annotation(m.Name("str") | m.Name("FactorError"))
 
 
@@ -98,6 +106,9 @@ def _is_for_people(node: cst.CSTNode) -> bool:
     return m.matches(
         node,
         m.Raise()
+        | m.Assert()
+        | m.Assign(value=m.SimpleString())
+        | m.Arg(keyword=m.Name("strict"))
         | m.Annotation()
         | m.Decorator()
         | m.ImportFrom()
@@ -109,15 +120,18 @@ def _is_for_people(node: cst.CSTNode) -> bool:
 
 
 def _only_changes_a_message(node: cst.CSTNode, mutated: cst.CSTNode) -> bool:
-    """Whether a call differs in a name for messages alone: its first argument is another."""
-    if not (isinstance(node, cst.Call) and isinstance(mutated, cst.Call) and len(node.args) == len(mutated.args)):
+    """Whether a call differs in names for messages alone, or in the ``strict`` of a ``zip``."""
+    if not (isinstance(node, cst.Call) and isinstance(mutated, cst.Call)):
         return False
     name = node.func.attr.value if isinstance(node.func, cst.Attribute) else getattr(node.func, "value", "")
-    differ = [i for i, (a, b) in enumerate(zip(node.args, mutated.args, strict=True)) if a is not b]
-    if name == "custom_factor":
-        return differ == [len(node.args) - 1] and len(node.args) == 6
-    many = 2 if name in ("checked_key", "pose_or_key", "number_or_key") else 1
-    return str(name).startswith(NAMED_FOR_MESSAGES) and all(i < many for i in differ)
+    if name == "zip":
+        return [a.value for a in node.args if not a.keyword] == [
+            a.value for a in mutated.args if not a.keyword
+        ]
+    if len(node.args) != len(mutated.args):
+        return False
+    differ = {i for i, (a, b) in enumerate(zip(node.args, mutated.args, strict=True)) if a is not b}
+    return differ <= MESSAGE_ARGUMENTS.get(str(name), set())
 
 
 def mutants_of(path: Path) -> Iterator[Mutant]:
@@ -149,25 +163,35 @@ class MutatedModule(importlib.abc.MetaPathFinder, importlib.machinery.SourceFile
         return compile(self.mutant.source, self.path, "exec")
 
 
-def own_tests_first(module: str) -> list[str]:
-    """Test files, those with the module's name in front."""
-    stem = module.rpartition(".")[2]
-    return [str(path) for path in sorted(TESTS.rglob("test_*.py"), key=lambda path: stem not in path.stem)]
+def tests_pass(module: str) -> bool:
+    """Whether the tests pass, first those in files with the module's name, then the others."""
+    stem, files = module.rpartition(".")[2], sorted(TESTS.rglob("test_*.py"))
+    own = [str(path) for path in files if stem and stem in path.stem]
+    others = [str(path) for path in files if str(path) not in own]
+    options = [
+        "-x",
+        "-q",
+        "-o",
+        "addopts=--import-mode=importlib",
+        "--confcutdir",
+        str(TESTS),
+        "--rootdir",
+        str(ROOT),
+    ]
+    return all(pytest.main([*options, *part]) == 0 for part in (own, others) if part)
 
 
 def outcome(mutant: Mutant | None, seconds: float) -> str:
-    """"killed", "survived" or "time out" of the tests on a mutant, or on the package as it is."""
+    """ "killed", "survived" or "time out" of the tests on a mutant, or on the package as it is."""
     child = os.fork()
     if child == 0:
         os.setsid()
         quiet = os.open(os.devnull, os.O_WRONLY)
         os.dup2(quiet, 1)
         os.dup2(quiet, 2)
-        files = own_tests_first(mutant.module if mutant else "")
         if mutant:
             sys.meta_path.insert(0, MutatedModule(mutant))
-        options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--rootdir", str(ROOT)]
-        os._exit(int(pytest.main([*options, *files])))
+        os._exit(0 if tests_pass(mutant.module if mutant else "") else 1)
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -190,7 +214,9 @@ def lower_bound(killed: int, count: int) -> float:
     """Wilson's lower 95 % bound of the share killed."""
     z, share = 1.645, killed / count
     middle = share + z * z / (2 * count)
-    return (middle - z * math.sqrt(share * (1 - share) / count + z * z / (4 * count**2))) / (1 + z * z / count)
+    return (middle - z * math.sqrt(share * (1 - share) / count + z * z / (4 * count**2))) / (
+        1 + z * z / count
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -199,9 +225,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the sample; default: 0")
     parser.add_argument("--only", default="", help="part of a module's name")
     parser.add_argument("--seconds", type=float, default=60.0, help="limit for each mutant; default: 60")
-    parser.add_argument("--out", type=Path, help="JSON lines: each mutant tried; what is in there is not tried again")
+    parser.add_argument(
+        "--out", type=Path, help="JSON lines: each mutant tried; what is in there is not tried again"
+    )
     chosen = parser.parse_args(arguments)
     os.chdir(ROOT)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
     files = [path for path in sorted((ROOT / "factors").rglob("*.py")) if path.name != "__init__.py"]
     mutants = [mutant for path in files for mutant in mutants_of(path) if chosen.only in mutant.module]
@@ -211,7 +240,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{total} mutants, {len(mutants)} tried (seed {chosen.seed})", flush=True)
     if outcome(None, 10 * chosen.seconds) != "survived":
         sys.exit("the tests fail on the package as it is")
-    known = _tried(chosen.out) if chosen.out else {}
+    known = {}
+    if chosen.out:
+        chosen.out.parent.mkdir(parents=True, exist_ok=True)
+        known = _tried(chosen.out)
     found: Counter[str] = Counter()
     for mutant in mutants:
         if not mutant.is_one():
@@ -220,12 +252,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
         found[result] += 1
         if chosen.out and (mutant.module, mutant.change) not in known:
             with chosen.out.open("a", encoding="utf-8") as out:
-                print(json.dumps({"module": mutant.module, "change": mutant.change, "outcome": result}), file=out)
+                print(
+                    json.dumps({"module": mutant.module, "change": mutant.change, "outcome": result}),
+                    file=out,
+                )
         if result == "survived":
             print(f"\nsurvived in {mutant.module}\n{mutant.change}", flush=True)
     count = max(found.total(), 1)
     killed = count - found["survived"]
-    print(f"\n{killed} of {count} killed ({100 * killed / count:.1f} %), {found['time out']} of them by time", end="")
+    print(
+        f"\n{killed} of {count} killed ({100 * killed / count:.1f} %), {found['time out']} of them by time",
+        end="",
+    )
     print(f"; of all at least {100 * lower_bound(killed, count):.1f} % (95 %)")
 
 

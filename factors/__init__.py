@@ -22,7 +22,7 @@ Covariance
     7x7 over [rotation xyz rad, translation xyz m, offset s]; right perturbation
     ``cTl * Exp(xi)``, as gtsam has it. A sigma is never called a covariance.
 Residual
-    predicted - measured, in pixels, unwhitened; sigmas in pixels stand in the noise.
+    predicted - measured, in pixels, unwhitened; sigmas in pixels belong to the noise model.
 Pixels
     The centre of the top-left pixel is (0, 0), as in OpenCV.
 Variables

@@ -34,7 +34,7 @@ def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
     """A (size, size) symmetric positive-definite covariance."""
     covariance = checked_array(what, value, (size, size))
     scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    # beside the sigmas: rounding leaves 1e-25 where a zero stands, of either sign
+    # relative to the sigmas: an entry that is zero but for rounding may be 1e-25, of either sign
     if (np.abs(covariance - covariance.T) > 1e-6 * np.outer(scale, scale)).any():
         raise FactorError(what, "an unsymmetric matrix", "a symmetric covariance")
     smallest = float(np.linalg.eigvalsh(covariance / np.outer(scale, scale))[0])

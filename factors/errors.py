@@ -7,7 +7,7 @@ MAX_MESSAGE = 1200
 
 
 def printable(text: object, limit: int = MAX_MESSAGE) -> str:
-    """``text`` as it may stand in a message: no control character, and at most ``limit`` characters.
+    """``text`` as a message may contain it: no control character, and at most ``limit`` characters.
 
     Line breaks, escape sequences, direction marks and lone surrogates appear as in a Python literal
     (``\\n``, ``\\x1b``), so that no file's content reaches a terminal as anything but text. What is too

@@ -1,4 +1,4 @@
-"""Motion-based factors: the LiDAR's own motion against the camera's, no common sight needed.
+"""Motion-based factors: the LiDAR's own motion against the camera's, without a common field of view.
 
     c1Tc2 = cTl . l1Tl2(d) . cTl^-1,    l1Tl2(d) = Exp(-l_twist_1 d) . l1Tl2 . Exp(l_twist_2 d)
 
@@ -31,7 +31,7 @@ MotionError = Callable[[gtsam.Pose3, bool], tuple[FloatArray, FloatArray | None]
 """Of a predicted motion of the camera: error (6,) and derivative (6, 6) by its right perturbation."""
 
 LOW_TRANSLATION_M = 0.02
-"""Below this length [m] of the predicted translation its direction says less and less."""
+"""Below this length [m] of the predicted translation its direction is known less and less well."""
 
 
 def hand_eye_factor(

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 class Alignment:
     """Matches (lP_i, q_i) of one image, frozen for an inner optimisation.
 
-    Those of many images of one camera can stand in one, too, where each match has its own ``c_acceleration``;
+    One alignment may hold the matches of many images of one camera, each match with its ``c_acceleration``;
     :func:`sst_graph.factors.residuals` then takes a twist for each. A factor has the matches of one image.
 
     Shapes are checked and arrays copied (read-only) once, here. No match at all (n = 0) is allowed.
@@ -40,7 +40,7 @@ class Alignment:
         motion_model: "se3" or the first-order "translation" (see :mod:`sst_graph.factors.motion`).
         weights: (n,) or one number: factor on the cost of each match (after the kernel).
         l_velocities: (n, 3) velocity over ground of the object that each point lies on, in the LiDAR frame
-            [m/s], or None where all stand.
+            [m/s], or None where all are static.
     """
 
     camera: PinholeCamera
@@ -98,8 +98,8 @@ class Alignment:
             c_acceleration: (6,) of that image's twist [rad/s^2, m/s^2].
         """
         some = self._some(index, c_acceleration)
-        stands = some.l_velocities is not None and not some.l_velocities.any()
-        return replace(some, l_velocities=None) if stands else some
+        static = some.l_velocities is not None and not some.l_velocities.any()
+        return replace(some, l_velocities=None) if static else some
 
     def _some(self, index: slice | NDArray[np.intp], c_acceleration: FloatArray) -> Alignment:
         return replace(

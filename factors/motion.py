@@ -35,7 +35,7 @@ MotionModel = Literal["se3", "translation"]
 
 _TERMS = 10
 _SERIES_LIMIT = 1.0
-"""Below this squared angle [rad^2] the power series (exact to 1e-16) stand in for the closed forms."""
+"""Below this squared angle [rad^2] the power series (exact to 1e-16) replaces the closed forms."""
 
 
 def write_cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
@@ -250,7 +250,7 @@ def move_points(
         c_acceleration: (6,) or (6, n) its rate of change [rad/s^2, m/s^2].
         model: see :data:`MotionModel`.
         l_velocities: (3, n) velocity u over ground of the object that each point lies on, in the LiDAR frame
-            [m/s]; None where all stand.
+            [m/s]; None where all are static.
     """
     one_motion = c_twist.ndim == 1 and c_acceleration.ndim == 1
     if l_velocities is not None or not one_motion:

@@ -5,9 +5,9 @@
     lTs = lTb . wTb_a^-1 . wTb_s . bTl
 
 X_a and X_b are two poses of the trajectory around the image's instant, ``seconds`` apart, between which
-the body moves with one twist; tau is the interval from X_a to the image, so that the camera stands at
+the body moves with one twist; tau is the interval from X_a to the image, so that the camera is at
 the pose interpolated between X_a and X_b. The scan was taken at X_s, X_a itself by default (lTs = 1): a
-scan of long ago then ties X_s to X_a and X_b, which is what makes a trajectory better.
+scan at an earlier pose constrains X_s relative to X_a and X_b, which improves the trajectory.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def pose_alignment_factor(
 ) -> gtsam.CustomFactor:
     """1/2 |error|^2 = sum_i weight_i rho(|r_i| / sigma_i), r_i as in the module, of one image [px].
 
-    All alignments of the image stand in one factor on the user's own keys.
+    One factor on the user's own keys for all alignments of the image.
 
     Goes into any ``NonlinearFactorGraph``, LM, iSAM2 or fixed-lag smoother. Its matches are frozen: make
     a new one when the estimate has moved by more than about a pixel.

@@ -7,7 +7,7 @@ in pixels, with cP_i = Exp(-tau_i w_i) . (cTl . lP_i) (:mod:`sst_graph.factors.m
 projection; sources: SST-Calib (Kodaira et al., ITSC 2022), eq. 2-6, for the first.
 
 Behind the camera. A point that is not :meth:`PinholeCamera.in_front` has no pixel: its rows are zero,
-residual and Jacobian, so it pulls nowhere. In the *cost* it counts as a match whose residual is the
+residual and Jacobian, so it has no gradient. In the *cost* it counts as a match whose residual is the
 image's diagonal. So a step never gains by pushing matches behind the camera, and with a bounded
 kernel, whose loss is already flat there, the cost does not jump either.
 """

@@ -50,7 +50,7 @@ class RobustKernel:
         return np.asarray(np.square(np.maximum(1.0 - z, 0.0)))
 
     def curvature(self, x: ArrayLike) -> FloatArray:
-        """rho''(x), any shape: negative where a kernel bends over."""
+        """rho''(x), any shape: negative where a kernel redescends."""
         x = np.asarray(x, dtype=np.float64)
         if self.kind == "none":
             return np.ones_like(x)

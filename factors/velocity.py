@@ -21,7 +21,7 @@ from .motion import twist_ad
 FloatArray = NDArray[np.float64]
 
 LOW_SPEED_MPS = 0.5
-"""Below this speed [m/s] a direction of motion says less and less; see velocity_direction_factor."""
+"""Below this speed [m/s] a direction of motion is known less and less well; see velocity_direction_factor."""
 
 
 def velocity_factor(V_key: int, c_twist: ArrayLike, covariance: ArrayLike) -> gtsam.PriorFactorVector:

@@ -12,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import TypeVar, cast
 
-from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.types import Frame
 
 FOLDER = "SST_GRAPH_TEST_FOLDER"
@@ -30,7 +30,7 @@ def stored(key: object, make: Callable[[], T]) -> T:
     folder = os.environ.get(FOLDER)
     if folder is None:  # outside pytest
         return make()
-    path = Path(folder, hashlib.sha256(repr(key).encode()).hexdigest())
+    path = Path(folder, _name(key))
     with open(path, "a+b") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         file.seek(0)
@@ -40,6 +40,10 @@ def stored(key: object, make: Callable[[], T]) -> T:
         result = make()
         file.write(pickle.dumps(result, pickle.HIGHEST_PROTOCOL))
         return result
+
+
+def _name(key: object) -> str:
+    return hashlib.sha256(repr(key).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -57,3 +61,13 @@ class StoredDrive(SimulatedDrive):
 def simulated(config: SimulationConfig) -> StoredDrive:
     """As :func:`sst_graph.simulator.simulate`, but each frame is rendered once a session."""
     return StoredDrive(**vars(simulate(config)))
+
+
+def written(config: SimulationConfig) -> Path:
+    """Folder ``street`` of a simulated drive, written once a session; for reading only."""
+    folder = Path(os.environ[FOLDER], _name(config) + "-written", "street")
+    with open(folder.parent.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            write_drive(simulate(config), folder)
+    return folder

@@ -58,9 +58,9 @@ class FactorRecipe:
         def callback(
             this: gtsam.CustomFactor, values: gtsam.Values, H: list[FloatArray] | None
         ) -> FloatArray:
-            asked = _ASKED.get()
-            if asked is not None:
-                asked.append(self)
+            request = _REQUEST.get()
+            if request is not None:
+                request.append(self)
                 return np.zeros(rows)
             arguments = [reader.read(values) for reader in readers]
             error, jacobians = function(*arguments, jacobians=H is not None)
@@ -76,27 +76,27 @@ class FactorRecipe:
         return gtsam.CustomFactor(self.noise, keys, callback)
 
 
-_ASKED: ContextVar[list[FactorRecipe] | None] = ContextVar("recipe asked for", default=None)
+_REQUEST: ContextVar[list[FactorRecipe] | None] = ContextVar("recipe", default=None)
 """Where a factor's callback leaves its recipe instead of doing its work; see :func:`recipe_of`."""
 
 
 def recipe_of(factor: gtsam.NonlinearFactor) -> FactorRecipe | None:
     """What a factor was made of; None for one that :func:`custom_factor` did not make.
 
-    gtsam gives the callback of a ``CustomFactor`` back to nobody, but it calls it: the callback is asked for
-    its recipe. A ``CustomFactor`` of somebody else is called on empty values, and may raise or not.
+    gtsam has no accessor for the callback of a ``CustomFactor``, so the callback is called and hands out its
+    recipe. That of a ``CustomFactor`` made elsewhere is called on empty values, and may raise or not.
     """
     if not isinstance(factor, gtsam.CustomFactor):
         return None
-    asked: list[FactorRecipe] = []
-    token = _ASKED.set(asked)
+    found: list[FactorRecipe] = []
+    token = _REQUEST.set(found)
     try:
         factor.unwhitenedError(gtsam.Values())
-    except Exception:  # another's callback, which knows nothing of this question
+    except Exception:  # a callback made elsewhere
         return None
     finally:
-        _ASKED.reset(token)
-    return asked[0] if asked else None
+        _REQUEST.reset(token)
+    return found[0] if found else None
 
 
 def custom_factor(

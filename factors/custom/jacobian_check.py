@@ -69,11 +69,11 @@ def check_jacobians(
     extrapolated to zero (Richardson): for smooth factors good to about 1e-10.
 
     A *condensed* or robustly weighted factor has no residual whose derivative its Jacobian is: its
-    linearization stands for the cost's gradient and Gauss-Newton Hessian. Use :func:`check_gradient`.
+    linearization has the cost's gradient and Gauss-Newton Hessian. Use :func:`check_gradient`.
 
     Args:
         factor: any NoiseModelFactor, a CustomFactor for instance, without a robust noise model.
-        values: point of comparison; take a generic one (no zero delay, no identity).
+        values: point of comparison; take a generic one (no zero time offset, no identity).
         tolerance: greatest relative error that passes.
         step: h, in the units of the tangent space (rad, m, s).
 

@@ -1,4 +1,4 @@
-"""Keys and variables of a factor: what may stand for one, and how its value is read.
+"""Keys and variables of a factor: what a caller may give for one, and how its value is read.
 
 A *kind* says what a factor wants of a variable: a tangent dimension that any type may have, a class of
 gtsam (``gtsam.Pose3``), or :class:`Vector`. A scalar, ``Vector(1)``, may be kept as a ``double`` as well:
@@ -59,7 +59,7 @@ _A_KEY = "a key: an int, as gtsam.symbol gives it, or a gtsam.Symbol"
 
 
 def is_key(value: Any) -> bool:
-    """Whether ``value`` stands for a variable, not for a constant."""
+    """Whether ``value`` is meant as a variable's key, not as a constant."""
     return isinstance(value, int | np.integer | gtsam.Symbol | gtsam.LabeledSymbol | bool | np.bool_)
 
 
@@ -100,7 +100,7 @@ def number_or_key(factor: str, argument: str, value: Any) -> int | float:
         array = np.zeros(0)
     if value is None or array.shape not in ((), (1,)) or not np.isfinite(array).all():
         raise FactorError(f"{argument} of {factor}", described(value), f"a finite float, or {_A_KEY}")
-    return float(array.reshape(()))
+    return float(array.item())
 
 
 def checked_keys(factor: str, keys: Sequence[Any] | Mapping[str, Any]) -> dict[int, str]:

@@ -83,12 +83,16 @@ class Run:
         return float(square / (some.stop - some.start))
 
 
-def run(config: ConsistencyConfig, progress: Progress | None = None) -> str:
-    """A Markdown table, one row for every kind of drive and one for all."""
+def run(
+    config: ConsistencyConfig,
+    progress: Progress | None = None,
+    drives: Mapping[str, tuple[str, Mapping[str, Any]]] = DRIVES,
+) -> str:
+    """A Markdown table, one row for every kind of drive and one for all; ``drives`` as :data:`DRIVES`."""
     rows = [_HEADER, "|---|---|---|---|---|---|---|"]
     everything: list[Run] = []
     for name in config.drives:
-        title, drive = DRIVES[name]
+        title, drive = drives[name]
         runs = []
         for number in range(config.runs):
             runs.append(_run(drive, config.seed + number, config))

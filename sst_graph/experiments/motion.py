@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -78,13 +78,22 @@ class Outcome:
     seconds: float
 
 
-def run(config: MotionTableConfig, progress: Progress | None = None) -> str:
-    """Every run on every street of every drive, as a Markdown table of medians and worst cases."""
+def run(
+    config: MotionTableConfig,
+    progress: Progress | None = None,
+    outcomes_of: Callable[[MotionTableConfig, str, int], list[Outcome]] | None = None,
+) -> str:
+    """Every run on every street of every drive, as a Markdown table of medians and worst cases.
+
+    Args:
+        outcomes_of: of the name of a drive and the number of a street; :func:`street_outcomes` by default.
+    """
+    outcomes_of = outcomes_of or street_outcomes
     rows = [_HEADER, _RULE]
     for name in config.drives:
         outcomes: list[Outcome] = []
         for number in range(config.streets):
-            outcomes += street_outcomes(config, name, number)
+            outcomes += outcomes_of(config, name, number)
             if progress is not None:
                 progress(name, number + 1, config.streets)
         rows += [_row(name, label, [o for o in outcomes if o.run == label]) for label in RUNS]

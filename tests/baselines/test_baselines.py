@@ -9,7 +9,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from stored import simulated
+from stored import simulated, written
 
 from sst_graph.association.nearest import ClassView
 from sst_graph.baselines.nearest_pixel_frames import (
@@ -32,7 +32,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.factors import beta_regularizer
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult, read_result
-from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import GroundTruth, SemanticClass
 
 METHODS = ("paper", "static", "semalign")
@@ -54,11 +54,9 @@ STREET = SimulationConfig(
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def street() -> Path:
     """A street on disk with exact labels: seven frames at rest, then an acceleration to 6 m/s."""
-    folder = tmp_path_factory.mktemp("data") / "street"
-    write_drive(simulate(STREET), folder)
-    return folder
+    return written(STREET)
 
 
 @pytest.fixture(scope="module")

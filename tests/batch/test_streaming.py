@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stored import written
 from streets import standing_street
 
 from sst_graph import open_source
@@ -23,7 +24,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files import array_store as shelf
 from sst_graph.result import CalibrationResult, FrameId
-from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -117,14 +118,12 @@ def opened_files() -> Iterator[Counter[str]]:
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def street() -> Path:
     """Ten frames on disk, of a street driven along, without times of the points."""
     config = SimulationConfig(
         seed=5, frames=10, width=414, height=125, azimuth_step_deg=0.6, motion="no_stop", speed_mps=8.0
     )
-    path = tmp_path_factory.mktemp("drive") / "street"
-    write_drive(simulate(config), path)
-    return path
+    return written(config)
 
 
 def of_folders(opened: Counter[str], *folders: str) -> dict[str, int]:

@@ -32,16 +32,15 @@ def test_a_row_by_hand() -> None:
     )
 
 
-def test_every_drive_and_run_has_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_drive_and_run_has_its_row() -> None:
     seen: list[tuple[str, int]] = []
 
     def outcomes(config: MotionTableConfig, name: str, number: int) -> list[Outcome]:
         seen.append((name, number))
         return [outcome(label, 0.1 * (number + 1), 0.001) for label in motion.RUNS]
 
-    monkeypatch.setattr(motion, "street_outcomes", outcomes)
     steps: list[tuple[str, int, int]] = []
-    table = motion.run(MotionTableConfig(streets=2), lambda *step: steps.append(step))
+    table = motion.run(MotionTableConfig(streets=2), lambda *step: steps.append(step), outcomes)
     assert len(table.splitlines()) == 2 + len(motion.DRIVES) * len(motion.RUNS)
     assert len(seen) == len(steps) == 2 * len(motion.DRIVES)
     assert {line.count("|") for line in table.splitlines()} == {9}

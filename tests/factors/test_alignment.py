@@ -271,3 +271,22 @@ def test_silhouettes_of_a_circle_give_the_distance_to_it():
 def test_a_silhouette_needs_normals(make_scene):
     with pytest.raises(FactorError, match="no normals"):
         silhouette_factor(make_scene(0)[0], E)
+
+
+def test_a_factor_is_condensed_unless_it_is_asked_not_to_be(make_scene):
+    points, contour = make_scene(0)[0], make_scene(0, normals=True)[0]
+    for make in (*FACTORIES.values(), lambda *args, **options: frame_factor([args[0]], *args[1:], **options)):
+        assert make(points, E, D, V).noiseModel().dim() == 13 + 2
+        assert make(points, E, D, V, condensed=False).noiseModel().dim() == 2 * len(points) + 1
+        assert make(points, E).noiseModel().dim() == 6 + 2  # offset and twist are zero
+    assert silhouette_factor(contour, E, D, V, B).noiseModel().dim() == 14 + 2
+    assert silhouette_factor(contour, E, D, V, B, condensed=False).noiseModel().dim() == len(contour) + 1
+
+
+def test_offset_and_twist_are_zero_where_they_are_not_given(make_scene):
+    points, contour = make_scene(0)[0], make_scene(0, normals=True)[0]
+    values = gtsam.Values()
+    values.insert(E, make_scene(0)[1])
+    for make, alignment in ((point_to_pixel_factor, points), (silhouette_factor, contour)):
+        expected = alignment_cost(alignment, values.atPose3(E), 0.0, np.zeros(6))
+        assert make(alignment, E).error(values) == pytest.approx(expected, rel=1e-12)

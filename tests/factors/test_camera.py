@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from sst_graph.factors import PinholeCamera
+from sst_graph.factors import MIN_DEPTH_M, PinholeCamera
 
 CAMERA = PinholeCamera(700.0, 710.0, 600.0, 180.0, 1242, 375)
 
@@ -36,3 +36,14 @@ def test_derivative():
         step = h * np.eye(3)[axis]
         numerical = (CAMERA.project(cPs + step) - CAMERA.project(cPs - step)) / (2.0 * h)
         np.testing.assert_allclose(CAMERA.uv_H_cP(cPs)[:, :, axis], numerical, rtol=1e-6, atol=1e-6)
+
+
+def test_the_matrix_projects_as_well():
+    cPs = np.random.default_rng(2).uniform([-5, -2, 3], [5, 2, 40], (20, 3))
+    homogeneous = cPs @ CAMERA.matrix.T
+    np.testing.assert_allclose(homogeneous[:, :2] / homogeneous[:, 2:], CAMERA.project(cPs), rtol=1e-12)
+
+
+def test_in_front_is_beyond_the_least_depth():
+    cPs = np.array([[0.0, 0.0, MIN_DEPTH_M], [9.0, 9.0, MIN_DEPTH_M + 1e-9], [9.0, 9.0, -1.0]])
+    assert CAMERA.in_front(cPs).tolist() == [False, True, False]

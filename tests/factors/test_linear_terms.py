@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -113,3 +115,22 @@ def test_wrong_terms_are_named() -> None:
         frame_factor([part], E, D, None, B, terms=[[LinearTerm(N, np.zeros(3))]])
     with pytest.raises(FactorError, match="key"):
         frame_factor([part], E, D, None, B, terms=[[LinearTerm(E, np.zeros(30))]])
+
+
+@pytest.mark.parametrize("condensed", [True, False])
+def test_a_point_behind_the_camera_tells_nothing_of_a_term(condensed: bool) -> None:
+    part, column = silhouettes(4, 12), np.linspace(1.0, 2.0, 12)
+    points = part.lPs.copy()
+    points[3, 0] = -10.0
+    behind = dataclasses.replace(part, lPs=points)
+    front = part.take(np.delete(np.arange(12), 3))
+    values = values_at(0.3, 0.0)
+    twist = np.zeros(6)
+    both = [
+        frame_factor([matches], E, D, twist, B, terms=[[LinearTerm(N, own)]], condensed=condensed)
+        for matches, own in ((behind, column), (front, np.delete(column, 3)))
+    ]
+    hessians = [factor.linearize(values).augmentedInformation()[:-1, :-1] for factor in both]
+    np.testing.assert_allclose(*hessians, rtol=1e-9, atol=1e-9 * np.abs(hessians[0]).max())
+    costs = [factor.error(values_at(theta, 0.0)) for factor in both for theta in (0.3, 0.4)]
+    assert costs[1] - costs[0] == pytest.approx(costs[3] - costs[2], rel=1e-9)

@@ -61,3 +61,78 @@ def test_travels_to_other_processes():
     assert (alignment.lPs == GOOD["lPs"]).all()
     error = pickle.loads(pickle.dumps(FactorError("x", "y", "z")))
     assert str(error) == "x: found y, expected z"
+
+
+def distinct(**changes):
+    """Four matches whose numbers are all different."""
+    numbers = iter(range(1, 1000))
+
+    def of(*shape):
+        return np.array([next(numbers) for _ in range(int(np.prod(shape)))], float).reshape(shape)
+
+    given = {"lPs": of(4, 3), "base_taus_s": of(4), "pixels": of(4, 2), "sigmas_px": of(4), "weights": of(4)}
+    return Alignment(CAMERA, **given | {"l_velocities": of(4, 3), "c_acceleration": of(4, 6)} | changes)
+
+
+def test_some_of_the_matches_by_position():
+    whole, index = distinct(normals=np.tile([0.6, 0.8], (4, 1)) * [[1], [-1], [1], [-1]]), np.array([3, 0])
+    some = whole.take(index)
+    assert len(some) == 2
+    for name in (
+        "lPs",
+        "base_taus_s",
+        "pixels",
+        "sigmas_px",
+        "weights",
+        "l_velocities",
+        "c_acceleration",
+        "normals",
+    ):
+        np.testing.assert_array_equal(getattr(some, name), getattr(whole, name)[index])
+    one = distinct(c_acceleration=np.arange(6.0), l_velocities=None).take(index)
+    assert one.normals is None and one.l_velocities is None
+    np.testing.assert_array_equal(one.c_acceleration, np.arange(6.0))
+
+
+def test_the_matches_of_one_image_have_its_acceleration_and_no_velocities_of_zero():
+    velocities = np.zeros((4, 3))
+    velocities[2, 1] = 1.0
+    whole = distinct(l_velocities=velocities)
+    one = whole.of_one_image(slice(0, 2), np.ones(6))
+    assert one.l_velocities is None and len(one) == 2
+    np.testing.assert_array_equal(one.c_acceleration, np.ones(6))
+    assert whole.of_one_image(slice(1, 3), np.ones(6)).l_velocities is not None
+
+
+def test_columns_are_the_rows_turned():
+    whole = distinct()
+    lPs, pixels, normals = whole.columns
+    assert normals is None and whole.rows_per_match == 2
+    assert lPs.flags.c_contiguous and pixels.flags.c_contiguous and whole.velocity_columns.flags.c_contiguous
+    np.testing.assert_array_equal(lPs, whole.lPs.T)
+    np.testing.assert_array_equal(pixels, whole.pixels.T)
+    np.testing.assert_array_equal(whole.velocity_columns, whole.l_velocities.T)
+    assert Alignment(CAMERA, **GOOD).rows_per_match == 1
+    assert Alignment(CAMERA, **GOOD).velocity_columns is None
+
+
+def test_no_match_at_all_has_no_common_time():
+    none = Alignment(CAMERA, np.zeros((0, 3)), 0.1, np.zeros((0, 2)), 1.0, np.zeros((0, 2)))
+    assert len(none) == 0 and none.common_tau_s is None
+
+
+def test_normals_are_unit_vectors_to_a_thousandth():
+    for length, ok in ((1.0 + 0.9e-3, True), (1.0 - 1.1e-3, False)):
+        normals = np.tile([0.6, 0.8], (4, 1))
+        normals[2] *= length
+        if ok:
+            Alignment(CAMERA, **(GOOD | {"normals": normals}))
+        else:
+            with pytest.raises(FactorError, match="unit vectors"):
+                Alignment(CAMERA, **(GOOD | {"normals": normals}))
+
+
+@pytest.mark.parametrize(("name", "value"), [("weights", 0.0), ("l_velocities", np.zeros((3, 3)))])
+def test_no_weight_of_zero_and_a_velocity_for_each(name, value):
+    with pytest.raises(FactorError):
+        Alignment(CAMERA, **(GOOD | {name: value}))

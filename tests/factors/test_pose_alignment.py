@@ -273,3 +273,10 @@ def test_refuses_what_makes_no_factor(make_scene):
     other = replace(alignment, c_acceleration=np.ones(6))
     with pytest.raises(FactorError, match="one for all"):
         pose_alignment_factor([alignment, other], X[0], X[1], E, D, SECONDS, image_after_middle_s=0.0)
+
+
+def test_a_factor_is_condensed_unless_it_is_asked_not_to_be(make_scene):
+    points = make_scene(1)[0]
+    assert pose_alignment_factor([points], X[0], X[1], E, D, SECONDS).noiseModel().dim() == 6 + 6 + 6 + 1 + 2
+    tall = pose_alignment_factor([points], X[0], X[1], E, D, SECONDS, condensed=False)
+    assert tall.noiseModel().dim() == 2 * len(points) + 1

@@ -113,6 +113,15 @@ def test_behind_the_camera_pulls_nowhere_and_costs_a_diagonal():
     assert alignment_cost(alignment, gtsam.Pose3(), 0.0, STILL) == pytest.approx(expected)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("point", [[0.0, 0.0, 0.0], [1.0, 2.0, 0.0], [1.0, 2.0, -0.1]])
+def test_a_point_in_the_plane_of_the_camera_is_behind_without_a_division_by_zero(point):
+    alignment = Alignment(CAMERA, [[1.0, 0.0, 10.0], point], 0.0, [[57.0, 40.0], [0.0, 0.0]], 2.0)
+    r, J = residuals(alignment, gtsam.Pose3(), 0.0, STILL)
+    np.testing.assert_allclose(r, [3.0, 0.0, 0.0, 0.0])
+    assert np.isfinite(J).all() and (J[[1, 3]] == 0.0).all()
+
+
 @pytest.mark.parametrize("kind", ["none", "huber", "cauchy", "geman_mcclure", "tukey"])
 def test_no_match_in_the_image_is_worse_than_one_behind(kind):
     # the cost must never fall when a step pushes a match that is seen behind the camera

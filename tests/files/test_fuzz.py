@@ -23,7 +23,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_no_mutated_input_brings_anything_down(inputs: Path) -> None:
     kinds = [kind for kind, (_, weight) in fuzz.KINDS.items() if weight]
-    cases = list(fuzz.cases(inputs, SEED, fuzz.plan(SEED, COUNT, kinds)))
+    cases = list(fuzz.cases(inputs, fuzz.Trials(SEED), fuzz.plan(SEED, COUNT, kinds)))
     assert [case for case in cases if case.verdict == "FAILURE"] == []
     assert len(cases) == COUNT and {case.kind for case in cases} == set(kinds)
     ends = Counter(case.verdict for case in cases)
@@ -32,13 +32,12 @@ def test_no_mutated_input_brings_anything_down(inputs: Path) -> None:
     assert ends["exit 0"] > 10 and ends["exit 2"] > 10
 
 
-def _case_of(monkeypatch: pytest.MonkeyPatch, inputs: Path, bad: str) -> fuzz.Case:
+def _case_of(inputs: Path, bad: str) -> fuzz.Case:
     def attempt(ground: fuzz.Ground, rng: np.random.Generator) -> None:
         exec(bad, {"np": np})
 
-    monkeypatch.setitem(fuzz.KINDS, "bad", (attempt, 1.0))
-    monkeypatch.setattr(fuzz, "MAX_SECONDS", 0.5)
-    (case,) = fuzz.cases(inputs, 1, [(0, "bad")])
+    trials = fuzz.Trials(1, {"bad": (attempt, 1.0)}, max_seconds=0.5)
+    (case,) = fuzz.cases(inputs, trials, [(0, "bad")])
     return case
 
 
@@ -54,15 +53,13 @@ def _case_of(monkeypatch: pytest.MonkeyPatch, inputs: Path, bad: str) -> fuzz.Ca
         (f"{IMPORTED}\ne = SstGraphError()\ne.args = ('a\\x1b',)\nraise e", "no printable line"),
     ],
 )
-def test_the_fuzzer_sees_what_is_wrong(
-    monkeypatch: pytest.MonkeyPatch, inputs: Path, bad: str, why: str
-) -> None:
-    case = _case_of(monkeypatch, inputs, bad)
+def test_the_fuzzer_sees_what_is_wrong(inputs: Path, bad: str, why: str) -> None:
+    case = _case_of(inputs, bad)
     assert case.verdict == "FAILURE" and why in case.why, case
 
 
-def test_an_error_of_the_package_is_no_failure(monkeypatch: pytest.MonkeyPatch, inputs: Path) -> None:
-    case = _case_of(monkeypatch, inputs, f"{IMPORTED}\nraise SstGraphError('a')")
+def test_an_error_of_the_package_is_no_failure(inputs: Path) -> None:
+    case = _case_of(inputs, f"{IMPORTED}\nraise SstGraphError('a')")
     assert (case.verdict, case.why) == ("error", "a")
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from stored import written
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
 from sst_graph.batch.motion_factor import belief_factor
@@ -29,7 +30,7 @@ from sst_graph.odometry.features import Tracks as ImageTracks
 from sst_graph.odometry.relative import DirectionMotion
 from sst_graph.odometry.visual import ImagePair
 from sst_graph.result import read_result
-from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import RelativeMotion
 
 TRUE = gtsam.Pose3(
@@ -231,9 +232,8 @@ def _config(**changes: object) -> CalibrationConfig:
 
 
 @pytest.fixture(scope="module")
-def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def street() -> Path:
     """A street of turns on disk, in small pictures."""
-    folder = tmp_path_factory.mktemp("data") / "street"
     config = SimulationConfig(
         seed=4,
         frames=20,
@@ -245,8 +245,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
         vehicle_density=0.3,
         time_offset_s=0.08,
     )
-    write_drive(simulate(config), folder)
-    return folder
+    return written(config)
 
 
 @pytest.mark.parametrize("start", ["dataset", "none"])
