@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
 SIGN = "t_lidar = t_camera_stamp + offset"
 
+_OLD_NAMES = {"time_offset": "delay", "time_offset_per_drive": "delay-per-drive"}
+"""Names of options that scripts may still use, by what they set."""
+
 
 class _Parser(argparse.ArgumentParser):
     """An argument parser that complains through :class:`ConfigError`."""
@@ -87,7 +90,10 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument("--seed", type=int, help="seed of the street and of all noise")
     simulate.add_argument("--frames", type=int, metavar="N", help="number of frames")
     simulate.add_argument(
-        "--delay", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
+        "--time-offset", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
+    )
+    simulate.add_argument(
+        f"--{_OLD_NAMES['time_offset']}", dest="time_offset", type=float, help=argparse.SUPPRESS
     )
     motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
     simulate.add_argument("--motion", metavar="NAME", help=motions)
@@ -128,7 +134,14 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
     )
     calibrate.add_argument(
-        "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
+        "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
+    )
+    calibrate.add_argument(
+        f"--{_OLD_NAMES['time_offset_per_drive']}",
+        dest="time_offset_per_drive",
+        action="store_true",
+        default=None,
+        help=argparse.SUPPRESS,
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)
@@ -147,7 +160,7 @@ def _add_estimate(command: _Parser) -> None:
     command.add_argument(
         "--estimate",
         metavar="NAMES",
-        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
+        help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
         "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
     )
 
@@ -247,7 +260,7 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     export = commands.add_parser(
         "export",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}; docs/export.md tells frames and signs.",
+        description=f"{text[0].upper()}{text[1:]}; docs/export.md states frames and signs.",
     )
     export.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     export.add_argument(
@@ -339,7 +352,7 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     source.add_argument(
         "--sweep",
         choices=("auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"),
-        help="times of the points: stored ones where there are, else what the scans tell (auto, default); "
+        help="times of the points: stored ones where there are, else what the scans show (auto, default); "
         "all at the stamp (compensated, or instant); as measured by a scanner that turns, seen from above, "
         "clockwise (or azimuth) or counterclockwise",
     )
@@ -354,7 +367,7 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
         "--sweep-stamp",
         choices=("forward", "start", "end"),
         help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
-        "forward (default), the turn begins or ends; no data tell it from a time offset",
+        "forward (default), the turn begins or ends; no data separate it from a time offset",
     )
 
 
