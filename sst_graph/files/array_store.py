@@ -1,4 +1,4 @@
-"""Arrays that are seldom asked for, kept out of memory: beyond a share of it, in an unnamed temporary file.
+"""Arrays that are seldom read, kept on disk: the first in memory, the others in an unnamed temporary file.
 
 A drive of any length then takes little more memory than a short one. What is read back is what was put there,
 bit by bit. The file has no name, so that nothing is left of it however the process ends; it lies where
@@ -28,7 +28,7 @@ that each is read in a tenth of a millisecond, and those of a long drive do not 
 
 
 class ArrayStore:
-    """Where arrays are kept."""
+    """Arrays in memory up to a number of bytes, the others in one temporary file."""
 
     def __init__(self, in_memory_bytes: int | None = None) -> None:
         """in_memory_bytes: of the first arrays, which stay in memory; by default :data:`IN_MEMORY_BYTES`."""
@@ -137,7 +137,7 @@ class _Place:
 
 
 class _Field:
-    """Attribute that is given an array, or one in an array store, and answers the array."""
+    """Attribute that accepts an array or a :class:`StoredArray`, and returns the array."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -159,7 +159,7 @@ def shape_of(instance: object, name: str) -> tuple[int, ...]:
 
 
 def storable(*names: str) -> Callable[[type[_T]], type[_T]]:
-    """Let fields of a dataclass take arrays in an array store as well, and answer the arrays; written above it."""
+    """Class decorator: the named fields accept a :class:`StoredArray` for an array, and return the array."""
 
     def declared(cls: type[_T]) -> type[_T]:
         for name in names:
