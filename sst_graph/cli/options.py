@@ -15,9 +15,6 @@ if TYPE_CHECKING:
 
 SIGN = "t_lidar = t_camera_stamp + offset"
 
-_OLD_NAMES = {"time_offset": "delay", "time_offset_per_drive": "delay-per-drive"}
-"""Names of options that scripts may still use, by what they set."""
-
 
 class _Parser(argparse.ArgumentParser):
     """An argument parser that complains through :class:`ConfigError`."""
@@ -93,7 +90,7 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
         "--time-offset", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
     )
     simulate.add_argument(
-        f"--{_OLD_NAMES['time_offset']}", dest="time_offset", type=float, help=argparse.SUPPRESS
+        "--delay", dest="time_offset", type=float, help=argparse.SUPPRESS
     )
     motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
     simulate.add_argument("--motion", metavar="NAME", help=motions)
@@ -134,14 +131,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
     )
     calibrate.add_argument(
-        "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
-    )
-    calibrate.add_argument(
-        f"--{_OLD_NAMES['time_offset_per_drive']}",
-        dest="time_offset_per_drive",
-        action="store_true",
-        default=None,
-        help=argparse.SUPPRESS,
+        "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)

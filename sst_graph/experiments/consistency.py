@@ -64,17 +64,17 @@ class Run:
         error: (7,) in the covariance's own coordinates.
         covariance: (7, 7).
         doubted: whether the status is a doubt.
-        tells_offset: whether the drive can tell the time offset: if not, it is the prior's and not judged.
+        offset_observable: whether the drive determines the time offset; if not, it is not compared.
     """
 
     error: FloatArray
     covariance: FloatArray
     doubted: bool
-    tells_offset: bool = True
+    offset_observable: bool = True
 
     def judged(self, part: slice) -> slice:
-        """Those of some of the seven that the drive can tell."""
-        return slice(part.start, part.stop if self.tells_offset else min(part.stop, 6))
+        """Those of some of the seven that the drive determines."""
+        return slice(part.start, part.stop if self.offset_observable else min(part.stop, 6))
 
     def nees(self, part: slice) -> float:
         """Normalised estimation error squared of some of the seven, over their number."""
@@ -109,7 +109,7 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     result = calibrate_prepared(prepared, start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
     doubted = result.status == "not_converged" or not result.frames_used
-    return Run(error, result.covariance, doubted, tells_offset=drive["motion"] != "standing")
+    return Run(error, result.covariance, doubted, offset_observable=drive["motion"] != "standing")
 
 
 def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:

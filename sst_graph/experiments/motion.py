@@ -1,4 +1,4 @@
-"""What motion alone tells on simulated streets, and what it adds to the joint method."""
+"""What motion alone determines on simulated streets, and what it adds to the joint method."""
 
 from __future__ import annotations
 

@@ -213,7 +213,7 @@ def _median(streets: Sequence[Street], row: str, name: str, digits: int) -> str:
 
 
 def _better(streets: Sequence[Street], name: str) -> str:
-    """In how many streets both together have the smaller error than the one alone that tells it."""
+    """In how many streets both together have the smaller error than the one alone that determines it."""
     alone = "SLAM alone" if name in list(MEASURES)[:3] else "calibration alone"
     count = sum(street.errors["both"][name] < street.errors[alone][name] for street in streets)
     return f"{count} of {len(streets)}"

@@ -116,7 +116,7 @@ class StoredArray:
         return self._kept.shape
 
     def get(self) -> NDArray[Any]:
-        """The array; read anew each time where it lies in the file."""
+        """The array; read again each time where it lies in the file."""
         kept = self._kept
         array = kept.store.read(kept.start, kept.dtype, kept.shape) if isinstance(kept, _Place) else kept
         return array.astype(self._dtype, copy=False)

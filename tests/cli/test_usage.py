@@ -104,10 +104,6 @@ def test_the_package_offers_its_names_on_demand() -> None:
     assert done.stdout == "[] True\n"
 
 
-def test_options_by_their_old_names() -> None:
+def test_the_old_name_of_an_option() -> None:
     parse = build_parser().parse_args
     assert parse(["simulate", "x", "--delay", "-0.1"]).time_offset == -0.1
-    old = "delay-per-drive"
-    assert parse(["calibrate", "x", f"--{old}"]).time_offset_per_drive is True
-    assert parse(["calibrate", "x"]).time_offset_per_drive is None
-    assert "--delay" not in build_parser().format_help()
