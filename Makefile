@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test lint demo bench lock clean
+.PHONY: setup test lint demo bench docs lock clean
 
 setup: $(INSTALLED)
 
@@ -33,6 +33,11 @@ demo: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -n 0
+
+# Pages that programs write.
+docs: $(INSTALLED)
+	$(BIN)/sst-graph settings --markdown > docs/settings.md
+	$(BIN)/python docs/make_api.py > docs/api.md
 
 # Fresh versions of everything, in a throw-away environment.
 lock:
