@@ -1,6 +1,6 @@
 """Settings by names that they do not have: the name, or what stands in their place.
 
-Names are dotted, as ``--set`` of ``calibrate`` takes them, of ``track`` for the tracker's own, or of experiments.
+Names are dotted, as ``--set`` of ``calibrate`` takes them; those of ``track`` and of experiments are their own.
 """
 
 from __future__ import annotations
