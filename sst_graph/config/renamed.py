@@ -1,6 +1,6 @@
 """Settings by names that they do not have: the name, or what stands in their place.
 
-Names are dotted, as ``--set`` of ``calibrate`` takes them; those of ``track`` and of experiments are their own.
+Names are dotted as ``--set`` takes them: of ``calibrate``, or of ``track`` and the experiments for their own.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ SIGNIFICANCE = 1e-3
 _ROUNDING = 1e-6
 """Information below zero by this share of the whole is rounding."""
 _FAR_SIGMA = 1e3
-"""A direction that a marginal does not determine has this sigma [rad, m, s]."""
+"""A direction that a marginal does not tell has this sigma [rad, m, s]."""
 
 
 def check_agreement(
@@ -38,7 +38,7 @@ def check_agreement(
 
     Raises:
         ContradictionError: they do not.
-        EstimationError: one is no solution of its own: it takes information away.
+        EstimationError: one is no answer of its own: it takes information away.
     """
     if len(parts) < 2 or significance <= 0.0:
         return
@@ -65,7 +65,7 @@ def check_agreement(
 
 
 def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:
-    """That each is a solution of its own, and no difference of two as a growing marginal's parts are."""
+    """That each is an answer of its own, and no difference of two as a growing marginal's parts are."""
     scale = np.sqrt(np.maximum(np.diag(np.sum(informations, axis=0)), 1e-300))
     for k, information in enumerate(informations):
         least = float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0])
@@ -78,6 +78,6 @@ def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> 
 
 
 def _answer(information: FloatArray, vector: FloatArray) -> PartAnswer:
-    """A cost's own optimum; a direction that it does not determine has a large variance."""
+    """A cost's own optimum; a direction that it does not tell has a large variance."""
     covariance = np.asarray(np.linalg.inv(information + np.eye(7) / _FAR_SIGMA**2), np.float64)
     return PartAnswer(covariance @ vector, covariance)
