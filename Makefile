@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test lint demo bench mutate lock clean
+.PHONY: setup test lint demo bench mutate docs lock clean
 
 setup: $(INSTALLED)
 
@@ -40,6 +40,11 @@ SAMPLE ?= 600
 mutate: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[mutation]'
 	$(BIN)/python benchmarks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
+
+# Pages that programs write.
+docs: $(INSTALLED)
+	$(BIN)/sst-graph settings --markdown > docs/settings.md
+	$(BIN)/python docs/make_api.py > docs/api.md
 
 # Fresh versions of everything, in a throw-away environment.
 lock:

@@ -48,7 +48,7 @@ CLASSES = {
 
 
 def run(street: Street, classes: tuple[SemanticClass, ...], guess: bool) -> tuple[list[float], str]:
-    """[rotation deg, ATD cm, delay ms, NEES rotation, translation, delay (each over its dimension), all]."""
+    """[rotation deg, ATD cm, time offset ms, NEES / dimension of rotation, translation, time offset, all]."""
     config, truth = street.config, street.truth
     rng = np.random.default_rng([config.seed, 99])
     away = np.concatenate([np.radians(rng.uniform(-12.0, 12.0, 3)), rng.uniform(-0.1, 0.1, 3)])
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--scenario", action="append", choices=sorted(SCENARIOS))
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    head = ("scenario", "off by more than 1 deg (status ok)", "rotation [deg]", "ATD [cm]", "delay [ms]")
+    head = ("scenario", "off by > 1 deg (status ok)", "rotation [deg]", "ATD [cm]", "time offset [ms]")
     print(
         "| "
         + " | ".join((*head, "NEES / dimension: r, t, d, all", "ok / unobservable / not converged"))

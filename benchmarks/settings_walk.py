@@ -44,9 +44,7 @@ QUICK = {"joint": ("start.enabled=false",), "semalign": ("semalign.starts=200",)
 TRACKING = (
     "window=8",
     "start_scans=3",
-    "restart_scans=2",
     "calibration.start.enabled=false",
-    "alarm.warm_up=1",
 )
 """Settings under which a few frames are enough for the tracker to start and go on."""
 

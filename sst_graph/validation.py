@@ -1,6 +1,6 @@
 """What a scan or an image must be, checked once where it enters an estimator.
 
-Both functions answer the same data in the documented dtypes (:mod:`sst_graph.types`), without a copy where
+Both functions return the same data in the documented dtypes (:mod:`sst_graph.types`), without a copy where
 nothing has to change. Whole numbers and floats of any width and byte order are converted where every value
 fits; everything else is refused with what was found and what was expected.
 """

@@ -63,6 +63,14 @@ def test_the_checker_finds_the_mistake_that_the_page_warns_of() -> None:
 
 
 def test_links_between_pages_lead_somewhere() -> None:
-    for page in DOCS.glob("*.md"):
+    for page in (*DOCS.glob("*.md"), DOCS.parent / "README.md"):
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_glossary_has_forty_terms_at_most() -> None:
+    rows = re.findall(
+        r"^\| (?!term|---)(.+)\|$", (DOCS / "glossary.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    assert 30 <= len(rows) <= 40
+    assert all(row.rsplit("|", 1)[1].strip() for row in rows)  # each has its source

@@ -59,7 +59,7 @@ def _discard_stdout() -> None:
 
 def complain(text: str) -> None:
     """One line on stderr, whatever the text holds."""
-    # Where nobody can be told, the exit code still tells.
+    # Where nobody reads it, the exit code still says it.
     with suppress(OSError, ValueError):
         sys.stderr.write(_shown("sst-graph: " + " ".join(text.split()) + "\n", sys.stderr))
         sys.stderr.flush()

@@ -87,7 +87,10 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument("--seed", type=int, help="seed of the street and of all noise")
     simulate.add_argument("--frames", type=int, metavar="N", help="number of frames")
     simulate.add_argument(
-        "--delay", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
+        "--time-offset", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
+    )
+    simulate.add_argument(
+        "--delay", dest="time_offset", type=float, help=argparse.SUPPRESS
     )
     motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
     simulate.add_argument("--motion", metavar="NAME", help=motions)
@@ -147,7 +150,7 @@ def _add_estimate(command: _Parser) -> None:
     command.add_argument(
         "--estimate",
         metavar="NAMES",
-        help="estimate what is otherwise taken for granted, with the calibration: some of focal, cx, cy, k1, "
+        help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
         "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
     )
 
@@ -247,7 +250,7 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     export = commands.add_parser(
         "export",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}; docs/export.md tells frames and signs.",
+        description=f"{text[0].upper()}{text[1:]}; docs/export.md states frames and signs.",
     )
     export.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     export.add_argument(
@@ -339,7 +342,7 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     source.add_argument(
         "--sweep",
         choices=("auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"),
-        help="times of the points: stored ones where there are, else what the scans tell (auto, default); "
+        help="times of the points: stored ones where there are, else what the scans show (auto, default); "
         "all at the stamp (compensated, or instant); as measured by a scanner that turns, seen from above, "
         "clockwise (or azimuth) or counterclockwise",
     )
@@ -354,7 +357,7 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
         "--sweep-stamp",
         choices=("forward", "start", "end"),
         help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
-        "forward (default), the turn begins or ends; no data tell it from a time offset",
+        "forward (default), the turn begins or ends; no data separate it from a time offset",
     )
 
 

@@ -1,4 +1,4 @@
-"""What the commands leave behind: kinds of outputs, a calibration's files, and a verdict on stderr."""
+"""What the commands leave behind: kinds of outputs, a calibration's files, and the exit code of a result."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def write_calibration(
     return [RESULT_NAME, "report.md", *pictures]
 
 
-def verdict(result: CalibrationResult) -> int:
+def exit_code(result: CalibrationResult) -> int:
     """Exit code of a result; one line on stderr says why it is not to be trusted."""
     if result.status == "ok":
         return 0

@@ -79,7 +79,7 @@ def _at_true_time(drive: RecentReader, position: int, offset_s: float) -> tuple[
 def camera_twist(drive: RecentReader, position: int, cTl: gtsam.Pose3) -> FloatArray | None:
     """(6,) twist of the camera [rad/s, m/s] at a frame, by LiDAR odometry over it and its neighbours.
 
-    None where the motion cannot be told.
+    None where the motion is unknown.
     """
     around = map(drive.scan, range(max(0, position - 1), min(len(drive), position + 2)))
     motions = lidar_odometry(scan for scan in around if scan is not None)

@@ -119,7 +119,7 @@ def _decode(path: Path, flags: int, size: Size | None) -> NDArray[Any]:
 
 
 def _tells_damage(line: str) -> bool:
-    """Whether a decoder's line tells that pixels are missing or wrong; libpng warns of much besides."""
+    """Whether a decoder's line says that pixels are missing or wrong; libpng warns of much besides."""
     if line.startswith("libpng warning"):
         return "IDAT" in line
     return line.startswith(("libpng", "Corrupt", "Premature", "Inconsistent")) and _PADDING not in line

@@ -1,4 +1,4 @@
-"""Where the files of a KITTI drive lie, and that they go together."""
+"""Paths of the files of a KITTI drive, and whether they belong together."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
 
 
 def _point_times(folder: Path, scans: Mapping[int, Path]) -> dict[int, Path] | None:
-    """Times of the points, which need not be there, but if so then of every scan: no other tells them."""
+    """Times of the points: of every scan, or of none."""
     if not folder.is_dir():
         return None
     files = numbered_files(folder, (".bin",))

@@ -1,4 +1,4 @@
-"""What the order of the points in a spinning scanner's file tells: laser numbers."""
+"""What the order of the points in a spinning scanner's file shows: laser numbers."""
 
 from __future__ import annotations
 

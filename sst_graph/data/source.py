@@ -97,10 +97,9 @@ def loader_names() -> tuple[str, ...]:
 
 
 class ReadOptions(TypedDict, total=False):
-    """The fields of :class:`SourceOptions` by keyword; ``frames`` also as text, "A:B"."""
+    """The fields of :class:`SourceOptions` by keyword, besides ``frames``."""
 
     sequence: str | None
-    frames: str | slice | None
     image_shift: int
     camera: str
     cloud: str
@@ -110,20 +109,25 @@ class ReadOptions(TypedDict, total=False):
     sweep_stamp: SweepStamp
 
 
-def open_source(path: str | Path, *, loader: str = "auto", **options: Unpack[ReadOptions]) -> Source:
+def open_source(
+    path: str | Path,
+    *,
+    loader: str = "auto",
+    frames: str | slice | None = None,
+    **options: Unpack[ReadOptions],
+) -> Source:
     """Open a drive; frames are read when asked for.
 
     Args:
         path: root of the data set, or the folder of one sequence.
         loader: a registered format, or "auto" for the one that recognizes the path.
-        options: the fields of :class:`SourceOptions`; ``frames`` is a slice or "A:B" (scan indices A..B-1;
-            either may be left out).
+        frames: "A:B" (scan indices A..B-1; either may be left out) or a slice.
+        options: the other fields of :class:`SourceOptions`.
 
     Raises:
         DataError: nothing there, or data that cannot be used.
         ConfigError: an option that is unknown or out of range.
     """
-    frames = options.pop("frames", None)
     chosen = SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
     path = Path(path)
     if loader != "auto":

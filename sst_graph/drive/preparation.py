@@ -19,7 +19,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.image_edges import PictureConfig
 from sst_graph.features.lidar_edges import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.files.array_store import Shelf, shelvable
+from sst_graph.files.array_store import ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -57,7 +57,7 @@ class PrepareConfig(Settings):
     sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
 
 
-@shelvable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
+@storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
 @dataclass(frozen=True)
 class ScanFeatures:
     """What is kept of a scan.
@@ -84,19 +84,19 @@ class ScanFeatures:
     depth_offsets_s: NDArray[np.float32]
     undersides: dict[SemanticClass, Boundaries] = field(default_factory=dict)
 
-    def on(self, shelf: Shelf) -> ScanFeatures:
-        """The same with its points on a shelf, in the precision of the scan's."""
+    def stored_in(self, store: ArrayStore) -> ScanFeatures:
+        """The same with its points in an array store, in the precision of the scan's."""
         return replace(
             self,
-            lPs=shelf.put(self.lPs.astype(np.float32), np.float64),
-            classes=shelf.put(self.classes),
-            offsets_s=shelf.put(self.offsets_s.astype(np.float32), np.float64),
-            depth_lPs=shelf.put(self.depth_lPs),
-            depth_offsets_s=shelf.put(self.depth_offsets_s),
+            lPs=store.put(self.lPs.astype(np.float32), np.float64),
+            classes=store.put(self.classes),
+            offsets_s=store.put(self.offsets_s.astype(np.float32), np.float64),
+            depth_lPs=store.put(self.depth_lPs),
+            depth_offsets_s=store.put(self.depth_offsets_s),
         )
 
 
-@shelvable("mask")
+@storable("mask")
 @dataclass(frozen=True)
 class ImageFeatures:
     """What is kept of an image: its mask and the signed distance to each class's contour.
@@ -111,10 +111,10 @@ class ImageFeatures:
     mask: NDArray[np.uint8]
     contours: dict[SemanticClass, ContourMap]
 
-    def on(self, shelf: Shelf) -> ImageFeatures:
-        """The same with mask and distances on a shelf."""
-        contours = {c: contour.on(shelf) for c, contour in self.contours.items()}
-        return replace(self, mask=shelf.put(self.mask), contours=contours)
+    def stored_in(self, store: ArrayStore) -> ImageFeatures:
+        """The same with mask and distances in an array store."""
+        contours = {c: contour.stored_in(store) for c, contour in self.contours.items()}
+        return replace(self, mask=store.put(self.mask), contours=contours)
 
     def __getstate__(self) -> dict[str, Any]:
         """The mask, packed, and the picture's edges, not the distances that follow from them."""
@@ -239,7 +239,7 @@ def prepare_drive(
     progress: Progress | None = None,
     depth: bool = True,
 ) -> Drive:
-    """Read every frame of a source once and keep what calibration needs, most of it on a shelf.
+    """Read every frame of a source once and keep what calibration needs, most of it in an array store.
 
     Args:
         depth: keep points for the depth of image features, where these are tracked.
@@ -253,7 +253,7 @@ def prepare_drive(
     tracker = FeatureTracker(config.visual_odometry.features)
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor, shelf = LeftOut(), Surveyor(total), Shelf()
+    left_out, surveyor, store = LeftOut(), Surveyor(total), ArrayStore()
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
@@ -262,14 +262,14 @@ def prepare_drive(
             motion = odometry.add(frame.scan)
             if motion is not None:
                 motions.append(motion)
-            scans.append(scan_features(frame.index, frame.scan, classes, config, depth).on(shelf))
+            scans.append(scan_features(frame.index, frame.scan, classes, config, depth).stored_in(store))
         if frame.image is not None:
             if config.use_visual_odometry:
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
                     pairs.append(ImagePair(tracks, direction))
-            images.append(image_features(frame.index, frame.image, classes, config.picture).on(shelf))
+            images.append(image_features(frame.index, frame.image, classes, config.picture).stored_in(store))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:

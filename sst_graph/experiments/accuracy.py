@@ -138,7 +138,7 @@ def _street(scenario: Scenario, config: AccuracyConfig, seed: int) -> list[Outco
 
 _HEADER = (
     "| scenario | runs | failed (silent) | rotation [deg] median / p95 | ATD [cm] median / p95 "
-    "| delay [ms] median / p95 | NEES rotation, translation (of 3), all (of 7) "
+    "| time offset [ms] median / p95 | NEES rotation, translation (of 3), all (of 7) "
     "| ok / unobservable / not converged |"
 )
 _RULE = "|---|---|---|---|---|---|---|---|"
@@ -152,7 +152,7 @@ def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
     rotation = _spread([e.qad_deg for e in errors], 3)
     translation = _spread([100.0 * e.atd_m for e in errors], 2)
     standing = scenario.drive.get("motion") == "standing"
-    delay = "–" if standing else _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2)
+    time_offset = "–" if standing else _spread([1e3 * abs(e.time_offset_s or 0.0) for e in errors], 2)
     nees = [e.nees for e in errors if e.nees is not None]
     means = [np.mean([getattr(n, part) for n in nees]) for part in ("rotation", "translation", "joint")]
     counts = [sum(o.status == s for o in outcomes) for s in ("ok", "unobservable", "not_converged")]
@@ -162,7 +162,7 @@ def _row(scenario: Scenario, outcomes: Sequence[Outcome]) -> str:
         f"{len(failed)} ({silent})",
         rotation,
         translation,
-        delay,
+        time_offset,
         ", ".join(f"{mean:.1f}" for mean in means),
         " / ".join(map(str, counts)),
     ]

@@ -1,4 +1,4 @@
-"""Assumptions broken on purpose: which are found, and what the others do to the answer and its covariance."""
+"""Assumptions broken on purpose: which are found, and what the others do to the result and its covariance."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class AssumptionTableConfig(Settings):
         if self.in_sigmas and not self.sizes:
             raise ConfigError("in_sigmas: found no sizes, expected some, as in sizes=[2,5,10]")
         if self.in_sigmas and CLEAN not in (self.cases or CASES):
-            raise ConfigError("in_sigmas: cases leave out clean, expected it: it tells the deviations")
+            raise ConfigError("in_sigmas: cases leave out clean, expected it: it gives the deviations")
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def runs_of(config: AssumptionTableConfig, progress: Progress | None = None) -> 
 
 
 def _deviations(clean: Run) -> dict[str, float]:
-    """Of the parameters that a clean street tells of, by name."""
+    """Of the parameters that a clean street determines, by name."""
     return {
         name: sigma
         for name, (_, sigma) in clean.estimates.items()

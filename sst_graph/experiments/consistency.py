@@ -63,18 +63,18 @@ class Run:
     Attributes:
         error: (7,) in the covariance's own coordinates.
         covariance: (7, 7).
-        doubted: whether the status is a doubt.
-        tells_offset: whether the drive can tell the time offset: if not, it is the prior's and not judged.
+        not_converged: whether the result claims nothing.
+        offset_observable: whether the drive determines the time offset; if not, it is not compared.
     """
 
     error: FloatArray
     covariance: FloatArray
-    doubted: bool
-    tells_offset: bool = True
+    not_converged: bool
+    offset_observable: bool = True
 
     def judged(self, part: slice) -> slice:
-        """Those of some of the seven that the drive can tell."""
-        return slice(part.start, part.stop if self.tells_offset else min(part.stop, 6))
+        """Those of some of the seven that the drive determines."""
+        return slice(part.start, part.stop if self.offset_observable else min(part.stop, 6))
 
     def nees(self, part: slice) -> float:
         """Normalised estimation error squared of some of the seven, over their number."""
@@ -112,8 +112,8 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     start = start_near(simulated.truth.cTl, config.start_deg, config.start_m, rng)
     result = calibrate_prepared(prepared, start, config.calibration)
     error = _error(result.T_camera_lidar, result.time_offset_s, simulated.truth)
-    doubted = result.status == "not_converged" or not result.frames_used
-    return Run(error, result.covariance, doubted, tells_offset=drive["motion"] != "standing")
+    not_converged = result.status == "not_converged" or not result.frames_used
+    return Run(error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing")
 
 
 def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:
@@ -122,17 +122,17 @@ def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:
 
 
 _HEADER = (
-    "| drive | runs (doubted, lost) | NEES / dimension: rotation | translation | delay | all "
-    "| within 95 % intervals: rotation, translation, delay |"
+    "| drive | runs (not converged, wrong) | NEES / dimension: rotation | translation | time offset | all "
+    "| within 95 % intervals: rotation, translation, time offset |"
 )
 
 
-_PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "delay": slice(6, 7), "all": slice(0, 7)}
+_PARTS = {"rotation": slice(0, 3), "translation": slice(3, 6), "time offset": slice(6, 7), "all": slice(0, 7)}
 
 
 def row(title: str, runs: Sequence[Run], lost_deg: float) -> str:
-    """A row of the table. Doubted runs (no claim is made) and lost ones are counted, the rest judged."""
-    claimed = [r for r in runs if not r.doubted]
+    """A row of the table: runs that did not converge and wrong ones are counted and left out of the means."""
+    claimed = [r for r in runs if not r.not_converged]
     kept = [r for r in claimed if np.degrees(np.linalg.norm(r.error[:3])) < lost_deg]
     cells, cover = [], []
     for name, part in _PARTS.items():

@@ -1,4 +1,4 @@
-"""Real drives from many wrong starts: do all lead to one answer, and how far is it from the reference?"""
+"""Real drives from many wrong starts: do all lead to one result, and how far is it from the reference?"""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def run(config: DrivesConfig, progress: Progress | None = None) -> str:
 
 
 _HEADER = (
-    "| drive | shift | starts | spread of answers [deg] | rotation [deg] | ATD [cm] | delay error [ms] "
-    "| forward - speed x delay [cm] | status |"
+    "| drive | shift | starts | spread of results [deg] | rotation [deg] | ATD [cm] | time offset error [ms] "
+    "| forward - speed x time offset [cm] | status |"
 )
 
 
@@ -109,7 +109,7 @@ def _spread_deg(results: Sequence[CalibrationResult]) -> float:
 
 
 def _along(result: CalibrationResult, errors: CalibrationErrors, truth: GroundTruth, drive: Drive) -> float:
-    """Error of the shift along the road that a steady drive does tell: forward - speed x delay [m]."""
+    """Error of what a steady drive determines along the road: forward - speed x time offset [m]."""
     tracks = Tracks([drive])
     samples = [tracks.at(0, scan.stamp_ns) for scan in drive.scans]
     forward = [camera_twist(sample, truth.cTl).twist[5] for sample in samples if sample is not None]

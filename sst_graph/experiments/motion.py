@@ -1,4 +1,4 @@
-"""What motion alone tells on simulated streets, and what it adds to the joint method."""
+"""What motion alone determines on simulated streets, and what it adds to the joint method."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MotionTableConfig(Settings):
         seed: of the first street; the next ones follow.
         drives: names; all of them by default.
         frames: of each drive.
-        delay_s: true time offset; the first street's, the next ones have a quarter of a period more each [s].
+        time_offset_s: true time offset of the first street; each next one has a quarter of a period more [s].
         start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
         label_noise: of the simulator.
         calibration: settings of the methods.
@@ -53,18 +53,18 @@ class MotionTableConfig(Settings):
     seed: int = setting(300, at_least=0, at_most=10**15)
     drives: tuple[str, ...] = setting(tuple(DRIVES), length=(1, 100), choices=DRIVES)
     frames: int = setting(40, at_least=1, at_most=10_000)
-    delay_s: float = setting(0.1, at_least=-0.5, at_most=0.5)
+    time_offset_s: float = setting(0.1, at_least=-0.5, at_most=0.5)
     start_deg: float = setting(10.0, at_least=0.0, at_most=180.0)
     start_m: float = setting(0.1, at_least=0.0, at_most=100.0)
     label_noise: float = setting(1.0, at_least=0.0, at_most=2.0)
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
 
     def __post_init__(self) -> None:
-        latest_s = self.delay_s + 0.25 * (self.streets - 1) * SimulationConfig().period_s
+        latest_s = self.time_offset_s + 0.25 * (self.streets - 1) * SimulationConfig().period_s
         if latest_s > 0.5:
             raise ConfigError(
-                f"streets: found {self.streets}, whose time offsets grow from delay_s {self.delay_s:g} to "
-                f"{latest_s:.3g} s, expected offsets of at most 0.5 s"
+                f"streets: found {self.streets} whose offsets grow from time_offset_s {self.time_offset_s:g} "
+                f"to {latest_s:.3g} s, expected offsets of at most 0.5 s"
             )
 
 
@@ -105,8 +105,8 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
     street = SimulationConfig(
         seed=config.seed + number, frames=config.frames, label_noise=config.label_noise, **DRIVES[name]
     )
-    delay_s = config.delay_s + 0.25 * number * street.period_s
-    source = simulate(dataclasses.replace(street, time_offset_s=delay_s))
+    time_offset_s = config.time_offset_s + 0.25 * number * street.period_s
+    source = simulate(dataclasses.replace(street, time_offset_s=time_offset_s))
     drive = prepare_drive(source, config.calibration.classes, config.calibration.prepare)
     rng = np.random.default_rng([street.seed, 9])
     start = start_near(source.truth.cTl, config.start_deg, config.start_m, rng)
@@ -122,8 +122,9 @@ def street_outcomes(config: MotionTableConfig, name: str, number: int) -> list[O
 
 
 _HEADER = (
-    "| drive | run | rotation [deg] median / worst | ATD [cm] median / worst | delay [ms] median / worst "
-    "| NEES rotation, translation (of 3), all (of 7) | ok / unobservable / not converged | seconds |"
+    "| drive | run | rotation [deg] median / worst | ATD [cm] median / worst "
+    "| time offset [ms] median / worst | NEES rotation, translation (of 3), all (of 7) "
+    "| ok / unobservable / not converged | seconds |"
 )
 _RULE = "|---|---|---|---|---|---|---|---|"
 

@@ -42,7 +42,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         accuracy.run,
     ),
     "assumptions": Experiment(
-        "assumptions broken on purpose: which are found, and what the others do to the answer",
+        "assumptions broken on purpose: which are found, and what the others do to the result",
         assumptions.AssumptionTableConfig(),
         assumptions.run,
     ),
@@ -52,12 +52,12 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         consistency.run,
     ),
     "drives": Experiment(
-        "real drives from many wrong starts: one answer, and its distance from the reference",
+        "real drives from many wrong starts: one result, and its distance from the reference",
         drives.DrivesConfig(),
         drives.run,
     ),
     "motion": Experiment(
-        "what motion alone tells on simulated streets, and what it adds to the joint method",
+        "what motion alone determines on simulated streets, and what it adds to the joint method",
         motion.MotionTableConfig(),
         motion.run,
     ),
@@ -72,7 +72,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         slam.run,
     ),
     "windows": Experiment(
-        "real drives cut into windows: the spread of the answers against the claimed sigmas",
+        "real drives cut into windows: the spread of the results against the claimed sigmas",
         windows.WindowsConfig(),
         windows.run,
     ),

@@ -47,7 +47,7 @@ MEASURES = {
     "step translation [cm]": 3,
     "rotation [deg]": 4,
     "translation [cm]": 3,
-    "delay [ms]": 3,
+    "time offset [ms]": 3,
 }
 """Errors, the trajectory's first, and the digits that the table shows."""
 
@@ -66,7 +66,7 @@ class SlamConfig(Settings):
         seed: of the first street; the next ones follow.
         weathers: names; all of them by default.
         frames: of each drive.
-        delay_s: true time offset [s].
+        time_offset_s: true time offset [s].
         street: further settings of the simulator.
         registration, loops: LiDAR odometry and loop closures.
         camera: what the camera adds to the pose graph.
@@ -77,7 +77,7 @@ class SlamConfig(Settings):
     seed: int = setting(1, at_least=0, at_most=10**15)
     weathers: tuple[str, ...] = setting(tuple(WEATHERS), length=(1, 100), choices=WEATHERS)
     frames: int = setting(60, at_least=2, at_most=10_000)
-    delay_s: float = setting(0.05, at_least=-0.5, at_most=0.5)
+    time_offset_s: float = setting(0.05, at_least=-0.5, at_most=0.5)
     street: SimulationConfig = field(
         default_factory=lambda: SimulationConfig(
             width=621,
@@ -142,7 +142,7 @@ def run(config: SlamConfig, progress: Progress | None = None) -> str:
 def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     """SLAM alone, calibration alone, and both, on one street."""
     street = dataclasses.replace(config.street, seed=seed, frames=config.frames, **WEATHERS[weather])
-    source = simulate(dataclasses.replace(street, time_offset_s=config.delay_s))
+    source = simulate(dataclasses.replace(street, time_offset_s=config.time_offset_s))
     frames = tuple(source)
     drive = prepare_drive(Recording(source, frames), config.calibration.classes, config.calibration.prepare)
     scans = [RegisteredScan(frame.scan, config.registration) for frame in frames if frame.scan is not None]
@@ -213,7 +213,7 @@ def _median(streets: Sequence[Street], row: str, name: str, digits: int) -> str:
 
 
 def _better(streets: Sequence[Street], name: str) -> str:
-    """In how many streets both together have the smaller error than the one alone that tells it."""
+    """In how many streets both together have the smaller error than the one alone that determines it."""
     alone = "SLAM alone" if name in list(MEASURES)[:3] else "calibration alone"
     count = sum(street.errors["both"][name] < street.errors[alone][name] for street in streets)
     return f"{count} of {len(streets)}"

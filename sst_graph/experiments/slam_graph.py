@@ -44,7 +44,7 @@ class CameraGraphConfig(Settings):
         bias_sigma_px: prior deviation of the mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from the common one [px].
         nominal_rad, nominal_m: prior deviation of the extrinsic from the nominal one [rad], [m].
-        delay_sigma_s: prior deviation of the time offset from 0 [s].
+        time_offset_sigma_s: prior deviation of the time offset from 0 [s].
         between_rad, between_m: how far the body's motion is from one twist between two poses [rad], [m];
             added to the sigmas of visual odometry.
         silhouettes, visual_odometry: which of the camera's factors there are.
@@ -58,7 +58,7 @@ class CameraGraphConfig(Settings):
     object_bias_sigma_px: float = setting(0.5, at_least=0.001, at_most=1000.0)
     nominal_rad: float = setting(0.2, at_least=1e-5, at_most=100.0)
     nominal_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
-    delay_sigma_s: float = setting(1.0, at_least=1e-6, at_most=100.0)
+    time_offset_sigma_s: float = setting(1.0, at_least=1e-6, at_most=100.0)
     between_rad: float = setting(3.5e-4, at_least=0.0, at_most=10.0)
     between_m: float = setting(4e-3, at_least=0.0, at_most=100.0)
     silhouettes: bool = True
@@ -168,7 +168,7 @@ def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
 def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config: CameraGraphConfig) -> None:
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([config.nominal_rad, config.nominal_m], 3))
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, nominal, noise))
-    graph.add(time_offset_prior(DELAY, 0.0, config.delay_sigma_s))
+    graph.add(time_offset_prior(DELAY, 0.0, config.time_offset_sigma_s))
     graph.add(time_offset_prior(BIAS, 0.0, config.bias_sigma_px))
 
 

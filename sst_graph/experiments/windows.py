@@ -1,4 +1,4 @@
-"""Real drives cut into windows: do the answers spread as far as their covariances claim?"""
+"""Real drives cut into windows: do the results spread as far as their covariances claim?"""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class ExportOptions:
     Attributes:
         camera_frame: name of the camera's optical frame.
         lidar_frame: name of the LiDAR's frame.
-        kitti: calib.txt whose P lines tell where the camera stands beside camera 0; None takes the
+        kitti: calib.txt whose P lines say where the camera stands beside camera 0; None takes the
             camera itself for camera 0.
     """
 

@@ -5,7 +5,7 @@ The cost of a calibration (cTl, offset), in the tangent space of the linearizati
     0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - offset_0]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
-docs/export.md tells how a C++ program rebuilds it from the JSON.
+docs/export.md describes how a C++ program rebuilds it from the JSON.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def marginal_of_result(result: CalibrationResult) -> CalibrationMarginal:
     """The marginal of a calibration: its estimate, with the inverse of its cluster-robust covariance.
 
     Not the frozen graph's Hessian, which takes neighbouring matches for independent and is far too sure.
-    A direction that the data do not tell has a large, finite sigma in the result and so next to no
+    A direction that the data do not determine has a large, finite sigma in the result and so next to no
     information here.
 
     Raises:
@@ -132,7 +132,7 @@ def fuse_graphs(
     """Drives fused through their marginals until that equals one graph of all of them.
 
     Marginals taken each at its own drive's optimum miss that by some thousandths to hundredths of a sigma,
-    for no drive's cost is quadratic. So every drive's marginal is taken anew at the fused estimate
+    for no drive's cost is quadratic. So every drive's marginal is taken again at the fused estimate
     (:func:`marginal_of_graph` with ``at``), and fused again, until the estimate stands still. Only
     seven-vectors travel between the drives' machines.
 
@@ -149,7 +149,7 @@ def fuse_graphs(
 
     Raises:
         ContradictionError: the drives contradict one another.
-        EstimationError: a direction that no drive tells, or no standstill.
+        EstimationError: a direction that no drive determines, or no standstill.
     """
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
@@ -183,8 +183,8 @@ def fuse_marginals(
 
     Raises:
         ContradictionError: they contradict one another; the message names the worst and its step.
-        EstimationError: none given, a direction that none of them tells, one that takes information away (to
-            be added with ``significance=0``), or no optimum.
+        EstimationError: none given, a direction that none of them determines, one that takes information away
+            (to be added with ``significance=0``), or no optimum.
     """
     if not marginals:
         raise EstimationError("no marginal to fuse")

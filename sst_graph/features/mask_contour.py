@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.features.image_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
-from sst_graph.files.array_store import Shelf, shape_of, shelvable
+from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -46,10 +46,10 @@ class ContourFeet:
     valid: NDArray[np.bool_]
 
 
-@shelvable("distance", "unknown")
+@storable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
-    """Signed distance field of one class in one mask; on a shelf, it is read whenever it is asked for.
+    """Signed distance field of one class in one mask; in an array store, it is read whenever it is asked for.
 
     Attributes:
         distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
@@ -112,9 +112,9 @@ class ContourMap:
         rows, columns = shape_of(self, "distance")
         return columns, rows
 
-    def on(self, shelf: Shelf) -> ContourMap:
-        """The same with its fields on a shelf."""
-        return replace(self, distance=shelf.put(self.distance), unknown=shelf.put(self.unknown))
+    def stored_in(self, store: ArrayStore) -> ContourMap:
+        """The same with its fields in an array store."""
+        return replace(self, distance=store.put(self.distance), unknown=store.put(self.unknown))
 
     def look_up(self, uvs: FloatArray) -> ContourFeet:
         """Nearest contour of pixels uvs (n, 2); rows with NaN are not valid."""

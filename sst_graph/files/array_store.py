@@ -1,4 +1,4 @@
-"""Arrays that are seldom asked for, kept out of memory: beyond a share of it, in an unnamed temporary file.
+"""Arrays that are seldom read, kept on disk: the first in memory, the others in an unnamed temporary file.
 
 A drive of any length then takes little more memory than a short one. What is read back is what was put there,
 bit by bit. The file has no name, so that nothing is left of it however the process ends; it lies where
@@ -23,12 +23,12 @@ _LOG = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 IN_MEMORY_BYTES = 32 * 1024 * 1024
-"""Bytes of arrays that a shelf keeps in memory: those of a dozen frames with pictures of KITTI's size. Beyond
+"""Bytes of arrays that a store keeps in memory: those of a dozen frames with pictures of KITTI's size. Beyond
 that each is read in a tenth of a millisecond, and those of a long drive do not add up."""
 
 
-class Shelf:
-    """Where arrays are kept."""
+class ArrayStore:
+    """Arrays in memory up to a number of bytes, the others in one temporary file."""
 
     def __init__(self, in_memory_bytes: int | None = None) -> None:
         """in_memory_bytes: of the first arrays, which stay in memory; by default :data:`IN_MEMORY_BYTES`."""
@@ -47,7 +47,7 @@ class Shelf:
         return self._end
 
     def put(self, array: NDArray[Any], dtype: Any = None) -> Any:
-        """Keep an array -> a :class:`Shelved`, which a field that is :func:`shelvable` takes for it.
+        """Keep an array -> a :class:`StoredArray`, which a field that is :func:`storable` takes for it.
 
         Args:
             dtype: that it comes back with; by default its own.
@@ -56,8 +56,8 @@ class Shelf:
         array = np.ascontiguousarray(array)
         if array.nbytes <= max(self._left, 0) or not self._write(array):
             self._left -= array.nbytes
-            return Shelved(array, wanted)
-        return Shelved(_Place(self, self._end - array.nbytes, array.dtype, array.shape), wanted)
+            return StoredArray(array, wanted)
+        return StoredArray(_Place(self, self._end - array.nbytes, array.dtype, array.shape), wanted)
 
     def _write(self, array: NDArray[Any]) -> bool:
         """Append to the file; False where that does not go."""
@@ -104,8 +104,8 @@ def _read_at(descriptor: int, view: memoryview, start: int) -> int:
     return len(data)
 
 
-class Shelved:
-    """An array on a shelf."""
+class StoredArray:
+    """An array in an array store."""
 
     def __init__(self, kept: NDArray[Any] | _Place, dtype: np.dtype[Any]) -> None:
         self._kept, self._dtype = kept, dtype
@@ -116,28 +116,28 @@ class Shelved:
         return self._kept.shape
 
     def get(self) -> NDArray[Any]:
-        """The array; read anew each time where it lies in the file."""
+        """The array; read again each time where it lies in the file."""
         kept = self._kept
-        array = kept.shelf.read(kept.start, kept.dtype, kept.shape) if isinstance(kept, _Place) else kept
+        array = kept.store.read(kept.start, kept.dtype, kept.shape) if isinstance(kept, _Place) else kept
         return array.astype(self._dtype, copy=False)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Elsewhere there is no such file: the array itself goes there."""
-        return Shelved, (self.get(), self._dtype)
+        return StoredArray, (self.get(), self._dtype)
 
 
 @dataclass(frozen=True)
 class _Place:
     """Where in its file an array lies."""
 
-    shelf: Shelf
+    store: ArrayStore
     start: int
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
 
 
 class _Field:
-    """Attribute that is given an array, or one on a shelf, and answers the array."""
+    """Attribute that accepts an array or a :class:`StoredArray`, and returns the array."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -146,20 +146,20 @@ class _Field:
         if instance is None:
             return self
         value = instance.__dict__[self._name]
-        return value.get() if isinstance(value, Shelved) else value
+        return value.get() if isinstance(value, StoredArray) else value
 
     def __set__(self, instance: object, value: object) -> None:
         instance.__dict__[self._name] = value
 
 
 def shape_of(instance: object, name: str) -> tuple[int, ...]:
-    """Shape of the array in a field that is :func:`shelvable`; nothing is read."""
+    """Shape of the array in a field that is :func:`storable`; nothing is read."""
     shape: tuple[int, ...] = vars(instance)[name].shape
     return shape
 
 
-def shelvable(*names: str) -> Callable[[type[_T]], type[_T]]:
-    """Let fields of a dataclass take arrays on a shelf as well, and answer the arrays; written above it."""
+def storable(*names: str) -> Callable[[type[_T]], type[_T]]:
+    """Class decorator: the named fields accept a :class:`StoredArray` for an array, and return the array."""
 
     def declared(cls: type[_T]) -> type[_T]:
         for name in names:

@@ -261,7 +261,7 @@ def _laid_out(value: Any, part: Callable[[Any], Any]) -> Any:
     elif kind == "object" and class_name(type(value)).startswith(_PACKAGES):
         attributes = vars(value) if hasattr(value, "__dict__") else {}
         for name, one in _state(value).items():
-            # What is stored otherwise than it is kept is made anew when it is read.
+            # What is stored otherwise than it is kept is made again when it is read.
             if attributes.get(name) is one and part(one) is not one:
                 object.__setattr__(value, name, part(one))
     return value

@@ -21,7 +21,7 @@ from sst_graph.files.staging import Stage, claim, uninterrupted
 from sst_graph.files.targets import TEXT, FileKind, check_file_target, check_folder_target, real_path
 
 _NO_LINKS = (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
-"""What a file system without hard links answers."""
+"""Errors of a file system without hard links."""
 
 _PATIENCE = 50
 """Steps that go by while the disk takes in what was written."""

@@ -69,7 +69,7 @@ class Stage:
         return self.path / FORMER
 
     def announce_exchange(self) -> None:
-        """Note which folder is the new one, so that a later run can tell after a kill."""
+        """Note which folder is the new one, so that a later run can recognize it after a kill."""
         (self.path / EXCHANGE).write_text(str(self.new.stat().st_ino), encoding="ascii")
 
     def release(self) -> None:

@@ -28,8 +28,8 @@ _PAIRS = (
 
 
 def inspection_plots(inspection: Inspection) -> dict[str, Any]:
-    """matplotlib figures by file name; those about frames only where the result tells of
-    several frames, what to record next where it tells of one.
+    """matplotlib figures by file name; those about frames only where the result has
+    several frames, what to record next where it has one.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.

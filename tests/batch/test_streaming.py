@@ -22,7 +22,7 @@ from sst_graph.batch import CalibrationConfig, prepare_drives
 from sst_graph.cli.outputs import write_calibration
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files import array_store as shelf
+from sst_graph.files import array_store as store
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, SemanticClass
@@ -72,7 +72,7 @@ def traced(frames: int) -> tuple[int, int, Drive]:
 
 def test_little_of_a_frame_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its fields alone take 0.5 MB at half the usual size, its labelled points and mask as much."""
-    monkeypatch.setattr(shelf, "IN_MEMORY_BYTES", 1_000_000)
+    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 1_000_000)
     few, few_peak, _ = traced(6)
     many, many_peak, drive = traced(18)
     fields = sum(contour.distance.nbytes for image in drive.images for contour in image.contours.values())
@@ -81,15 +81,15 @@ def test_little_of_a_frame_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> N
     assert (many_peak - few_peak) / 12 < 100_000
 
 
-def test_a_drive_on_the_shelf_is_the_same_drive(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_in_the_array_store_is_the_same_drive(monkeypatch: pytest.MonkeyPatch) -> None:
     (plain,) = prepare_drives([Long(2)], CalibrationConfig())
-    monkeypatch.setattr(shelf, "IN_MEMORY_BYTES", 0)
-    (shelved,) = prepare_drives([Long(2)], CalibrationConfig())
-    for a, b in zip(plain.scans, shelved.scans, strict=True):
+    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 0)
+    (stored,) = prepare_drives([Long(2)], CalibrationConfig())
+    for a, b in zip(plain.scans, stored.scans, strict=True):
         assert len(a.lPs) > 100 and a.lPs.dtype == b.lPs.dtype == float
         assert (a.lPs == b.lPs).all() and (a.classes == b.classes).all()
         assert (a.offsets_s == b.offsets_s).all()
-    for c, d in zip(plain.images, shelved.images, strict=True):
+    for c, d in zip(plain.images, stored.images, strict=True):
         assert (c.mask == d.mask).all() and list(c.contours) == list(d.contours) == [VEHICLE]
         assert (c.contours[VEHICLE].distance == d.contours[VEHICLE].distance).all()
         assert (c.contours[VEHICLE].unknown == d.contours[VEHICLE].unknown).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import pytest
@@ -71,3 +72,9 @@ def test_a_filter_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert "calibrate: 0 settings" in out and "drift.rotation_deg = 0.005" in out and "window" not in out
     assert main(["settings", "nothing.like.it"]) == 2
     assert "no name contains it" in capsys.readouterr().err
+
+
+def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["settings", "--markdown"]) == 0
+    page = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
+    assert capsys.readouterr().out == page.read_text(encoding="utf-8")

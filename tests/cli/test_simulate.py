@@ -20,9 +20,8 @@ SMALL = ["--frames", "2", "--set", "width=160", "--set", "height=64", "--set", "
 
 def test_writes_a_drive_that_can_be_opened(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "drive"
-    assert (
-        main(["simulate", str(out), "--seed", "5", "--delay", "-0.12", "--motion", "constant", *SMALL]) == 0
-    )
+    options = ["--seed", "5", "--time-offset", "-0.12", "--motion", "constant", *SMALL]
+    assert main(["simulate", str(out), *options]) == 0
     assert "2 frames, true time offset -120.0 ms" in capsys.readouterr().out
     source = open_source(out)
     assert len(source) == 2 and (source.camera.width, source.camera.height) == (160, 64)
@@ -57,8 +56,8 @@ def test_settings_come_from_a_file_then_flags_then_set(tmp_path: Path) -> None:
     ("options", "message"),
     [
         (["--frames", "0"], "frames: found 0, expected at least 1 and at most 100000"),
-        (["--delay", "2"], "time_offset_s: found 2.0, expected at least -0.5 and at most 0.5 s"),
-        (["--delay", "nan"], "time_offset_s"),
+        (["--time-offset", "2"], "time_offset_s: found 2.0, expected at least -0.5 and at most 0.5 s"),
+        (["--time-offset", "nan"], "time_offset_s"),
         (["--motion", "flying"], "motion: found 'flying', expected one of mixed, standing"),
         (["--label-noise", "3"], "label_noise: found 3.0, expected at least 0 and at most 2"),
         (["--set", "speed=3"], "unknown setting 'speed'; did you mean 'speed_mps'?"),

@@ -60,7 +60,7 @@ def test_help_states_sign_and_direction() -> None:
         (["calibrate", "x", "--method", "magic"], "invalid choice: 'magic'"),
         (["evaluate", "x"], "the following arguments are required: --truth"),
         (["simulate", "x", "--frames", "many"], "argument --frames: invalid int value: 'many'"),
-        (["simulate", "x", "--delay", "1,5"], "argument --delay: invalid float value: '1,5'"),
+        (["simulate", "x", "--time-offset", "1,5"], "argument --time-offset: invalid float value: '1,5'"),
     ],
 )
 def test_usage_errors_are_one_line(
@@ -102,3 +102,8 @@ def test_the_package_offers_its_names_on_demand() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[] True\n"
+
+
+def test_the_old_name_of_an_option() -> None:
+    parse = build_parser().parse_args
+    assert parse(["simulate", "x", "--delay", "-0.1"]).time_offset == -0.1

@@ -15,6 +15,7 @@ from sst_graph.config import Settings, from_dict, setting, to_dict, walk_setting
 from sst_graph.config.old_names import with_new_names
 from sst_graph.config.renamed import CONSTANTS, RENAMED
 from sst_graph.errors import ConfigError
+from sst_graph.experiments.registry import EXPERIMENTS
 from sst_graph.tracker.config import TrackerConfig
 
 
@@ -104,8 +105,15 @@ def test_tables_nested_hundreds_deep_are_no_recursion_error() -> None:
     assert new(Method, deep) is deep
 
 
+ROOTS: list[Any] = [
+    CalibrationConfig(),
+    TrackerConfig(),
+    *(experiment.config for experiment in EXPERIMENTS.values()),
+]
+
+
 def known_names() -> set[str]:
-    return {name for cls in (CalibrationConfig, TrackerConfig) for name, _, _ in walk_settings(cls)}
+    return {name for root in ROOTS for name, _, _ in walk_settings(type(root))}
 
 
 def test_every_old_name_leads_to_a_setting() -> None:
@@ -124,8 +132,13 @@ def test_every_constant_is_where_the_table_says() -> None:
 
 @pytest.mark.parametrize("old", RENAMED)
 def test_the_default_under_an_old_name_is_the_default(old: str) -> None:
-    of_calibrate = RENAMED[old] in {name for name, _, _ in walk_settings(CalibrationConfig)}
-    default: Any = CalibrationConfig() if of_calibrate else TrackerConfig()
+    roots = [root for root in ROOTS if RENAMED[old] in {name for name, _, _ in walk_settings(type(root))}]
+    assert roots
+    for root in roots:
+        check_default(root, old)
+
+
+def check_default(default: Any, old: str) -> None:
     value = to_dict(default)
     for key in RENAMED[old].split("."):
         value = value[key]

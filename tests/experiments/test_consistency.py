@@ -38,11 +38,11 @@ def test_errors_drawn_from_the_covariance_are_consistent() -> None:
     np.testing.assert_allclose(shares, 95.0, atol=1.5)
 
 
-def test_what_is_doubted_or_lost_is_counted_and_not_judged() -> None:
+def test_what_did_not_converge_or_is_wrong_is_counted_and_left_out() -> None:
     fine = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
     lost = dataclasses.replace(fine, error=np.full(7, 1.0))
-    doubted = dataclasses.replace(lost, doubted=True)
-    cells = consistency.row("mixed", [fine, fine, lost, doubted], 2.0).split("|")
+    not_converged = dataclasses.replace(lost, not_converged=True)
+    cells = consistency.row("mixed", [fine, fine, lost, not_converged], 2.0).split("|")
     assert cells[2].strip() == "4 (1, 1)" and float(cells[3]) == pytest.approx(1.0)
     assert float(cells[5]) == pytest.approx(1.0) and cells[7].count("%") == 3
 

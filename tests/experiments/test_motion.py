@@ -54,7 +54,7 @@ def test_every_drive_and_run_has_its_row() -> None:
         ({"streets": 0}, "streets: found 0, expected at least 1"),
         (
             {"streets": 40},
-            "streets: found 40, whose time offsets grow from delay_s .* expected offsets of at most 0.5 s",
+            "streets: found 40 whose offsets grow from time_offset_s .* expected offsets of at most 0.5 s",
         ),
     ],
 )

@@ -1,11 +1,13 @@
-"""What holds on the project's own simulator holds on another one."""
+"""What holds on the project's own simulator holds on two others."""
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
+import pytest
 
 from benchmarks.second_street import SecondStreet, StreetConfig
+from benchmarks.third_street import ThirdConfig, ThirdStreet
 from sst_graph import calibrate
 from sst_graph.types import SemanticClass
 
@@ -26,10 +28,22 @@ def test_points_and_masks_agree() -> None:
         assert np.mean(found[expected == label] == label) > 0.98
 
 
-def test_a_street_with_a_stop() -> None:
-    street = SecondStreet(StreetConfig(seed=2, frames=12, width=960, height=320, focal_px=540.0))
-    away = gtsam.Pose3.Expmap(np.array([0.1, -0.12, 0.15, 0.08, -0.06, 0.05]))
-    result = calibrate(street, street.truth.cTl * away)
+@pytest.mark.parametrize(
+    ("street", "away"),
+    [
+        (
+            SecondStreet(StreetConfig(seed=2, frames=12, width=960, height=320, focal_px=540.0)),
+            (0.1, -0.12, 0.15, 0.08, -0.06, 0.05),
+        ),
+        (
+            ThirdStreet(ThirdConfig(seed=2, frames=10, width=828, height=250, focal_px=480.0)),
+            (0.08, -0.1, 0.12, 0.06, -0.05, 0.05),
+        ),
+    ],
+    ids=["second", "third"],
+)
+def test_a_street_with_a_stop(street: SecondStreet | ThirdStreet, away: tuple[float, ...]) -> None:
+    result = calibrate(street, street.truth.cTl * gtsam.Pose3.Expmap(np.array(away)))
     assert result.status != "not_converged"
     error = np.append(
         gtsam.Pose3.Logmap(result.T_camera_lidar.between(street.truth.cTl)), 0.1 - result.time_offset_s

@@ -12,7 +12,7 @@ import gtsam
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.cli.inputs import chosen_classes, open_drives, settings, starting_point
 from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, verdict, write_calibration
+from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, exit_code, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.files import atomic_directory
@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         mention(summary(result, against))
         names = write_calibration(folder, result, sources, against)
     mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
-    return verdict(result)
+    return exit_code(result)
 
 
 def calibrate_drives(

@@ -7,7 +7,7 @@ import argparse
 from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.commands.calibrate import calibrate_drives
 from sst_graph.cli.messages import complain, mention
-from sst_graph.cli.outputs import verdict, write_calibration
+from sst_graph.cli.outputs import exit_code, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.data import open_source
 from sst_graph.files import OutputKind, atomic_directory
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
     faults = over_bounds(against.errors)
     if faults:
         complain(f"demo failed: {', '.join(faults)}")
-    return verdict(result) or (3 if faults else 0)
+    return exit_code(result) or (3 if faults else 0)
 
 
 def over_bounds(errors: CalibrationErrors) -> list[str]:

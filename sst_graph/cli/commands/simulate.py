@@ -17,7 +17,7 @@ def run(args: argparse.Namespace) -> int:
     flags = {
         "seed": args.seed,
         "frames": args.frames,
-        "time_offset_s": args.delay,
+        "time_offset_s": args.time_offset,
         "motion": args.motion,
         "label_noise": args.label_noise,
         "rolling": args.rolling,

@@ -24,7 +24,7 @@ from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, Source
 
-_OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be told from the scans: {REMEDY}"
+_OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be decided from the scans: {REMEDY}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -152,7 +152,7 @@ def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:
 
 
 def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
-    """The result with what was decided of the sweep; not to be trusted where the scans did not tell it."""
+    """The result with what was decided of the sweep; not to be trusted where that is open."""
     diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: source.sweep_decision.to_dict()}}
     result = dataclasses.replace(result, diagnostics=diagnostics)
     if not _is_open(source):

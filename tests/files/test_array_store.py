@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sst_graph.files.array_store import Shelf, shape_of, shelvable
+from sst_graph.files.array_store import ArrayStore, shape_of, storable
 
 
-@shelvable("values")
+@storable("values")
 @dataclass(frozen=True)
 class Holder:
     name: str
@@ -36,41 +36,41 @@ def arrays() -> list[NDArray[np.generic]]:
 
 @pytest.mark.parametrize("in_memory_bytes", [0, 70, 10_000])
 def test_what_is_put_comes_back(in_memory_bytes: int) -> None:
-    shelf = Shelf(in_memory_bytes)
-    kept = [(array, shelf.put(array)) for array in arrays()]
+    store = ArrayStore(in_memory_bytes)
+    kept = [(array, store.put(array)) for array in arrays()]
     for _ in range(2):
-        for array, shelved in kept:
-            found = shelved.get()
+        for array, stored in kept:
+            found = stored.get()
             assert (found.dtype, found.shape) == (array.dtype, array.shape)
             np.testing.assert_array_equal(found, array)
     whole = sum(array.nbytes for array in arrays())
-    assert whole - in_memory_bytes <= shelf.file_bytes <= whole or in_memory_bytes > whole > shelf.file_bytes
+    assert whole - in_memory_bytes <= store.file_bytes <= whole or in_memory_bytes > whole > store.file_bytes
 
 
 def test_float32_comes_back_as_float64_without_loss() -> None:
     points = np.random.default_rng(1).normal(size=(7, 3)).astype(np.float32)
-    found = Shelf(0).put(points, np.float64).get()
+    found = ArrayStore(0).put(points, np.float64).get()
     assert found.dtype == np.float64
     np.testing.assert_array_equal(found, points.astype(np.float64))
 
 
 def test_a_field_answers_the_array() -> None:
     values = np.arange(6, dtype=np.float32)
-    plain, shelved = Holder("a", values), Holder("a", Shelf(0).put(values))
+    plain, stored = Holder("a", values), Holder("a", ArrayStore(0).put(values))
     assert plain.values is values
-    np.testing.assert_array_equal(shelved.values, values)
-    assert shape_of(plain, "values") == shape_of(shelved, "values") == (6,)
-    np.testing.assert_array_equal(replace(shelved, name="b").values, values)
+    np.testing.assert_array_equal(stored.values, values)
+    assert shape_of(plain, "values") == shape_of(stored, "values") == (6,)
+    np.testing.assert_array_equal(replace(stored, name="b").values, values)
     with pytest.raises(AttributeError):  # frozen as before
-        shelved.values = values  # type: ignore[misc]
+        stored.values = values  # type: ignore[misc]
 
 
 def test_copies_do_not_depend_on_the_file() -> None:
     values = np.arange(6, dtype=np.float32)
-    shelf = Shelf(0)
-    holder = Holder("a", shelf.put(values))
+    store = ArrayStore(0)
+    holder = Holder("a", store.put(values))
     copies = [pickle.loads(pickle.dumps(holder)), copy.deepcopy(holder)]
-    shelf.__del__()  # closes the file
+    store.__del__()  # closes the file
     with pytest.raises(ValueError):
         _ = holder.values
     for one in copies:
@@ -81,22 +81,22 @@ def test_where_no_file_can_be_written_arrays_stay_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
-    shelf = Shelf(0)
+    store = ArrayStore(0)
     with caplog.at_level(logging.WARNING):
-        kept = [(array, shelf.put(array)) for array in arrays()]
-    for array, shelved in kept:
-        np.testing.assert_array_equal(shelved.get(), array)
-    assert shelf.file_bytes == 0 and len(caplog.records) == 1
+        kept = [(array, store.put(array)) for array in arrays()]
+    for array, stored in kept:
+        np.testing.assert_array_equal(stored.get(), array)
+    assert store.file_bytes == 0 and len(caplog.records) == 1
 
 
 def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """Linux's /dev/full refuses every byte; what was written before comes back all the same."""
-    shelf = Shelf(0)
+    store = ArrayStore(0)
     first, second = np.arange(4.0), np.arange(5.0)
-    kept = shelf.put(first)
+    kept = store.put(first)
     with open("/dev/full", "r+b", buffering=0) as full:
-        monkeypatch.setattr(shelf, "_file", full, raising=True)
-        refused = shelf.put(second)
+        monkeypatch.setattr(store, "_file", full, raising=True)
+        refused = store.put(second)
         monkeypatch.undo()
     np.testing.assert_array_equal(refused.get(), second)
     np.testing.assert_array_equal(kept.get(), first)
@@ -104,7 +104,7 @@ def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_nothing_is_left_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    shelf = Shelf(0)
-    shelf.put(np.zeros(10_000))
-    assert shelf.file_bytes == 80_000
+    store = ArrayStore(0)
+    store.put(np.zeros(10_000))
+    assert store.file_bytes == 80_000
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,131 @@
+"""Prints docs/api.md from the signatures and docstrings: ``python docs/make_api.py > docs/api.md``."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import importlib
+import inspect
+import re
+from typing import Any
+
+import sst_graph
+from sst_graph.config import Settings
+
+MOST_ARGUMENTS = 6
+
+SECTIONS: dict[str, list[str]] = {
+    "Data": [
+        "sst_graph.open_source",
+        "sst_graph.Source",
+        "sst_graph.Frame",
+        "sst_graph.Scan",
+        "sst_graph.CameraImage",
+        "sst_graph.PinholeCamera",
+        "sst_graph.SemanticClass",
+    ],
+    "Calibration of drives": [
+        "sst_graph.calibrate",
+        "sst_graph.CalibrationConfig",
+        "sst_graph.CalibrationResult",
+        "sst_graph.inspect_result",
+    ],
+    "Frame by frame": ["sst_graph.Tracker", "sst_graph.TrackerConfig", "sst_graph.TrackUpdate"],
+    "In a graph of your own": [
+        "sst_graph.AlignmentTerm",
+        "sst_graph.AlignmentKeys",
+        "sst_graph.Trajectory",
+        "sst_graph.solve_with_terms",
+        "sst_graph.IncrementalTerms",
+        "sst_graph.calibration_covariance",
+        "sst_graph.align_frame",
+    ],
+    "Marginals and formats": ["sst_graph.CalibrationMarginal"],
+}
+"""Public names by section; the others of ``sst_graph.export`` and ``sst_graph.factors`` follow in lists."""
+
+
+def main() -> None:
+    """Print the page."""
+    print("# Public API\n")
+    print("Made by `python docs/make_api.py > docs/api.md`. Conventions: [factors](../factors/__init__.py);")
+    print("terms: [glossary](glossary.md); settings: [settings](settings.md).")
+    for title, names in SECTIONS.items():
+        print(f"\n## {title}\n")
+        for name in names:
+            print("\n".join(entry(name)))
+        if title == "Marginals and formats":
+            print("\n".join(listed("sst_graph.export", {"CalibrationMarginal"})))
+    print("\n## Factors (`sst_graph.factors`)\n")
+    print("\n".join(listed("sst_graph.factors", {"PinholeCamera"})))
+
+
+def entry(path: str) -> list[str]:
+    """A name with its signature and first line, and below it the public methods of a class."""
+    thing = found(path)
+    lines = [f"- `{signature(path, thing)}`<br>{first_line(thing)}"]
+    if inspect.isclass(thing) and not issubclass(thing, enum.Enum):
+        methods = ", ".join(f"`{name}`" for name in methods_of(thing))
+        if methods:
+            lines.append(f"  <br>{methods}")
+    return lines
+
+
+def listed(package: str, but: set[str]) -> list[str]:
+    """The public functions and classes of a package, each with its first line."""
+    names = sorted(set(importlib.import_module(package).__all__) - but, key=str.lower)
+    things = [(name, found(f"{package}.{name}")) for name in names]
+    public = [(name, thing) for name, thing in things if inspect.isclass(thing) or inspect.isfunction(thing)]
+    return [f"- `{name}`: {first_line(thing)}" for name, thing in public]
+
+
+def found(path: str) -> Any:
+    package, _, name = path.rpartition(".")
+    return getattr(importlib.import_module(package), name)
+
+
+def signature(path: str, thing: Any) -> str:
+    """The call; of what only the package itself makes, and of settings, the name alone."""
+    name = path.removeprefix("sst_graph.")
+    if inspect.isclass(thing) and (issubclass(thing, enum.Enum) or thing is sst_graph.Source):
+        return name
+    if len(inspect.signature(thing).parameters) > MOST_ARGUMENTS and inspect.isclass(thing):
+        return name
+    call = inspect.signature(thing)
+    text = name + str(call.replace(parameters=[shortened(one) for one in call.parameters.values()]))
+    text = re.sub(r"(: |-> )'([^']*)'", r"\1\2", text.removesuffix(" -> 'None'").removesuffix(" -> None"))
+    return text.replace("NDArray[np.", "NDArray[").replace("<factory>", "...").replace("Ellipsis", "...")
+
+
+def shortened(parameter: inspect.Parameter) -> inspect.Parameter:
+    """The parameter, its default as ``...`` where it is more than a word or a number."""
+    if parameter.default is parameter.empty or isinstance(parameter.default, str | int | float | None):
+        return parameter
+    return parameter.replace(default=... if parameter.default else parameter.default)
+
+
+def first_line(thing: Any) -> str:
+    """The first sentence of the docstring, without the marks of references."""
+    paragraph = " ".join((inspect.getdoc(thing) or "").split("\n\n")[0].splitlines())
+    sentence = re.split(r"(?<=[a-z\])`])\. (?=[A-Z])", paragraph)[0]
+    return re.sub(r":\w+:`~?([^`]*)`", r"`\1`", sentence).replace("``", "`")
+
+
+def methods_of(cls: type) -> list[str]:
+    """Fields of a dataclass that has too many for a signature, then public methods and properties.
+
+    The fields of settings have a page of their own.
+    """
+    fields = [field.name for field in dataclasses.fields(cls)] if dataclasses.is_dataclass(cls) else []
+    own = [name for name, member in vars(cls).items() if not name.startswith("_") and is_method(member)]
+    if len(fields) <= MOST_ARGUMENTS or issubclass(cls, Settings):
+        fields = []
+    return [*fields, *(f"{name}()" if callable(getattr(cls, name)) else name for name in own)]
+
+
+def is_method(member: Any) -> bool:
+    return inspect.isfunction(member) or isinstance(member, property | staticmethod | classmethod)
+
+
+if __name__ == "__main__":
+    main()
