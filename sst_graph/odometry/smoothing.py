@@ -22,7 +22,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.odometry.standing import overlap
+from sst_graph.odometry.standstill import overlap
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]

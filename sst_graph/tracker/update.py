@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import contradiction_of, told_by
-from sst_graph.batch.lower_edges import without_undersides
 from sst_graph.covariance.considered import Considered, considered
 from sst_graph.covariance.observability import open_directions
 from sst_graph.drive.preparation import ScanFeatures, image_features, scan_features
@@ -140,7 +139,7 @@ class Tracking:
         check_lateness(image, self.window, self.point.offset_s, self.config.late_s)
         self.image_order.take(image.stamp_ns, moved_ns != 0)
         self.clocks.take_image(image.stamp_ns, self.window.place)
-        picture = self.config.calibration.prepare.picture
+        picture = self.config.calibration.prepare.picture.use
         self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
         self._forget_images()
         return self.answer(image.stamp_ns)
@@ -165,9 +164,8 @@ class Tracking:
     def _features(self, scan: Scan) -> tuple[ScanFeatures, RelativeMotion | None]:
         """What is kept of a scan, and the motion that led to it."""
         prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
-        if self.config.calibration.undersides.use == "never":
-            prepare = without_undersides(prepare)
-        features = scan_features(self.window.next_scan, scan, self.classes, prepare)
+        lower_edges = self.config.calibration.undersides.use != "never"
+        features = scan_features(self.window.next_scan, scan, self.classes, prepare, lower_edges=lower_edges)
         motion = self.odometry.add(scan)
         self.last_scan = scan
         return features, motion

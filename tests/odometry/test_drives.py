@@ -9,10 +9,10 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sst_graph.odometry.standing import standing_frames
 
 from sst_graph.data import open_source
 from sst_graph.odometry.lidar import lidar_odometry
-from sst_graph.odometry.standing import standing_frames
 from sst_graph.odometry.visual import visual_odometry
 from sst_graph.types import CameraImage, RelativeMotion, Scan, Source
 
