@@ -129,12 +129,12 @@ def solve_paper(
     if not moving:
         covariance = frozen_covariance(still, static, config.static_weights[-1])
         reason = "no moving frame with a known velocity: the joint stage was left out"
-        counts: dict[str, object] = {"standing_frames": len(still)}
+        counts: dict[str, object] = {"standstill_frames": len(still)}
         return NearestSolution(static, covariance, static_creep, tuple(still), (reason,), counts)
     joint, creep, moving = _joint_stage(drives, moving, static, motions, config, progress)
     # 4. What holds the extrinsic is the standing frames themselves: they stand in beta's place.
     covariance = frozen_covariance([*still, *moving], joint, config.joint_weight)
-    counts = {"standing_frames": len(still), "moving_frames": len(moving)}
+    counts = {"standstill_frames": len(still), "moving_frames": len(moving)}
     # beta holds the extrinsic where the static stage left it: that stage's way is still to go.
     creep[:6] = static_creep[:6]
     return NearestSolution(joint, covariance, creep, (*still, *moving), (), counts)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings
-from sst_graph.drive.survey import Survey, Surveyor
+from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -197,8 +197,8 @@ class Drive:
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
         left_out: what the data lacked.
-        survey: what the raw frames show, for the search for causes; None where nobody looked.
-        sweep: what was decided of the times of the points, or None where nobody asked.
+        statistics: of the raw frames, for the search for causes; None where they were not collected.
+        sweep: decision about the times of the points; None where there was none.
         origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
     """
 
@@ -209,7 +209,7 @@ class Drive:
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
     left_out: LeftOut = field(default_factory=LeftOut)
-    survey: Survey | None = None
+    statistics: InputStatistics | None = None
     sweep: SweepDecision | None = None
     origin_ns: int | None = None
 
@@ -238,10 +238,10 @@ class Drive:
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
-        """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
+        """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:
-            growing: has seen most of the motions before.
+            growing: has most of the motions from a call before.
         """
         return (growing or GrowingTrack()).of(self.lidar_motions)
 
@@ -269,11 +269,11 @@ def prepare_drive(
     tracker = FeatureTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor, shelf = LeftOut(), Surveyor(total), Shelf()
+    left_out, collector, shelf = LeftOut(), StatisticsCollector(total), Shelf()
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
-        surveyor.add(frame)
+        collector.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
@@ -303,7 +303,7 @@ def prepare_drive(
         tuple(motions),
         tuple(pairs),
         left_out,
-        surveyor.survey(),
+        collector.statistics(),
         sweep,
     )
 

@@ -98,7 +98,7 @@ _AXES = np.arange(6)
 
 
 class GrowingTrack:
-    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero while it stands."""
+    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero at standstill."""
 
     def __init__(self, reach: int | None = None) -> None:
         """reach: how many of the latest motions are smoothed anew each time; None: all."""

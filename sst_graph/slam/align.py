@@ -21,7 +21,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.objects.persistence import ObjectName
+from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
 

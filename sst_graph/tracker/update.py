@@ -164,8 +164,8 @@ class Tracking:
     def _features(self, scan: Scan) -> tuple[ScanFeatures, RelativeMotion | None]:
         """What is kept of a scan, and the motion that led to it."""
         prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
-        lower_edges = self.config.calibration.undersides.use != "never"
-        features = scan_features(self.window.next_scan, scan, self.classes, prepare, lower_edges=lower_edges)
+        used = self.config.calibration.undersides.use != "never"
+        features = scan_features(self.window.next_scan, scan, self.classes, prepare, with_lower_edges=used)
         motion = self.odometry.add(scan)
         self.last_scan = scan
         return features, motion
@@ -196,7 +196,7 @@ class Tracking:
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""
         smoother, known, window = started.smoother, started.known, self.window
-        if why := self.trial.check(self.watch, smoother, known, window.restless()):
+        if why := self.trial.check(self.watch, smoother, known, window.dynamics.recently_moving()):
             return self._refuse_start(stamp_ns, len(window.scans) // 2, why)
         self.known, self.smoother = known, smoother
         self.tests.look(smoother)
@@ -235,7 +235,10 @@ class Tracking:
         waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
         new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
+        restless, matches = (
+            self.window.dynamics.recently_moving(),
+            {scan: len(found[scan].pair) for scan in new},
+        )
         chi2 = self.watch.take(sorted(waiting), matches, before, self.known.joint, smoother.model, restless)
         changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
         if changed is not None:
@@ -250,7 +253,7 @@ class Tracking:
         first = self.window.first_scan
         if new or not missing <= {number}:
             smoother.update(found, missing, first, self.window.objects.live)
-            self.window.judged_anew -= chosen
+            self.window.dynamics.changed_scans -= chosen
         self.entered.extend(new)
         self._begin_or_end_settling(number)
         self.known = Known.of(smoother)
@@ -266,7 +269,7 @@ class Tracking:
 
     def begin_settling(self) -> None:
         """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
-        self.window.judge_all()
+        self.window.dynamics.test_all()
         self.settling = Settling(self.matcher, self.config.settle_scans)
         self.window.held = self.window.first_scan == self.milestones.first
 

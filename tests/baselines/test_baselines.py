@@ -95,7 +95,7 @@ def test_the_paper_comes_nearer_in_rotation_and_time(drive: Drive, truth: Ground
     assert errors.qad_deg < 0.5 * before.qad_deg
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.6 * OFFSET_S
     assert result.method == "paper" and result.diagnostics["moving_frames"] >= 8
-    assert 2 <= result.diagnostics["standing_frames"] <= 7
+    assert 2 <= result.diagnostics["standstill_frames"] <= 7
     assert {frame.drive for frame in result.frames_used} == {drive.name}
 
 
