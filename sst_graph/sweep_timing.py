@@ -48,7 +48,7 @@ class SweepTiming:
         start_rad: azimuth at which a turn begins and ends, counter-clockwise from the LiDAR's x axis [rad].
         period_s: duration T of a turn [s].
         stamp: the instant that the stamp names; the times of the points are relative to it. It is a
-            convention: no data tell it from a time offset between the clocks.
+            convention: no data separate it from a time offset between the clocks.
     """
 
     fraction: float

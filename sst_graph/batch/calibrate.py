@@ -111,10 +111,8 @@ def prepare_drives(
     depth = config.method in _NEED_DEPTH
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(
-            with_sweep(source, config.sweep.decide), config.classes, prepare, progress, depth, with_lower_edges
-        )
-        for source in sources
+        prepare_drive(source, config.classes, prepare, progress, depth, with_lower_edges)
+        for source in (with_sweep(source, config.sweep.decide) for source in sources)
     ]
 
 

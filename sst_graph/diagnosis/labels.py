@@ -108,7 +108,7 @@ def foreign_masks(found: MaskShift | None) -> Finding | None:
 
 
 def _are_foreign(found: MaskShift) -> bool:
-    return found.contrast < _LEAST_CONTRAST or found.rival > _MOST_RIVAL
+    return found.contrast < _LEAST_CONTRAST or found.second_best > _MOST_RIVAL
 
 
 _OVER_GROUND = (SemanticClass.SKY, SemanticClass.VEHICLE)

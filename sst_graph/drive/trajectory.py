@@ -101,12 +101,12 @@ class GrowingTrack:
     """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero at standstill."""
 
     def __init__(self, reach: int | None = None) -> None:
-        """reach: how many of the latest motions are smoothed anew each time; None: all."""
+        """reach: how many of the latest motions are smoothed again each time; None: all."""
         self._zero_velocity, self._smoother = ZeroVelocityUpdate(), MotionSmoother(reach)
 
     def of(self, motions: Sequence[RelativeMotion]) -> TwistTrack | None:
-        """The track of consecutive motions; None without any. Those of the call before are known again by
-        being the same objects."""
+        """The track of consecutive motions; None without any. Those of the call before are recognised by
+        identity."""
         return TwistTrack(self._smoother.smoothed(self._zero_velocity.apply(motions))) if motions else None
 
 

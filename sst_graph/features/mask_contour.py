@@ -49,7 +49,7 @@ class ContourFeet:
 @shelvable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
-    """Signed distance field of one class in one mask; on a shelf, it is read whenever it is asked for.
+    """Signed distance field of one class in one mask; on a shelf, it is read at every access.
 
     Attributes:
         distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around

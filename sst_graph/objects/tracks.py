@@ -107,7 +107,7 @@ def object_tracks(drive: Drive) -> dict[ObjectId, int]:
 
 
 def tracks_of_scans(tracks: Mapping[ObjectId, int], scans: Sequence[int]) -> dict[ObjectId, int]:
-    """Tracks of the objects of some scans (positions, rising), which are numbered anew from 0."""
+    """Tracks of the objects of some scans (positions, rising), which are renumbered from 0."""
     place = {position: k for k, position in enumerate(scans)}
     return {(place[scan], c, n): track for (scan, c, n), track in tracks.items() if scan in place}
 

@@ -256,7 +256,7 @@ def near_end_velocity(
     None where it does not move steadily, or passes alongside.
 
     Args:
-        rough: (2,) velocity, good enough to tell along from across [m/s].
+        rough: (2,) velocity, good enough to separate along from across [m/s].
     """
     speed = float(np.hypot(*rough))
     axes = np.array([[rough[0], rough[1]], [-rough[1], rough[0]]]) / speed
