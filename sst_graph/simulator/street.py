@@ -177,7 +177,7 @@ def build_street(config: SimulationConfig) -> Street:
     _lay_ground(builder, profile, root, start, end)
     _raise_buildings(builder, profile, np.random.default_rng([config.seed, 3]), start, end)
     _plant(builder, profile, np.random.default_rng([config.seed, 4]), start, end)
-    _park(builder, profile, angled, config, np.random.default_rng([config.seed, 5]), (start, end), sun)
+    _park(builder, profile, angled, config, (start, end), sun)
     moving = _set_moving(
         builder, profile, config, np.random.default_rng([config.seed, 6]), (t, s, start, end), sun
     )
@@ -299,11 +299,11 @@ def _park(
     profile: scenery.Profile,
     angled: tuple[bool, bool],
     config: SimulationConfig,
-    rng: np.random.Generator,
     ends: tuple[float, float],
     sun: FloatArray,
 ) -> None:
     """Parked vehicles in the parking lanes of both sides."""
+    rng = np.random.default_rng([config.seed, 5])
     density = config.vehicle_density * (1.0 - config.moving_fraction) / 2.0
     for side, kerb, slanted in ((-1.0, profile.kerbs[0], angled[0]), (1.0, profile.kerbs[1], angled[1])):
         s, slant = ends[0] + rng.uniform(3.0, 9.0), rng.uniform(0.9, 1.5)
