@@ -25,7 +25,7 @@ MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TW
 """Classes whose members may move by themselves."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
-MIN_VOXEL_M, MAX_VOXEL_M = 0.1, 1.0
+_MIN_VOXEL_M, _MAX_VOXEL_M = 0.1, 1.0
 """Limits between which the voxels' edge is adapted from scan to scan [m]."""
 _TARGET_POINTS = 3000
 """Number of registered points that the adaptation aims at; the time of a registration grows with it."""
@@ -52,9 +52,8 @@ _SEARCH_ITERATIONS = 6
 """Gauss-Newton steps from each such start."""
 _STANDSTILL_M, _STANDSTILL_INLIER_RATIO = 0.02, 0.65
 """No farther shift is tried where the best of the nearest ones stays within this distance of the prediction
-[m]
-with at least this fraction of its points paired: standstill. Along a street's walls a scan may well stay
-where it was started, which its neighbours show."""
+with at least this fraction of its points paired: standstill [m, 1]. Along a street's walls a scan may well
+stay where it was started, which its neighbours show."""
 _MISSED_COST = 1.0
 """What a point without a voxel to pair with costs in the choice among starts; a pair costs its squared,
 whitened residual."""
@@ -236,7 +235,7 @@ class LidarOdometry:
         movable = self._parts(scan)[1].at_stamp(self._twist)
         self._static.insert(_transformed(self._wTl, movable), scan.stamp_ns)
         edge = self._voxel_m * np.sqrt(registered / _TARGET_POINTS)
-        self._voxel_m = float(np.clip(edge, MIN_VOXEL_M, MAX_VOXEL_M))
+        self._voxel_m = float(np.clip(edge, _MIN_VOXEL_M, _MAX_VOXEL_M))
 
     def _restart_map(self, scan: Scan) -> None:
         """Drop the map and start a new one with a scan at the current pose."""

@@ -49,8 +49,7 @@ _ERROR_RATE = 0.001
 """A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: as much speaks against the true
 one in this share of drives at most, where the error model holds."""
 _TOLERANCE = 0.2
-"""The estimated share may differ so much from 0 or 1 beside three of its sigmas: vegetation and edges bias
-it."""
+"""The estimated share may differ so much from 0 or 1 beside three of its sigmas."""
 _LONG_SWEEP_M = 1.0
 """Where the vehicle moves farther in a turn, a wrong hypothesis keeps the matches made under it, and all
 hypotheses are tried as starts [m]."""

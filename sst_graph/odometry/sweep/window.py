@@ -33,8 +33,7 @@ SECTORS = 72
 
 
 _NEAR_M, _FAR_M = 2.5, 45.0
-"""Ranges between which points are used: nearer is the vehicle itself, farther too few points a surface
-[m]."""
+"""Ranges between which points are used [m]."""
 _MAX_POINTS = 40_000
 """Most points of a scan that are read."""
 _VOXEL_M = 0.12
