@@ -31,7 +31,7 @@ import numpy as np
 import sst_graph
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch import calibrate_prepared
-from sst_graph.drive.preparation import PrepareConfig, prepare_drive
+from sst_graph.drive.preparation import PictureConfig, PrepareConfig, prepare_drive
 from sst_graph.factors import (
     Between,
     GroupedBias,
@@ -40,7 +40,6 @@ from sst_graph.factors import (
     pose_alignment_factor,
     time_offset_prior,
 )
-from sst_graph.features.image_edges import PictureConfig
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.odometry import RegisteredScan, loop_closures, metric_motions, scan_to_scan
 from sst_graph.simulator import SimulationConfig, simulate

@@ -19,7 +19,6 @@ from sst_graph.baselines.sst_calib import NearestSolution, PaperConfig, still_fr
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors import PinholeCamera
-from sst_graph.odometry import VisualOdometryConfig
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -55,7 +54,6 @@ def solve_semalign(
     classes: Sequence[SemanticClass],
     config: SemAlignConfig,
     paper: PaperConfig,
-    odometry: VisualOdometryConfig,
     progress: Progress | None = None,
 ) -> NearestSolution:
     """The best sampled start, refined; on the frames of the static stage, the time offset at the guess.
@@ -63,7 +61,7 @@ def solve_semalign(
     Raises:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
-    still = still_frames(drives, guess, classes, paper, odometry)
+    still = still_frames(drives, guess, classes, paper)
     poses = sampled_poses(guess.cTl, config)
     scores = np.zeros(len(poses))
     for done, frame in enumerate(still.frames, start=1):

@@ -29,7 +29,7 @@ from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.factors import beta_regularizer
 from sst_graph.graph.state import EXTRINSIC
-from sst_graph.odometry import StandingConfig, VisualOdometryConfig, metric_motions, standing_frames
+from sst_graph.odometry import metric_motions, standstill_frames
 from sst_graph.types import RelativeMotion, SemanticClass
 
 _LOG = logging.getLogger(__name__)
@@ -47,7 +47,6 @@ class PaperConfig(Settings):
         pixel_share: share of the mask's pixels that are matched.
         static_frames, joint_frames: most frames of each stage.
         velocity_every: iterations of the joint stage between renewals of the velocities.
-        standing: what counts as standing.
         seed: of the sample of pixels.
     """
 
@@ -61,7 +60,6 @@ class PaperConfig(Settings):
     static_frames: int = setting(5, at_least=1, at_most=1000)
     joint_frames: int = setting(20, at_least=1, at_most=1000)
     velocity_every: int = setting(5, at_least=1, at_most=1000)
-    standing: StandingConfig = field(default_factory=StandingConfig)
     seed: int = setting(0, at_least=0, at_most=10**15)
 
     def __post_init__(self) -> None:
@@ -108,7 +106,6 @@ def solve_paper(
     guess: Calibration,
     classes: Sequence[SemanticClass],
     config: PaperConfig,
-    odometry: VisualOdometryConfig,
     progress: Progress | None = None,
 ) -> NearestSolution:
     """The static stage on standing frames, then the joint stage on moving ones.
@@ -118,8 +115,8 @@ def solve_paper(
     """
     # 1. Standing and moving frames by visual odometry.
     pairs = frame_pairs(drives)
-    motions = camera_motions(drives, guess, [None] * len(drives), odometry)
-    stands = _standing_images(drives, motions, config)
+    motions = camera_motions(drives, guess, [None] * len(drives))
+    stands = _standing_images(drives, motions)
     still = _standing(pairs, drives, stands, classes, config)
     if not still:
         raise EstimationError(
@@ -132,12 +129,12 @@ def solve_paper(
     if not moving:
         covariance = frozen_covariance(still, static, config.static_weights[-1])
         reason = "no moving frame with a known velocity: the joint stage was left out"
-        counts: dict[str, object] = {"standing_frames": len(still)}
+        counts: dict[str, object] = {"standstill_frames": len(still)}
         return NearestSolution(static, covariance, static_creep, tuple(still), (reason,), counts)
-    joint, creep, moving = _joint_stage(drives, moving, static, motions, config, odometry, progress)
+    joint, creep, moving = _joint_stage(drives, moving, static, motions, config, progress)
     # 4. What holds the extrinsic is the standing frames themselves: they stand in beta's place.
     covariance = frozen_covariance([*still, *moving], joint, config.joint_weight)
-    counts = {"standing_frames": len(still), "moving_frames": len(moving)}
+    counts = {"standstill_frames": len(still), "moving_frames": len(moving)}
     # beta holds the extrinsic where the static stage left it: that stage's way is still to go.
     creep[:6] = static_creep[:6]
     return NearestSolution(joint, covariance, creep, (*still, *moving), (), counts)
@@ -148,7 +145,6 @@ def solve_static(
     guess: Calibration,
     classes: Sequence[SemanticClass],
     config: PaperConfig,
-    odometry: VisualOdometryConfig,
     progress: Progress | None = None,
 ) -> NearestSolution:
     """The static stage alone; the time offset stays at the guess.
@@ -156,7 +152,7 @@ def solve_static(
     Raises:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
-    still = still_frames(drives, guess, classes, config, odometry)
+    still = still_frames(drives, guess, classes, config)
     answer, creep = _static_stage(still.frames, guess, config, progress)
     covariance = frozen_covariance(still.frames, answer, config.static_weights[-1])
     counts: dict[str, object] = {"frames": len(still.frames)}
@@ -168,7 +164,6 @@ def still_frames(
     guess: Calibration,
     classes: Sequence[SemanticClass],
     config: PaperConfig,
-    odometry: VisualOdometryConfig,
 ) -> StillFrames:
     """Standing frames that show the classes, or all frames that do where none is known to stand.
 
@@ -176,8 +171,8 @@ def still_frames(
         EstimationError: no frame shows a class to both sensors.
     """
     pairs = frame_pairs(drives)
-    motions = camera_motions(drives, guess, [None] * len(drives), odometry)
-    stands = _standing_images(drives, motions, config)
+    motions = camera_motions(drives, guess, [None] * len(drives))
+    stands = _standing_images(drives, motions)
     still = _standing(pairs, drives, stands, classes, config)
     if still:
         return StillFrames(tuple(still))
@@ -195,7 +190,6 @@ def camera_motions(
     drives: Sequence[Drive],
     at: Calibration,
     former: Sequence[Sequence[RelativeMotion] | None],
-    odometry: VisualOdometryConfig,
 ) -> list[list[RelativeMotion]]:
     """Metric motions of each drive's camera, with LiDAR depth placed by a calibration.
 
@@ -203,7 +197,7 @@ def camera_motions(
         former: motions found earlier, which carry the depth to the image's instant; None: at rest.
     """
     return [
-        metric_motions(drive.image_pairs, drive.camera, _Depth(drive, at, before), odometry)
+        metric_motions(drive.image_pairs, drive.camera, _Depth(drive, at, before))
         for drive, before in zip(drives, former, strict=True)
     ]
 
@@ -229,11 +223,11 @@ class _Depth:
 
 
 def _standing_images(
-    drives: Sequence[Drive], motions: Sequence[Sequence[RelativeMotion]], config: PaperConfig
+    drives: Sequence[Drive], motions: Sequence[Sequence[RelativeMotion]]
 ) -> list[NDArray[np.bool_]]:
     """Whether the vehicle stands at each image of each drive; nowhere where no motion is known."""
     return [
-        standing_frames(found, config.standing) if found else np.zeros(len(drive.images), np.bool_)
+        standstill_frames(found) if found else np.zeros(len(drive.images), np.bool_)
         for drive, found in zip(drives, motions, strict=True)
     ]
 
@@ -294,7 +288,6 @@ def _joint_stage(
     static: Calibration,
     motions: list[list[RelativeMotion]],
     config: PaperConfig,
-    odometry: VisualOdometryConfig,
     progress: Progress | None,
 ) -> tuple[Calibration, FloatArray, list[MatchFrame]]:
     """The estimate, its creep, and the frames with the velocities that it was made with."""
@@ -302,7 +295,7 @@ def _joint_stage(
     at, creep, moving = static, np.zeros(7), list(frames)
     for iteration in range(config.joint_iterations):
         if iteration % config.velocity_every == 0:
-            motions = camera_motions(drives, at, motions, odometry)
+            motions = camera_motions(drives, at, motions)
             moving = [f.moving_at(velocity_at(motions[f.pair.drive], f.pair.image_position)) for f in moving]
         last, at = at, step_once(moving, at, config.joint_weight, beta, offset_free=True)
         creep = config.joint_iterations * last.to(at)

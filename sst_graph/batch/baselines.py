@@ -22,8 +22,7 @@ def answer_paper(
     """SST-Calib, static and joint stage."""
 
     def solve(start: Calibration) -> NearestSolution:
-        odometry = config.prepare.visual_odometry
-        return solve_paper(drives, start, config.classes, config.paper, odometry, progress)
+        return solve_paper(drives, start, config.classes, config.paper, progress)
 
     return _judged(solve, drives, guess, config)
 
@@ -34,8 +33,7 @@ def answer_static(
     """SST-Calib's static stage alone."""
 
     def solve(start: Calibration) -> NearestSolution:
-        odometry = config.prepare.visual_odometry
-        return solve_static(drives, start, config.classes, config.paper, odometry, progress)
+        return solve_static(drives, start, config.classes, config.paper, progress)
 
     return _judged(solve, drives, guess, config)
 
@@ -46,10 +44,7 @@ def answer_semalign(
     """SemAlign."""
 
     def solve(start: Calibration) -> NearestSolution:
-        odometry = config.prepare.visual_odometry
-        return solve_semalign(
-            drives, start, config.classes, config.semalign, config.paper, odometry, progress
-        )
+        return solve_semalign(drives, start, config.classes, config.semalign, config.paper, progress)
 
     return _judged(solve, drives, guess, config)
 

@@ -24,7 +24,7 @@ from sst_graph.batch.baselines import answer_paper, answer_semalign, answer_stat
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.lower_edges import WithUndersides, with_undersides, without_undersides
+from sst_graph.batch.lower_edges import WithUndersides, with_undersides
 from sst_graph.batch.motion_answer import answer_motion
 from sst_graph.batch.motion_factor import Labels, WithMotion, with_motion
 from sst_graph.batch.parts import Parts
@@ -107,13 +107,12 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
-    if config.method != "joint" or config.undersides.use == "never":
-        prepare = without_undersides(prepare)
+    with_lower_edges = config.method == "joint" and config.undersides.use != "never"
     depth = config.method in _NEED_DEPTH
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(with_sweep(source, config.sweep), config.classes, prepare, progress, depth)
-        for source in sources
+        prepare_drive(source, config.classes, prepare, progress, depth, with_lower_edges)
+        for source in (with_sweep(source, config.sweep.decide) for source in sources)
     ]
 
 

@@ -14,7 +14,7 @@ from typing import Literal
 
 from sst_graph.association.edge_matching import BOTTOM
 from sst_graph.config import Settings, setting
-from sst_graph.drive.preparation import Drive, PrepareConfig, Progress
+from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.matching import match_all, outlines_of
@@ -45,11 +45,6 @@ class UndersideConfig(Settings):
     min_concentration: float = setting(0.7, at_least=0.0, at_most=1.0)
     min_support: float = setting(30.0, at_least=0.001, at_most=1e9)
     kernel_px: tuple[float, ...] = setting((5.0, 4.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100))
-
-
-def without_undersides(prepare: PrepareConfig) -> PrepareConfig:
-    """Settings for those who never match edges towards the ground: they are not looked for."""
-    return replace(prepare, boundary=replace(prepare.boundary, bottom_edges=False))
 
 
 @dataclass(frozen=True)

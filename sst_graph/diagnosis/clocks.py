@@ -43,7 +43,7 @@ def stamps(drive: Drive) -> Finding | None:
     if period > _LONGEST_PERIOD_S:
         return _in_another_unit(steps, period)
     speed, acceleration = _dynamics(drive)
-    spread = max((scan.sweep_s for scan in drive.survey.scans), default=0.0) if drive.survey else 0.0
+    spread = max((scan.sweep_s for scan in drive.statistics.scans), default=0.0) if drive.statistics else 0.0
     found = []
     if period <= _SHORTEST_PERIOD_S:
         found.append("no scanner turns so fast")
@@ -63,10 +63,10 @@ def stamps(drive: Drive) -> Finding | None:
 
 def two_clocks(drive: Drive) -> Finding | None:
     """Scans and images of the same frames whose stamps do not advance alike."""
-    if drive.survey is None:
+    if drive.statistics is None:
         return None
-    scans = dict(zip((fact.index for fact in drive.survey.scans), drive.scan_stamps_ns, strict=False))
-    images = dict(zip((fact.index for fact in drive.survey.images), drive.image_stamps_ns, strict=False))
+    scans = dict(zip((fact.index for fact in drive.statistics.scans), drive.scan_stamps_ns, strict=False))
+    images = dict(zip((fact.index for fact in drive.statistics.images), drive.image_stamps_ns, strict=False))
     both = sorted(scans.keys() & images.keys())
     if len(both) <= _LEAST_STEPS:
         return None

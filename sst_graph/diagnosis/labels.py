@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.diagnosis.units import FLAT, usual_ground
+from sst_graph.drive.input_statistics import InputStatistics
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.survey import Survey
 from sst_graph.features.mask_shift import MaskShift, mask_shift
 from sst_graph.types import SemanticClass
 
@@ -24,11 +24,14 @@ _ABOVE = 0.1
 
 def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) -> Finding | None:
     """None of the classes to align in any scan, or in any mask."""
-    surveys = [drive.survey for drive in drives if drive.survey is not None]
+    statistics_of_drives = [drive.statistics for drive in drives if drive.statistics is not None]
     names = " or ".join(c.name.lower() for c in classes)
     for what, labelled in (
-        ("point", [scan.labelled for survey in surveys for scan in survey.scans]),
-        ("mask's pixel", [image.labelled for survey in surveys for image in survey.images]),
+        ("point", [scan.labelled for statistics in statistics_of_drives for scan in statistics.scans]),
+        (
+            "mask's pixel",
+            [image.labelled for statistics in statistics_of_drives for image in statistics.images],
+        ),
     ):
         present = {c for counts in labelled for c in counts}
         if labelled and not present & {int(c) for c in classes}:
@@ -42,7 +45,7 @@ def searched_classes(drives: Sequence[Drive], classes: Sequence[SemanticClass]) 
 
 def ground_points(drive: Drive) -> Finding | None:
     """Points labelled ground that do not lie on a plane."""
-    ground = None if drive.survey is None else usual_ground(drive.survey)
+    ground = None if drive.statistics is None else usual_ground(drive.statistics)
     if ground is None or ground.share >= FLAT:
         return None
     return Finding(
@@ -54,9 +57,9 @@ def ground_points(drive: Drive) -> Finding | None:
 
 def mask_rows(drive: Drive) -> Finding | None:
     """Masks whose ground is above their sky or their vehicles."""
-    if drive.survey is None:
+    if drive.statistics is None:
         return None
-    rows = {c: _mean_row(drive.survey, c) for c in (SemanticClass.GROUND, *_OVER_GROUND)}
+    rows = {c: _mean_row(drive.statistics, c) for c in (SemanticClass.GROUND, *_OVER_GROUND)}
     ground = rows[SemanticClass.GROUND]
     for c in _OVER_GROUND:
         over = rows[c]
@@ -71,8 +74,10 @@ def mask_rows(drive: Drive) -> Finding | None:
 
 def shift(drives: Iterable[Drive]) -> MaskShift | None:
     """The shift of all masks against their pictures."""
-    surveys = [drive.survey for drive in drives if drive.survey is not None]
-    return mask_shift([p for survey in surveys for image in survey.images for p in image.profiles])
+    statistics_of_drives = [drive.statistics for drive in drives if drive.statistics is not None]
+    return mask_shift(
+        [p for statistics in statistics_of_drives for image in statistics.images for p in image.profiles]
+    )
 
 
 def shifted_masks(found: MaskShift | None) -> Finding | None:
@@ -103,19 +108,19 @@ def foreign_masks(found: MaskShift | None) -> Finding | None:
 
 
 def _are_foreign(found: MaskShift) -> bool:
-    return found.contrast < _LEAST_CONTRAST or found.rival > _MOST_RIVAL
+    return found.contrast < _LEAST_CONTRAST or found.second_best > _MOST_RIVAL
 
 
 _OVER_GROUND = (SemanticClass.SKY, SemanticClass.VEHICLE)
 
 
-def _mean_row(survey: Survey, c: SemanticClass) -> float | None:
+def _mean_row(statistics: InputStatistics, c: SemanticClass) -> float | None:
     """Over all pixels of a class, as a share of the height; None for a class that is seldom seen."""
-    weights = [image.labelled.get(int(c), 0) for image in survey.images]
+    weights = [image.labelled.get(int(c), 0) for image in statistics.images]
     total = sum(weights)
-    if total < 0.005 * sum(sum(image.labelled.values()) for image in survey.images) or total == 0:
+    if total < 0.005 * sum(sum(image.labelled.values()) for image in statistics.images) or total == 0:
         return None
-    rows = [image.rows.get(int(c), 0.0) for image in survey.images]
+    rows = [image.rows.get(int(c), 0.0) for image in statistics.images]
     return sum(row * weight for row, weight in zip(rows, weights, strict=True)) / total
 
 

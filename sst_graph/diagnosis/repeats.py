@@ -18,17 +18,17 @@ vehicle are right."""
 
 def repeats(drive: Drive) -> Finding | None:
     """Scans or pictures that stay the same to the last bit while the other sensor sees motion."""
-    if drive.survey is None:
+    if drive.statistics is None:
         return None
-    scans = [scan.digest for scan in drive.survey.scans]
+    scans = [scan.digest for scan in drive.statistics.scans]
     first, count = _longest(scans)
     if count >= _LEAST and _pictures_move(drive, first, count):
-        frame = drive.survey.scans[first].index
+        frame = drive.statistics.scans[first].index
         return _finding("scan", frame, count, "the pictures move", "the LiDAR's driver and its recording")
-    images = [image.picture_digest for image in drive.survey.images]
+    images = [image.picture_digest for image in drive.statistics.images]
     first, count = _longest(images)
     if count >= _LEAST and _lidar_moves(drive, first, count):
-        frame = drive.survey.images[first].index
+        frame = drive.statistics.images[first].index
         return _finding("picture", frame, count, "the LiDAR moves", "the camera's driver and its recording")
     return None
 
@@ -57,8 +57,8 @@ def _pictures_move(drive: Drive, first: int, count: int) -> bool:
     begin, end = drive.scan_stamps_ns[first], drive.scan_stamps_ns[first + count - 1]
     tracks = [p.tracks for p in drive.image_pairs if begin <= p.tracks.from_ns < end and len(p.tracks)]
     if not tracks:
-        assert drive.survey is not None
-        return len({image.picture_digest for image in drive.survey.images}) > 1
+        assert drive.statistics is not None
+        return len({image.picture_digest for image in drive.statistics.images}) > 1
     sizes = [float(np.median(np.linalg.norm(t.uv_b - t.uv_a, axis=1))) for t in tracks]
     return bool(np.mean(np.array(sizes) > _MOVED_PX) > 0.3)
 

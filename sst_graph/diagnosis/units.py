@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.diagnosis.finding import Finding
+from sst_graph.drive.input_statistics import Ground, InputStatistics
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.survey import Ground, Survey
 
 FloatArray = NDArray[np.float64]
 
@@ -30,10 +30,10 @@ _FARTHEST_START_M = 10.0
 
 def clouds(drive: Drive) -> Finding | None:
     """Clouds in another unit than metres: vehicles and the ground below the LiDAR tell."""
-    if drive.survey is None:
+    if drive.statistics is None:
         return None
-    heights = vehicle_heights(drive.survey)
-    ground = usual_ground(drive.survey)
+    heights = vehicle_heights(drive.statistics)
+    ground = usual_ground(drive.statistics)
     if len(heights) < _LEAST_VEHICLES or (ground is not None and ground.share < FLAT):
         return None
     middle, upper = float(np.median(heights)), float(np.quantile(heights, 0.75))
@@ -61,7 +61,7 @@ def clouds(drive: Drive) -> Finding | None:
 
 def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
     """Clouds in the camera's axes under a start that is not made for them: the ground tells what is down."""
-    ground = None if drive.survey is None else usual_ground(drive.survey)
+    ground = None if drive.statistics is None else usual_ground(drive.statistics)
     if ground is None or ground.share < FLAT or ground.up[1] > -_UPRIGHT:
         return None
     if guess is not None and float((guess.rotation().matrix() @ ground.up)[1]) < -_UPRIGHT:
@@ -93,14 +93,14 @@ FLAT = 0.75
 """Share of the points labelled ground on one plane: above 0.9 on streets, about a half for other things."""
 
 
-def vehicle_heights(survey: Survey) -> FloatArray:
+def vehicle_heights(statistics: InputStatistics) -> FloatArray:
     """(k,) of all vehicles of the scans looked at closely."""
-    return np.concatenate([np.zeros(0), *(scan.vehicle_heights for scan in survey.scans)])
+    return np.concatenate([np.zeros(0), *(scan.vehicle_heights for scan in statistics.scans)])
 
 
-def usual_ground(survey: Survey) -> Ground | None:
+def usual_ground(statistics: InputStatistics) -> Ground | None:
     """The median ground of the scans; None where fewer than half of those looked at closely show one."""
-    grounds: Sequence[Ground] = [scan.ground for scan in survey.scans if scan.ground is not None]
+    grounds: Sequence[Ground] = [scan.ground for scan in statistics.scans if scan.ground is not None]
     if not grounds:
         return None
     up = np.median([ground.up for ground in grounds], axis=0)

@@ -39,7 +39,7 @@ class SensorPath:
     """Poses at stamps, joined smoothly: Exp of a cubic through the four nearest poses' logarithms.
 
     Each cubic blends the parabolas around the interval's two ends (Overhauser), so that twists are
-    continuous, too, and follow an acceleration. Nothing is told across a motion that failed, or beyond the
+    continuous, too, and follow an acceleration. None is known across a motion that failed, or beyond the
     ends.
     """
 

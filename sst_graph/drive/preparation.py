@@ -11,12 +11,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
-from sst_graph.drive.survey import Survey, Surveyor
+from sst_graph.config import Settings
+from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.features.image_edges import PictureConfig
 from sst_graph.features.lidar_edges import Boundaries, BoundaryConfig, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.files.array_store import ArrayStore, storable
@@ -25,7 +24,7 @@ from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
 from sst_graph.odometry.relative import relative_pose
 from sst_graph.odometry.sweep import SweepDecision, SweptSource
-from sst_graph.odometry.visual import ImagePair, VisualOdometryConfig
+from sst_graph.odometry.visual import ImagePair
 from sst_graph.types import CameraImage, Frame, RelativeMotion, Scan, SemanticClass, Source
 from sst_graph.validation import checked_image, checked_scan
 
@@ -36,25 +35,40 @@ Progress = Callable[[str, int, int], None]
 """Called with (stage, steps done, steps in all)."""
 
 
+SAMPLE_POINTS = 3000
+"""Most labelled points of a scan that are kept for search and checks, of each class."""
+_SAMPLE_NEAR_M, _FAR_M = 2.0, 60.0
+"""Ranges between which points are kept [m]."""
+_DEPTH_POINTS = 30_000
+"""Points of a scan that are kept for the depth of image features, about."""
+
+
+@dataclass(frozen=True)
+class PictureConfig(Settings):
+    """Contours of masks.
+
+    Attributes:
+        use: contours follow the picture; False uses them as the masks have them.
+    """
+
+    use: bool = True
+
+
 @dataclass(frozen=True)
 class PrepareConfig(Settings):
-    """What is taken from every frame.
+    """What is kept of every frame.
 
     Attributes:
         boundary: boundary points.
-        picture: how the masks' contours follow the picture.
+        picture: contours of masks.
         lidar_odometry: motion between scans.
-        visual_odometry: motion between images.
-        use_visual_odometry: track image features at all.
-        sample_points: most labelled points of a scan kept for search and checks, of each class.
+        use_visual_odometry: track image features.
     """
 
     boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
     picture: PictureConfig = field(default_factory=PictureConfig)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
-    visual_odometry: VisualOdometryConfig = field(default_factory=VisualOdometryConfig)
     use_visual_odometry: bool = True
-    sample_points: int = setting(3000, at_least=1, at_most=1_000_000)
 
 
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
@@ -183,8 +197,8 @@ class Drive:
         lidar_motions: between consecutive scans; empty for a single scan.
         image_pairs: tracks between consecutive images; empty for a single image.
         left_out: what the data lacked.
-        survey: what the raw frames show, for the search for causes; None where nobody looked.
-        sweep: what was decided of the times of the points, or None where nobody asked.
+        statistics: of the raw frames, for the search for causes; None where they were not collected.
+        sweep: decision about the times of the points; None where there was none.
         origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
     """
 
@@ -195,7 +209,7 @@ class Drive:
     lidar_motions: tuple[RelativeMotion, ...]
     image_pairs: tuple[ImagePair, ...]
     left_out: LeftOut = field(default_factory=LeftOut)
-    survey: Survey | None = None
+    statistics: InputStatistics | None = None
     sweep: SweepDecision | None = None
     origin_ns: int | None = None
 
@@ -224,10 +238,10 @@ class Drive:
         return float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.1
 
     def lidar_track(self, growing: GrowingTrack | None = None) -> TwistTrack | None:
-        """Twists of the LiDAR over time, smoothed, exactly zero while it stands; None for a single scan.
+        """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:
-            growing: has seen most of the motions before.
+            growing: has most of the motions from a call before.
         """
         return (growing or GrowingTrack()).of(self.lidar_motions)
 
@@ -238,11 +252,13 @@ def prepare_drive(
     config: PrepareConfig | None = None,
     progress: Progress | None = None,
     depth: bool = True,
+    with_lower_edges: bool = True,
 ) -> Drive:
     """Read every frame of a source once and keep what calibration needs, most of it in an array store.
 
     Args:
         depth: keep points for the depth of image features, where these are tracked.
+        with_lower_edges: find edges towards the ground.
 
     Raises:
         DataError: the source has no scan or no image, its stamps do not rise, or the arrays of one are not
@@ -250,26 +266,27 @@ def prepare_drive(
     """
     config = config or PrepareConfig()
     odometry = LidarOdometry(config.lidar_odometry)
-    tracker = FeatureTracker(config.visual_odometry.features)
+    tracker = FeatureTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, surveyor, store = LeftOut(), Surveyor(total), ArrayStore()
+    left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore()
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
-        surveyor.add(frame)
+        collector.add(frame)
         if frame.scan is not None:
             motion = odometry.add(frame.scan)
             if motion is not None:
                 motions.append(motion)
-            scans.append(scan_features(frame.index, frame.scan, classes, config, depth).stored_in(store))
+            features = scan_features(frame.index, frame.scan, classes, config, depth, with_lower_edges)
+            scans.append(features.stored_in(store))
         if frame.image is not None:
             if config.use_visual_odometry:
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
-                    direction = relative_pose(tracks, source.camera, config.visual_odometry.relative)
-                    pairs.append(ImagePair(tracks, direction))
-            images.append(image_features(frame.index, frame.image, classes, config.picture).stored_in(store))
+                    pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
+            features = image_features(frame.index, frame.image, classes, config.picture.use)
+            images.append(features.stored_in(store))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
@@ -286,7 +303,7 @@ def prepare_drive(
         tuple(motions),
         tuple(pairs),
         left_out,
-        surveyor.survey(),
+        collector.statistics(),
         sweep,
     )
 
@@ -299,16 +316,21 @@ def _checked(frame: Frame, camera: PinholeCamera, place: str) -> Frame:
 
 
 def scan_features(
-    index: int, scan: Scan, classes: Sequence[SemanticClass], config: PrepareConfig, depth: bool = True
+    index: int,
+    scan: Scan,
+    classes: Sequence[SemanticClass],
+    config: PrepareConfig,
+    depth: bool = True,
+    with_lower_edges: bool = True,
 ) -> ScanFeatures:
-    """Boundaries of a scan and a sample of its points."""
+    """Boundaries of a scan and a sample of its points; the arguments are those of :func:`prepare_drive`."""
     offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
-    chosen = _sample(scan, config.sample_points)
+    chosen = _sample(scan)
     deep = np.zeros(0, dtype=np.intp)
     if depth and config.use_visual_odometry:
-        near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
-        deep = near[:: max(1, len(scan.points) // 30_000)]
-    boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary))
+        near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < _FAR_M)
+        deep = near[:: max(1, len(scan.points) // _DEPTH_POINTS)]
+    boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary, with_lower_edges))
     return ScanFeatures(
         index,
         scan.stamp_ns,
@@ -350,22 +372,23 @@ def outline_size(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> i
     return below + sum(map(len, scan.boundaries.values()))
 
 
-def _sample(scan: Scan, most: int) -> NDArray[np.intp]:
-    """Evenly spread indices of at most ``most`` points of every known class, 2 to 60 m away."""
+def _sample(scan: Scan) -> NDArray[np.intp]:
+    """Evenly spread indices of at most ``SAMPLE_POINTS`` points of every known class, 2 to 60 m away."""
     square = np.einsum("ij,ij->i", scan.points, scan.points)
-    usable = (square > 2.0**2) & (square < 60.0**2) & (scan.classes != SemanticClass.IGNORE)
+    usable = (square > _SAMPLE_NEAR_M**2) & (square < _FAR_M**2) & (scan.classes != SemanticClass.IGNORE)
     parts = [np.zeros(0, dtype=np.intp)]
-    # Compared with plain ints, for those of NumPy make all classes int64.
+    # Compared with plain ints: compared with NumPy's, all classes are converted to int64.
     for c in np.flatnonzero(np.bincount(scan.classes[usable])).tolist():
         members = np.flatnonzero(usable & (scan.classes == c))
-        parts.append(members[:: max(1, -(-len(members) // most))])
+        parts.append(members[:: max(1, -(-len(members) // SAMPLE_POINTS))])
     return np.concatenate(parts)
 
 
 def image_features(
-    index: int, image: CameraImage, classes: Sequence[SemanticClass], config: PictureConfig | None = None
+    index: int, image: CameraImage, classes: Sequence[SemanticClass], use_picture: bool = True
 ) -> ImageFeatures:
-    """Mask and contours of an image; the contours follow its picture."""
-    fields = {c: ContourMap.of(image.mask, c, image.pixels, config) for c in classes}
+    """Mask and contours of an image; ``use_picture``: the contours follow its picture."""
+    picture = image.pixels if use_picture else None
+    fields = {c: ContourMap.of(image.mask, c, picture) for c in classes}
     contours = {c: field for c, field in fields.items() if field is not None}
     return ImageFeatures(index, image.stamp_ns, image.mask, contours)

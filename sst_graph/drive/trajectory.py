@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.odometry.smoothing import MotionSmoother
-from sst_graph.odometry.standing import Rest
+from sst_graph.odometry.standstill import ZeroVelocityUpdate
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
@@ -98,16 +98,16 @@ _AXES = np.arange(6)
 
 
 class GrowingTrack:
-    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero while it stands."""
+    """Tracks of a LiDAR's motions of which some are new each time: smoothed, exactly zero at standstill."""
 
     def __init__(self, reach: int | None = None) -> None:
-        """reach: how many of the latest motions are smoothed anew each time; None: all."""
-        self._rest, self._smoother = Rest(), MotionSmoother(reach)
+        """reach: how many of the latest motions are smoothed again each time; None: all."""
+        self._zero_velocity, self._smoother = ZeroVelocityUpdate(), MotionSmoother(reach)
 
     def of(self, motions: Sequence[RelativeMotion]) -> TwistTrack | None:
-        """The track of consecutive motions; None without any. Those of the call before are known again by
-        being the same objects."""
-        return TwistTrack(self._smoother.smoothed(self._rest.told(motions))) if motions else None
+        """The track of consecutive motions; None without any. Those of the call before are recognised by
+        identity."""
+        return TwistTrack(self._smoother.smoothed(self._zero_velocity.apply(motions))) if motions else None
 
 
 def _covariance(motion: RelativeMotion) -> FloatArray:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
-from sst_graph.drive.preparation import PrepareConfig, Progress, prepare_drive
+from sst_graph.drive.preparation import PictureConfig, PrepareConfig, Progress, prepare_drive
 from sst_graph.experiments.slam_graph import (
     DELAY,
     EXTRINSIC,
@@ -28,8 +28,7 @@ from sst_graph.experiments.slam_graph import (
     pose_key,
     with_camera,
 )
-from sst_graph.features.image_edges import PictureConfig
-from sst_graph.odometry import LoopConfig, RegisteredScan, RegistrationConfig, loop_closures, scan_to_scan
+from sst_graph.odometry import RegisteredScan, loop_closures, scan_to_scan
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Frame
 
@@ -68,7 +67,8 @@ class SlamConfig(Settings):
         frames: of each drive.
         time_offset_s: true time offset [s].
         street: further settings of the simulator.
-        registration, loops: LiDAR odometry and loop closures.
+        loop_every, loop_min_s: one scan out of so many is tried as a loop closure, and with scans that are so
+            much older [s].
         camera: what the camera adds to the pose graph.
         calibration: of the calibration alone, from whose answer both together start.
     """
@@ -89,8 +89,8 @@ class SlamConfig(Settings):
             moving_fraction=0.0,
         )
     )
-    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    loops: LoopConfig = field(default_factory=LoopConfig)
+    loop_every: int = setting(4, at_least=1, at_most=100_000)
+    loop_min_s: float = setting(2.0, at_least=0.001, at_most=1e6)
     camera: CameraGraphConfig = field(default_factory=CameraGraphConfig)
     calibration: CalibrationConfig = field(default_factory=_as_drawn)
 
@@ -145,11 +145,11 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     source = simulate(dataclasses.replace(street, time_offset_s=config.time_offset_s))
     frames = tuple(source)
     drive = prepare_drive(Recording(source, frames), config.calibration.classes, config.calibration.prepare)
-    scans = [RegisteredScan(frame.scan, config.registration) for frame in frames if frame.scan is not None]
+    scans = [RegisteredScan(frame.scan) for frame in frames if frame.scan is not None]
     # 1. SLAM alone: LiDAR odometry, loop closures.
     graph, odometry = pose_graph(scan_to_scan(scans))
     poses = [odometry.atPose3(pose_key(k)) for k in range(len(scans))]
-    closures = loop_closures(scans, poses, config.loops)
+    closures = loop_closures(scans, poses, config.loop_every, config.loop_min_s)
     graph, _ = pose_graph(scan_to_scan(scans), closures)
     slam = gtsam.LevenbergMarquardtOptimizer(graph, odometry).optimize()
     # 2. Calibration alone.

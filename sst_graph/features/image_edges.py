@@ -1,10 +1,10 @@
 """What the picture shows along a mask's contour: where the object's edge is, and where none can be seen.
 
 Networks and people put a contour a pixel or three beside the edge, all along one side of an object, and
-where the picture is too dark to see an edge they draw what they think is there. The picture tells both:
-colours change most across the edge. One pixel's profile is noise, so profiles are averaged along the
-contour. The contour moves to an edge that has no rival within reach; where hardly any change of colour goes
-with it, it is not asked at all.
+where the picture is too dark to see an edge they interpolate. The picture shows both: colours change most
+across the edge. One pixel's profile is noise, so profiles are averaged along the contour. The contour moves
+to an edge that is unambiguous within reach; where hardly any change of colour goes with it, it is not
+matched.
 """
 
 from __future__ import annotations
@@ -17,53 +17,45 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sst_graph.config import Settings, setting
 from sst_graph.features.sampling import sampled
 
 FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 Picture = NDArray[np.uint8]
 
+_REACH_PX = 3.0
+"""Farthest that a contour is moved [px]."""
+_MASK_SIGMA_PX = 1.4
+"""Deviation of the masks' contours from the objects': of two edges within reach the closer one is likelier
+[px]."""
+_ALONG_PX = 4
+"""Length of contour to either side of a pixel over which profiles are averaged [px]."""
+_MIN_CONTRAST = 1.5
+"""Least ratio of an edge to the mean change of colour within reach."""
+_MAX_SECOND_BEST = 0.6
+"""An edge is ambiguous if another within reach has more than this share of its weight."""
+_MIN_SHARE = 0.2
+"""Where the likeliest edge has less than this share of the median weight along all contours, no edge is
+visible: nothing is matched there."""
 _STEP_PX = 0.5
+"""Between the distances from the contour at which the picture is sampled [px]."""
 _BLUR_PX = 0.8
-_RIVAL_PX = 1.3
+"""Gaussian blur of the picture before sampling [px]."""
+_EDGE_WIDTH_PX = 1.3
 """What is this close to an edge is part of it [px]."""
 _NEARBY = np.arange(-2, 3)
-"""In steps around the likeliest place: the same edge."""
-_SLOPE, _BEND = _NEARBY / 10.0, (_NEARBY**2 - 2.0) / 14.0
+"""In steps around the likeliest distance: the same edge."""
+_SLOPE, _CURVATURE = _NEARBY / 10.0, (_NEARBY**2 - 2.0) / 14.0
+"""Weights of the parabola through five samples (Savitzky and Golay, 1964)."""
 _OWN_PX = 0.7
-"""A place belongs to a contour pixel if its distance to the contour is what it would be by this much [px]."""
-_AROUND_PX = 2
-"""How far around a contour pixel it is not asked, either."""
+"""A sample belongs to a contour pixel if the distance field there is its distance from it, by this much
+[px]."""
+_UNSEEN_PX = 2
+"""How far around a contour pixel without a visible edge nothing is matched [px]."""
 _SMOOTHING_PX = 1.0
 """Gaussian smoothing of the shifts across the field, in pixels of the image [px]."""
 _EVERY = 2
-"""One of so many contour pixels is asked: neighbours show the same."""
-
-
-@dataclass(frozen=True)
-class PictureConfig(Settings):
-    """How contours follow the picture.
-
-    Attributes:
-        use: ask the picture at all; False takes the masks' contours as they are.
-        reach_px: farthest that a contour is moved [px].
-        mask_sigma_px: deviation of the masks' contours from the objects': of two edges within reach the
-            closer one is the likelier [px].
-        along_px: length of contour to either side of a pixel that decides with it [px].
-        min_contrast: least ratio of an edge to the mean change of colour within reach.
-        max_rival: an edge is not followed if another within reach has more than this share of its weight.
-        min_share: where the likeliest edge has less than this share of the weight that it has in the median
-            along all contours, the contour is taken for guessed, and nothing is matched to it.
-    """
-
-    use: bool = True
-    reach_px: float = setting(3.0, at_least=1.0, at_most=20.0)
-    mask_sigma_px: float = setting(1.4, at_least=0.1, at_most=100.0)
-    along_px: int = setting(4, at_least=2, at_most=64)
-    min_contrast: float = setting(1.5, at_least=0.0, at_most=100.0)
-    max_rival: float = setting(0.6, at_least=0.0, at_most=1.0)
-    min_share: float = setting(0.2, at_least=0.0, at_most=1.0)
+"""One of so many contour pixels is evaluated: neighbours show the same."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +88,7 @@ class PictureEdges:
         shifts = cv2.resize(smooth, (2 * width, 2 * height))[: inside.shape[0], : inside.shape[1]]
         unseen = np.zeros(inside.shape, np.uint8)
         unseen[v[~self.seen], u[~self.seen]] = 1
-        around = np.ones((2 * _AROUND_PX + 1, 2 * _AROUND_PX + 1), np.uint8)
+        around = np.ones((2 * _UNSEEN_PX + 1, 2 * _UNSEEN_PX + 1), np.uint8)
         return np.asarray(shifts, np.float32), np.asarray(cv2.dilate(unseen, around), np.uint8)
 
 
@@ -106,9 +98,7 @@ def contour_pixels(inside: NDArray[np.uint8]) -> list[NDArray[np.intp]]:
     return [outline[::_EVERY, 0].astype(np.intp) for outline in outlines]
 
 
-def find_picture_edges(
-    inside: NDArray[np.uint8], distance: FloatMap, picture: Picture, config: PictureConfig
-) -> PictureEdges:
+def find_picture_edges(inside: NDArray[np.uint8], distance: FloatMap, picture: Picture) -> PictureEdges:
     """What the picture shows along the contours of a region.
 
     Args:
@@ -116,21 +106,21 @@ def find_picture_edges(
         distance: (h, w) signed distance to its contour, negative inside, lightly smoothed [px].
         picture: (h, w, 3) BGR.
     """
-    along = config.along_px // _EVERY
+    along = _ALONG_PX // _EVERY
     pixels, own = _closed(contour_pixels(inside), 3 * along)
-    ts = np.arange(-config.reach_px, config.reach_px + 1e-9, _STEP_PX)
+    ts = np.arange(-_REACH_PX, _REACH_PX + 1e-9, _STEP_PX)
     strength = _strength(pixels, ts, distance, picture, along)
-    likely = strength * np.exp(-0.5 * (ts / config.mask_sigma_px) ** 2).astype(np.float32)[:, None]
-    shifts, clear = _best_edges(strength, likely, ts, config)
+    likely = strength * np.exp(-0.5 * (ts / _MASK_SIGMA_PX) ** 2).astype(np.float32)[:, None]
+    shifts, clear = _best_edges(strength, likely, ts)
     size = 2 * along + 1
     shifts = ndimage.median_filter(np.where(clear, shifts, 0.0), size, mode="nearest")
     shifts = ndimage.uniform_filter1d(shifts, size, mode="nearest")
     strongest = likely.max(axis=0)
-    # Where the picture cuts the object there is no edge of its own.
+    # At the image's border the object is cut: no edge of its own.
     cut = (pixels == 0).any(axis=1) | (pixels == np.array(inside.shape[::-1]) - 1).any(axis=1)
     whole = own[~cut[own]]
     usual = np.median(strongest[whole]) if len(whole) else 0.0
-    seen = ndimage.median_filter(strongest >= config.min_share * usual, size, mode="nearest")
+    seen = ndimage.median_filter(strongest >= _MIN_SHARE * usual, size, mode="nearest")
     return PictureEdges(shifts[own].astype(np.float32), np.asarray(seen[own], np.bool_))
 
 
@@ -154,9 +144,9 @@ def _strength(
     normals = np.stack([around[1] - around[2], around[3] - around[4]], axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-6)[:, None]
     feet = pixels - around[0][:, None] * normals
-    # Colours half a pixel to either side of the places asked.
-    asked = np.concatenate([[ts[0] - _STEP_PX], ts, [ts[-1] + _STEP_PX]])
-    u, v = (feet[:, k] + asked[:, None] * normals[:, k] for k in (0, 1))
+    # Colours half a pixel to either side of the samples.
+    samples = np.concatenate([[ts[0] - _STEP_PX], ts, [ts[-1] + _STEP_PX]])
+    u, v = (feet[:, k] + samples[:, None] * normals[:, k] for k in (0, 1))
     blurred = np.asarray(cv2.GaussianBlur(picture, (3, 3), _BLUR_PX), np.uint8)
     colours = sampled(blurred, u, v).astype(np.float32)
     change = (colours[2:] - colours[:-2]) / np.float32(2.0 * _STEP_PX)
@@ -169,20 +159,20 @@ def _strength(
     return np.asarray(cv2.blur(strength, (size, 1), borderType=cv2.BORDER_REPLICATE), np.float32)
 
 
-def _best_edges(
-    strength: FloatMap, likely: FloatMap, ts: FloatArray, config: PictureConfig
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """(n,) distances of the likeliest edges [px], and whether they are beyond doubt."""
-    # Which edge is a question of likelihood; where it is, of the picture alone.
+def _best_edges(strength: FloatMap, likely: FloatMap, ts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """(n,) distances of the likeliest edges [px], and whether they are unambiguous."""
+    # Which edge it is, the likelihood decides; where it is, the picture alone.
     column = np.arange(strength.shape[1])
     likeliest = likely.argmax(axis=0)
     nearby = np.clip(likeliest + _NEARBY[:, None], 2, len(ts) - 3)
     best = nearby[strength[nearby, column].argmax(axis=0), column]
     # The top of a parabola through five places: an edge within a pixel has a flat one.
-    slope, bend = (weights @ strength[best + _NEARBY[:, None], column] for weights in (_SLOPE, _BEND))
-    shifts = ts[best] + np.clip(-0.5 * slope / np.minimum(bend, -1e-9), -2.0, 2.0) * _STEP_PX
+    slope, curvature = (
+        weights @ strength[best + _NEARBY[:, None], column] for weights in (_SLOPE, _CURVATURE)
+    )
+    shifts = ts[best] + np.clip(-0.5 * slope / np.minimum(curvature, -1e-9), -2.0, 2.0) * _STEP_PX
     top = strength[best, column]
-    clear = top > config.min_contrast * strength.mean(axis=0)
-    rival = np.where(np.abs(ts[:, None] - shifts) > _RIVAL_PX, likely, 0.0).max(axis=0)
-    clear &= rival < config.max_rival * likely[likeliest, column]
+    clear = top > _MIN_CONTRAST * strength.mean(axis=0)
+    second = np.where(np.abs(ts[:, None] - shifts) > _EDGE_WIDTH_PX, likely, 0.0).max(axis=0)
+    clear &= second < _MAX_SECOND_BEST * likely[likeliest, column]
     return np.asarray(shifts), np.asarray(clear)

@@ -141,7 +141,7 @@ def _evenly_from_each(counts: IntArray) -> IntArray:
 
 
 def _cone_heights(z: FloatArray, rho: FloatArray, counts: IntArray) -> FloatArray:
-    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where a ring cannot tell.
+    """(rings,) heights of the cone tips by robust regression of z on rho; 0 where not determined.
 
     Args:
         z, rho: (rings, n) of points of each ring [m].

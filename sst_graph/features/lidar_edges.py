@@ -2,7 +2,7 @@
 
 The edge lies between the last return on the object and the next beam, so the direction half way is
 unbiased, uniform over half a beam step to either side. Where the neighbour is *nearer* the edge belongs
-to the neighbour and is skipped. The range is carried on over the half step with the slope of the last
+to the neighbour and is skipped. The range is extrapolated over the half step with the slope of the last
 two returns, and along a roof that is seen from above: at a grazing angle it ends well behind the last
 return, and a camera beside the LiDAR sees the difference.
 """
@@ -25,8 +25,23 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 
-_AMID = 2
-"""Beams to either side of a point on a roof that meet the object, too."""
+_BEHIND_M = 0.5
+"""The neighbour has to be farther by this much: less is the object's own relief [m]."""
+_MAX_STEPS = 1.6
+"""Largest azimuth gap between neighbours, in beam steps: one missing return ends the line."""
+_MAX_ELEVATION_GAP = np.radians(0.9)
+"""Largest gap between neighbouring rings: twice the 0.4 deg of an HDL-64E [rad]."""
+_GROUND_MARGIN_M = 0.3
+"""What is lower than an object's lowest points plus this is the ground below it [m]."""
+_MAX_SLOPE_M = 1.0
+"""Most that the range is extrapolated by the slope of the last two returns [m]."""
+_MAX_ROOF_M = 0.6
+"""Most that it is extrapolated along a roof, from a return anywhere on it to where a camera a little lower
+loses sight of it [m]."""
+_ROOF_BEAMS = 2
+"""Beams to either side of a point on a roof that hit the object, too."""
+_CELL_M = 0.3
+"""Grid cell for splitting a class into objects where instances are missing [m]."""
 
 
 class Edge(IntEnum):
@@ -39,34 +54,15 @@ class Edge(IntEnum):
 
 @dataclass(frozen=True)
 class BoundaryConfig(Settings):
-    """Which returns make a boundary.
+    """Objects whose boundaries are used.
 
     Attributes:
-        behind_m: the neighbour must be farther by this much [m] ...
-        behind_ratio: ... plus this fraction of the range.
-        max_steps: largest azimuth gap between neighbours, in beam steps.
-        max_elevation_gap_deg: largest gap between neighbouring rings [deg].
         max_range_m: farthest object [m].
         min_points: objects with fewer points are left out.
-        bottom_edges: find edges towards the ground too.
-        ground_margin_m: what is lower than an object's lowest points plus this is the ground below it [m].
-        max_slope_m: most that the range is carried on by the slope of the last two returns [m].
-        max_roof_m: most that it is carried on along a roof, from a return anywhere on it to where a camera a
-            little lower loses sight of it [m].
-        cell_m: grid cell for splitting a class into objects where instances are missing [m].
     """
 
-    behind_m: float = setting(0.5, at_least=0.0, at_most=100.0)
-    behind_ratio: float = setting(0.0, at_least=0.0, at_most=10.0)
-    max_steps: float = setting(1.6, at_least=0.1, at_most=1000.0)
-    max_elevation_gap_deg: float = setting(0.9, at_least=0.01, at_most=90.0)
     max_range_m: float = setting(60.0, at_least=1.0, at_most=1000.0)
     min_points: int = setting(15, at_least=1, at_most=1_000_000)
-    bottom_edges: bool = True
-    ground_margin_m: float = setting(0.3, at_least=0.0, at_most=10.0)
-    max_slope_m: float = setting(1.0, at_least=0.0, at_most=100.0)
-    max_roof_m: float = setting(0.6, at_least=0.0, at_most=100.0)
-    cell_m: float = setting(0.3, at_least=0.05, at_most=10.0)
 
 
 @dataclass(frozen=True)
@@ -118,15 +114,22 @@ def joined(parts: Sequence[Boundaries]) -> Boundaries:
 
 
 def find_boundaries(
-    scan: Scan, classes: Sequence[SemanticClass], config: BoundaryConfig | None = None
+    scan: Scan,
+    classes: Sequence[SemanticClass],
+    config: BoundaryConfig | None = None,
+    with_lower_edges: bool = True,
 ) -> dict[SemanticClass, Boundaries]:
-    """Boundary points of each class in a scan; a class without any has no entry."""
+    """Boundary points of each class in a scan; a class without any has no entry.
+
+    Args:
+        with_lower_edges: find edges towards the ground, too.
+    """
     config = config or BoundaryConfig()
     points = scan.points.astype(np.float64)
     apart = np.einsum("ij,ij->i", points, points) > 0.25
     usable = slice(None) if apart.all() else apart
     points, labels = points[usable], scan.classes[usable]
-    # Compared with plain ints, for an enum makes all labels int64.
+    # Compared with plain ints: compared with an enum, all labels are converted to int64.
     members = {c: labels == int(c) for c in classes}
     present = [c for c in classes if np.count_nonzero(members[c]) >= config.min_points]
     if not present:
@@ -137,15 +140,15 @@ def find_boundaries(
     found = {}
     for c in present:
         mask = members[c]
-        objects = split_objects(points, mask, instances, config)
+        objects = split_objects(points, mask, instances, config.min_points)
         parts = [
-            _side_edges(points, mask, beams, config, +1),
-            _side_edges(points, mask, beams, config, -1),
-            _ring_edges(points, mask, beams, config, roofs=c == SemanticClass.VEHICLE),
+            _side_edges(points, mask, beams, +1),
+            _side_edges(points, mask, beams, -1),
+            _ring_edges(points, mask, beams, roofs=c == SemanticClass.VEHICLE),
         ]
-        if config.bottom_edges:
-            parts.append(_ring_edges(points, mask, beams, config, _ground_heights(points, objects)))
-        found[c] = _collect(parts, offsets, objects, config)
+        if with_lower_edges:
+            parts.append(_ring_edges(points, mask, beams, _ground_heights(points, objects)))
+        found[c] = _collect(parts, offsets, objects, config.max_range_m)
     return {c: b for c, b in found.items() if len(b)}
 
 
@@ -159,9 +162,7 @@ class _Edges:
     edge: Edge
 
 
-def _side_edges(
-    points: FloatArray, mask: NDArray[np.bool_], beams: Beams, config: BoundaryConfig, side: int
-) -> _Edges:
+def _side_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, side: int) -> _Edges:
     """Edges towards rising (side = 1) or falling azimuth, half a beam step from the last return.
 
     The half step, not the middle of the two azimuths: a laser mounted off the axis shows a near and a
@@ -169,30 +170,28 @@ def _side_edges(
     """
     member = mask[beams.order]
     here, there = (member[:-1], member[1:]) if side > 0 else (member[1:], member[:-1])
-    # Few points are the last of a class: all that follows is asked of these alone.
+    # Few points are the last of a class: all that follows is computed for these alone.
     place = np.flatnonzero(here & ~there) + (side < 0)
     last, following = beams.order[place], beams.order[place + side]
     before = beams.order[np.clip(place - side, 0, len(beams.order) - 1)]
     gap = side * (beams.azimuth[following] - beams.azimuth[last])
     parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
-    ok = (beams.ring[last] == beams.ring[following]) & (gap < config.max_steps * beams.step + parallax)
-    ok &= _is_behind(beams.rho, last, following, config)
+    ok = (beams.ring[last] == beams.ring[following]) & (gap < _MAX_STEPS * beams.step + parallax)
+    ok &= _is_behind(beams.rho, last, following)
     last, before = last[ok], before[ok]
     steps = side * (beams.azimuth[last] - beams.azimuth[before])
     known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
-    known &= steps < config.max_steps * beams.step
-    edge = _along_rays(points, beams, last, _carried_on(beams, last, before, known, config))
+    known &= steps < _MAX_STEPS * beams.step
+    edge = _along_rays(points, beams, last, _extrapolated(beams, last, before, known))
     half = 0.5 * side * beams.step
     return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), Edge.SIDE)
 
 
-def _carried_on(
-    beams: Beams, last: IntArray, before: IntArray, known: NDArray[np.bool_], config: BoundaryConfig
-) -> FloatArray:
+def _extrapolated(beams: Beams, last: IntArray, before: IntArray, known: NDArray[np.bool_]) -> FloatArray:
     """(n,) half the range step to last returns from those before, where these are known [m]."""
     step = beams.rho[last] - beams.rho[before]
-    push = np.clip(0.5 * step, -config.max_slope_m, config.max_slope_m)
-    return np.where(known & (np.abs(step) < 2.0 * config.max_slope_m), push, 0.0)
+    push = np.clip(0.5 * step, -_MAX_SLOPE_M, _MAX_SLOPE_M)
+    return np.where(known & (np.abs(step) < 2.0 * _MAX_SLOPE_M), push, 0.0)
 
 
 def _along_rays(points: FloatArray, beams: Beams, index: IntArray, push: FloatArray) -> FloatArray:
@@ -215,7 +214,6 @@ def _ring_edges(
     points: FloatArray,
     mask: NDArray[np.bool_],
     beams: Beams,
-    config: BoundaryConfig,
     ground: FloatArray | None = None,
     roofs: bool = False,
 ) -> _Edges:
@@ -236,22 +234,22 @@ def _ring_edges(
     following, near = _nearest_in_ring(beams, i, ring[i])
     ok = near & ~mask[following]
     if ground is None:
-        ok &= _is_behind(beams.rho, i, following, config)
+        ok &= _is_behind(beams.rho, i, following)
     else:
-        ok &= points[following, 2] < ground[i] + config.ground_margin_m
+        ok &= points[following, 2] < ground[i] + _GROUND_MARGIN_M
     i, following = i[ok], following[ok]
     # The two rays: height over range, from their cones' tips.
     rho, tip, tip_there = beams.rho[i], beams.height[beams.ring[i]], beams.height[ring[i]]
     slope = (points[i, 2] - tip) / rho
     slope_there = (points[following, 2] - tip_there) / beams.rho[following]
     gap = tip_there + slope_there * rho - points[i, 2]
-    ok = (up * gap > 0.0) & (up * gap < np.radians(config.max_elevation_gap_deg) * rho)
+    ok = (up * gap > 0.0) & (up * gap < _MAX_ELEVATION_GAP * rho)
     i, rho, gap, slope, slope_there = (a[ok] for a in (i, rho, gap, slope, slope_there))
     before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
-    push = _carried_on(beams, i, before, known & mask[before], config)
+    push = _extrapolated(beams, i, before, known & mask[before])
     if roofs:
-        along = _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope, config)
-        push = np.maximum(push, np.where(_amid(mask, beams, i), along, 0.0))
+        along = _along_roof(0.5 * gap, 0.5 * (slope + slope_there), slope)
+        push = np.maximum(push, np.where(_within_object(mask, beams, i), along, 0.0))
     edge = _along_rays(points, beams, i, push)
     half = 0.5 * (gap + push * (slope_there - slope))
     lPs, outward = edge.copy(), edge.copy()
@@ -260,9 +258,7 @@ def _ring_edges(
     return _Edges(i, lPs, outward, Edge.TOP if up > 0 else Edge.BOTTOM)
 
 
-def _along_roof(
-    half: FloatArray, middle: FloatArray, slope: FloatArray, config: BoundaryConfig
-) -> FloatArray:
+def _along_roof(half: FloatArray, middle: FloatArray, slope: FloatArray) -> FloatArray:
     """(n,) how far behind the last return the ray half way to the ring above comes down to its height [m].
 
     A roof seen from above at a grazing angle ends somewhere between the returns of two rings that are metres
@@ -273,19 +269,21 @@ def _along_roof(
         middle, slope: (n,) slopes of that ray and of the last return's.
     """
     down = np.where(middle < 0.0, half / np.maximum(-middle, 1e-9), np.inf)
-    return np.where(slope < 0.0, np.minimum(down, config.max_roof_m), 0.0)
+    return np.where(slope < 0.0, np.minimum(down, _MAX_ROOF_M), 0.0)
 
 
-def _amid(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:
+def _within_object(mask: NDArray[np.bool_], beams: Beams, index: IntArray) -> NDArray[np.bool_]:
     """(n,) whether the class goes on in the ring to both sides of a point: where it does not, the edge above
     may well be that of a slanting pillar, not of a roof."""
     place = np.searchsorted(beams.keys, Beams.key(beams.ring[index], beams.azimuth[index]))
-    amid = np.ones(len(index), np.bool_)
-    for steps in (-_AMID, _AMID):
+    within = np.ones(len(index), np.bool_)
+    for steps in (-_ROOF_BEAMS, _ROOF_BEAMS):
         beside = beams.order[np.clip(place + steps, 0, len(beams.order) - 1)]
         gap = np.abs(beams.azimuth[beside] - beams.azimuth[index])
-        amid &= mask[beside] & (beams.ring[beside] == beams.ring[index]) & (gap < (_AMID + 1) * beams.step)
-    return amid
+        within &= (
+            mask[beside] & (beams.ring[beside] == beams.ring[index]) & (gap < (_ROOF_BEAMS + 1) * beams.step)
+        )
+    return within
 
 
 def _ground_heights(points: FloatArray, objects: IntArray) -> FloatArray:
@@ -313,20 +311,18 @@ def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[Int
     return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < beams.step)
 
 
-def _is_behind(
-    rho: FloatArray, last: IntArray, following: IntArray, config: BoundaryConfig
-) -> NDArray[np.bool_]:
-    return np.asarray(rho[following] > rho[last] * (1.0 + config.behind_ratio) + config.behind_m)
+def _is_behind(rho: FloatArray, last: IntArray, following: IntArray) -> NDArray[np.bool_]:
+    return np.asarray(rho[following] > rho[last] + _BEHIND_M)
 
 
 def _collect(
-    parts: Sequence[_Edges], offsets: FloatArray, objects: IntArray, config: BoundaryConfig
+    parts: Sequence[_Edges], offsets: FloatArray, objects: IntArray, max_range_m: float
 ) -> Boundaries:
     index = np.concatenate([part.index for part in parts])
     lPs = np.concatenate([part.lPs for part in parts])
     outward = np.concatenate([part.outward for part in parts])
     edges = np.concatenate([np.full(len(part.index), part.edge, dtype=np.uint8) for part in parts])
-    keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < config.max_range_m)
+    keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < max_range_m)
     half_gaps = 0.5 * np.linalg.norm(outward - lPs, axis=1)
     return Boundaries(
         lPs[keep], outward[keep], half_gaps[keep], offsets[index][keep], edges[keep], objects[index][keep]
@@ -337,9 +333,9 @@ def split_objects(
     points: FloatArray,
     mask: NDArray[np.bool_],
     instances: NDArray[np.uint16] | None,
-    config: BoundaryConfig,
+    min_points: int,
 ) -> IntArray:
-    """(n,) number of the object that each point of a class belongs to; -1 for none or too small a one.
+    """(n,) number of the object that each point of a class belongs to; -1 for none, or one of too few points.
 
     The data's instances where all points carry one, else connected cells of a grid seen from above.
     """
@@ -348,7 +344,7 @@ def split_objects(
     if instances is not None and bool((instances[mask] > 0).all()):
         numbers = instances[mask].astype(np.intp)
     else:
-        cells = np.floor(members / config.cell_m).astype(np.intp)
+        cells = np.floor(members / _CELL_M).astype(np.intp)
         cells -= cells.min(axis=0) - 1
         size = np.minimum(cells.max(axis=0) + 2, 4000)
         grid = np.zeros(size, dtype=np.uint8)
@@ -358,5 +354,5 @@ def split_objects(
         _, regions = cv2.connectedComponents(grown, connectivity=4)
         numbers = regions[cells[:, 0], cells[:, 1]].astype(np.intp)
     counts = np.bincount(numbers)
-    objects[mask] = np.where(counts[numbers] >= config.min_points, numbers, -1)
+    objects[mask] = np.where(counts[numbers] >= min_points, numbers, -1)
     return objects

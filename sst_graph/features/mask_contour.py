@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.features.image_edges import Picture, PictureConfig, PictureEdges, find_picture_edges
+from sst_graph.features.image_edges import Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
 from sst_graph.types import SemanticClass
@@ -49,7 +49,7 @@ class ContourFeet:
 @storable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
-    """Signed distance field of one class in one mask; in an array store, it is read whenever it is asked for.
+    """Signed distance field of one class in one mask; in an array store it is read at every access.
 
     Attributes:
         distance: (h, w) signed distance to the contour, negative inside, lightly smoothed, in a box around
@@ -58,7 +58,7 @@ class ContourMap:
         width, height: of the image.
         unknown: 1 near ``IGNORE`` pixels, where a contour is not the object's, and where the picture shows no
             edge along it; in the same box.
-        edges: what the picture shows along the contour, if it was asked; in ``distance`` already.
+        edges: what the picture shows along the contour, if it was used; in ``distance`` already.
     """
 
     distance: FloatMap
@@ -75,21 +75,19 @@ class ContourMap:
         mask: NDArray[np.uint8],
         semantic_class: SemanticClass,
         picture: Picture | None = None,
-        config: PictureConfig | None = None,
         edges: PictureEdges | None = None,
     ) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image.
 
         Args:
             picture: (h, w, 3) BGR that the contour follows; by default, or where it has another size, none.
-            config: how it does.
-            edges: what was found in the picture before; it is not asked again.
+            edges: what was found in the picture before, instead of the picture.
         """
-        # Compared with a plain int, for an enum makes all pixels int64.
+        # Compared with a plain int: compared with an enum, all pixels are converted to int64.
         inside = (mask == int(semantic_class)).view(np.uint8)
         if cv2.countNonZero(inside) in (0, inside.size):
             return None
-        # Only near the class: elsewhere nothing is matched, and the field is what an image costs.
+        # Only near the class: elsewhere nothing is matched, and the field takes most of an image's time.
         x, y, width, height = cv2.boundingRect(inside)
         top, left = max(0, y - REACH_PX), max(0, x - REACH_PX)
         part = slice(top, y + height + REACH_PX), slice(left, x + width + REACH_PX)
@@ -97,9 +95,8 @@ class ContourMap:
         distance = np.asarray(cv2.GaussianBlur(signed_distance(box), (0, 0), _SMOOTHING_PX), np.float32)
         ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
         unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.uint8)
-        config = config or PictureConfig()
-        if edges is None and picture is not None and config.use and picture.shape[:2] == mask.shape:
-            edges = find_picture_edges(box, distance, picture[part], config)
+        if edges is None and picture is not None and picture.shape[:2] == mask.shape:
+            edges = find_picture_edges(box, distance, picture[part])
         if edges is not None:
             shifts, unseen = edges.fields(box)
             distance -= shifts

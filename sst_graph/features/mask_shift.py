@@ -58,8 +58,8 @@ class MaskShift:
         sigma_px: standard deviations of the two, (2,) [px].
         contrast: how far the mean strength at the best shift stands out, in standard deviations of an
             object's strength over the shifts.
-        rival: the most at a shift elsewhere, as a share of that at the best one: the picture of another mask
-            has edges here and there.
+        second_best: the highest strength at a shift elsewhere, as a share of the best one's: near 1 where the
+            picture is that of another mask.
         objects: that took part.
     """
 
@@ -67,7 +67,7 @@ class MaskShift:
     down_px: float
     sigma_px: FloatArray
     contrast: float
-    rival: float
+    second_best: float
     objects: int
 
     @property
@@ -82,8 +82,8 @@ class MaskShift:
     @property
     def sigma_along_px(self) -> float:
         """Standard deviation of the shift along itself [px]."""
-        way = np.array([self.right_px, self.down_px]) / max(self.length_px, 1e-9)
-        return float(np.sqrt(way**2 @ self.sigma_px**2))
+        direction = np.array([self.right_px, self.down_px]) / max(self.length_px, 1e-9)
+        return float(np.sqrt(direction**2 @ self.sigma_px**2))
 
 
 def contour_profiles(
@@ -116,7 +116,7 @@ def contour_profiles(
 
 
 def mask_shift(profiles: Sequence[ContourProfile]) -> MaskShift | None:
-    """The shift that the masks of all objects share; None where there are too few of them to tell."""
+    """The shift that the masks of all objects share; None where there are too few of them."""
     clusters = sorted({profile.cluster for profile in profiles})
     if len(profiles) < _LEAST_OBJECTS or len(clusters) < _LEAST_CLUSTERS:
         return None
@@ -131,10 +131,10 @@ def mask_shift(profiles: Sequence[ContourProfile]) -> MaskShift | None:
     sigma = np.sqrt(variance + 0.1**2)
     right, down = -best
     at_best = contrast / float(weights.sum())
-    return MaskShift(float(right), float(down), sigma, at_best, _rival(whole, best), len(profiles))
+    return MaskShift(float(right), float(down), sigma, at_best, _second_best(whole, best), len(profiles))
 
 
-def _rival(total: FloatArray, best: FloatArray) -> float:
+def _second_best(total: FloatArray, best: FloatArray) -> float:
     """The highest strength farther than :data:`_APART_PX` from the best, as a share of the highest."""
     down, right = np.mgrid[-REACH_PX : REACH_PX + 1, -REACH_PX : REACH_PX + 1]
     elsewhere = np.hypot(right - best[0], down - best[1]) > _APART_PX
@@ -149,14 +149,14 @@ def sum_of(profiles: Sequence[ContourProfile]) -> FloatArray:
 def _gradients(picture: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(h, w, 6) derivatives of the lightly blurred picture: to the right of each channel, and down."""
     blurred = cv2.GaussianBlur(picture, (0, 0), 1.0).astype(np.float32)
-    parts = [cv2.Sobel(blurred, cv2.CV_32F, *way, ksize=3, scale=0.125) for way in ((1, 0), (0, 1))]
+    parts = [cv2.Sobel(blurred, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
     return np.asarray(np.concatenate(parts, axis=2), np.float32)
 
 
 def _normals(inside: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Unit normals (h, w) of a region's border, right and down parts."""
     smooth = cv2.GaussianBlur(inside.astype(np.float32), (0, 0), 2.0)
-    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *way, ksize=3) for way in ((1, 0), (0, 1)))
+    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1)))
     length = np.maximum(np.hypot(x, y), 1e-6)
     return np.asarray(x / length, np.float32), np.asarray(y / length, np.float32)
 
@@ -189,7 +189,7 @@ def _peak(total: FloatArray) -> tuple[FloatArray, float]:
         step = 0.0
         if 0 < place < SIDE - 1:
             before, here, after = line[place - 1 : place + 2]
-            bend = before - 2.0 * here + after
-            step = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
+            curvature = before - 2.0 * here + after
+            step = 0.5 * (before - after) / curvature if curvature < 0.0 else 0.0
         at.append(place - REACH_PX + step)
     return np.array(at), float(total.max())

@@ -38,21 +38,18 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
 from sst_graph.graph.state import State, underside_track
-from sst_graph.objects.tracks import (
-    Mover,
-    ObjectId,
-    moving_objects,
-    numbers_in,
-    of_each,
-    standing_shares,
-    tracks_of_scans,
+from sst_graph.objects.dynamic_objects import (
+    DynamicObject,
+    dynamic_object_weights,
+    find_dynamic_objects,
 )
+from sst_graph.objects.tracks import ObjectId, numbers_in, of_each, tracks_of_scans
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-Movers = dict[tuple[SemanticClass, int], Mover]
-"""The moving objects of one scan, by class and number within the scan."""
+DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
+"""The dynamic objects of one scan, by class and number within the scan."""
 
 
 @dataclass(frozen=True)
@@ -154,12 +151,12 @@ class Tracks:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track(growing) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._movers = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
+        self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
 
-    def seeing(self, objects: Mapping[ObjectId, int], movers: Mapping[ObjectId, Mover]) -> Tracks:
+    def seeing(self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]) -> Tracks:
         """The same twists of one drive, with other object tracks and moving objects."""
         other = Tracks([])
-        other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
+        other._tracks, other.objects, other._dynamic = self._tracks, [objects], [_by_scan(dynamic)]
         return other
 
     def part(self, drive: int, scans: Sequence[int]) -> Tracks:
@@ -168,13 +165,13 @@ class Tracks:
         other._tracks = [self._tracks[drive]]
         if self.objects is not None:
             other.objects = [tracks_of_scans(self.objects[drive], scans)]
-            moving = self._movers[drive]
-            other._movers = [{place[scan]: own for scan, own in moving.items() if scan in place}]
+            moving = self._dynamic[drive]
+            other._dynamic = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
-    def movers(self, drive: int, scan: int) -> Movers:
+    def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
         """The moving objects of a scan."""
-        return self._movers[drive].get(scan, {}) if self._movers else {}
+        return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
         """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
@@ -237,7 +234,9 @@ class DriveOutlines:
                     for k, c, points in groups
                 ]
             )
-        unknown_mps, velocities = _own_motion([(tracks.movers(number, k), c, b) for k, c, b in groups])
+        unknown_mps, velocities = _own_motion(
+            [(tracks.dynamic_objects(number, k), c, b) for k, c, b in groups]
+        )
         return cls(
             number,
             drive,
@@ -275,7 +274,7 @@ class DriveOutlines:
         shares = None
         if self.unknown_mps is not None:
             taus_s = offset_s + facing.repeated([pairs[p].base_tau_s for _, p in groups])
-            shares = standing_shares(self.unknown_mps[index], taus_s, self.config.mover_reach_m)
+            shares = dynamic_object_weights(self.unknown_mps[index], taus_s, self.config.mover_reach_m)
             if not shares.all():
                 kept = np.flatnonzero(shares)
                 facing, index, shares = facing.take(kept), index[kept], shares[kept]
@@ -517,19 +516,19 @@ class DriveMatches:
 
 
 def _own_motion(
-    groups: Sequence[tuple[Movers, SemanticClass, Boundaries]],
+    groups: Sequence[tuple[DynamicObjects, SemanticClass, Boundaries]],
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """How much of the motion of each point's object is not known (n,), and its velocity (n, 3); None where no
     object moves."""
     unknown = [np.zeros(len(points)) for _, _, points in groups]
     velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
-    for (movers, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
-        for (other, n), mover in movers.items():
+    for (dynamic, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
+        for (other, n), one in dynamic.items():
             if other == c:
                 own = points.objects == n
-                slow[own] = mover.unknown_mps
-                if mover.velocity is not None:
-                    known[own] = mover.velocity.l_velocity
+                slow[own] = one.unknown_mps
+                if one.velocity is not None:
+                    known[own] = one.velocity.l_velocity
     slow, known = np.concatenate(unknown), np.concatenate(velocities)
     return slow if slow.any() else None, known if known.any() else None
 
@@ -554,8 +553,8 @@ def associate(
     return [pair for matches in found for pair in matches.by_pair()]
 
 
-def _by_scan(movers: Mapping[ObjectId, Mover]) -> dict[int, Movers]:
-    found: dict[int, Movers] = {}
-    for (scan, c, n), mover in movers.items():
-        found.setdefault(scan, {})[c, n] = mover
+def _by_scan(dynamic: Mapping[ObjectId, DynamicObject]) -> dict[int, DynamicObjects]:
+    found: dict[int, DynamicObjects] = {}
+    for (scan, c, n), one in dynamic.items():
+        found.setdefault(scan, {})[c, n] = one
     return found

@@ -21,7 +21,7 @@ from sst_graph.factors.custom.factor import recipe_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.odometry.relative import DirectionMotion
-from sst_graph.odometry.standing import StandingConfig, at_rest
+from sst_graph.odometry.standstill import zero_velocity_update
 
 FloatArray = NDArray[np.float64]
 
@@ -94,14 +94,13 @@ def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list
     ]
 
 
-_EACH_ALONE = StandingConfig(longest_stretch=1)
-"""Only motions that each by itself are surely none are set to rest: the noise's scale is fitted to all pairs,
-and noise that is taken away would make the rest of them too sure."""
-
-
 def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
-    """The LiDAR's path in each drive, exactly at rest where it stands without any doubt."""
-    return [SensorPath(at_rest(drive.lidar_motions, _EACH_ALONE)) for drive in drives]
+    """The LiDAR's path in each drive, constant where each motion by itself is surely zero.
+
+    Not several motions together: the noise's scale is fitted to all pairs, and noise that is removed would
+    make the others too sure.
+    """
+    return [SensorPath(zero_velocity_update(drive.lidar_motions, together=1)) for drive in drives]
 
 
 def pair_motions(

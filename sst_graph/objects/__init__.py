@@ -1,1 +1,1 @@
-"""Objects through the scans of a drive: tracks, whether they stay, and their velocity."""
+"""Objects through the scans of a drive: tracks, which ones are dynamic, and their velocity."""

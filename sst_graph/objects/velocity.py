@@ -1,8 +1,8 @@
-"""Velocity over ground of objects that move: their near end, followed through the scans around.
+"""Velocity of dynamic objects over ground: their near end, followed through the scans around.
 
 The centre of an outline wanders over a vehicle while other sides of it come into view, by half a metre a
-second close by. Its end towards the LiDAR along the way that it takes, and its side towards the LiDAR across
-it, are the same pieces of it in every scan, as long as it does not pass alongside.
+second close by. Its end towards the LiDAR along its direction of motion, and its side towards the LiDAR
+across it, are the same pieces of it in every scan, as long as it does not pass alongside.
 """
 
 from __future__ import annotations
@@ -16,51 +16,41 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries, Edge
-from sst_graph.objects.persistence import ObjectName
+from sst_graph.objects.occupancy import ObjectName
 from sst_graph.odometry.lidar import MOVABLE_CLASSES
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class VelocityConfig(Settings):
-    """When an object is followed well enough.
-
-    Attributes:
-        window_s: half width of the time around a scan that is looked at [s].
-        min_sightings: fewest scans within it.
-        least_mps: slower ones have no direction to speak of [m/s].
-        least_sigmas: nor have those whose velocity is not as many deviations from none.
-        least_points: fewest points of an outline.
-        end: share of an outline that lies beyond its end, for stray points.
-        max_scatter_m: largest rms distance of end and side from a steady motion [m].
-        acceleration_mps2: deviation of the velocity's rate of change; it counts where the scans do not lie
-            evenly around [m/s^2].
-        floor_mps: least deviation of a velocity [m/s].
-        memory_s: an object that moved within this time before or after moves [s].
-        reach_m: farthest that a point of an outline may be from the same outline in another scan [m] ...
-        kept: ... for this share of the points at least where the outline is moved on ...
-        gained: ... and this share more than where it is not. An end that the field of view cuts off moves
-            along with the LiDAR, and the rest of the outline does not.
-    """
-
-    window_s: float = setting(0.35, at_least=0.01, at_most=10.0)
-    min_sightings: int = setting(4, at_least=2, at_most=1000)
-    least_mps: float = setting(1.0, at_least=0.0, at_most=100.0)
-    least_sigmas: float = setting(3.0, at_least=0.0, at_most=100.0)
-    least_points: int = setting(8, at_least=1, at_most=10_000)
-    end: float = setting(0.02, at_least=0.0, at_most=0.5)
-    max_scatter_m: float = setting(0.25, at_least=0.0, at_most=10.0)
-    acceleration_mps2: float = setting(1.0, at_least=0.0, at_most=100.0)
-    floor_mps: float = setting(0.03, at_least=0.0001, at_most=10.0)
-    memory_s: float = setting(0.8, at_least=0.0, at_most=10.0)
-    reach_m: float = setting(0.2, at_least=0.001, at_most=10.0)
-    kept: float = setting(0.4, at_least=0.0, at_most=1.0)
-    gained: float = setting(0.2, at_least=-1.0, at_most=1.0)
+_WINDOW_S = 0.35
+"""Half width of the time around a scan in which the near end is followed [s]."""
+_MIN_DETECTIONS = 4
+"""Fewest scans within it."""
+_MIN_SPEED_MPS = 1.0
+"""Slower objects have no reliable direction [m/s]."""
+_MIN_SIGMAS = 3.0
+"""Nor have those whose velocity is not so many sigmas from zero."""
+_MIN_POINTS = 8
+"""Fewest points of an outline."""
+_STRAY_SHARE = 0.02
+"""Share of an outline that lies beyond its end, for stray points."""
+_MAX_SCATTER_M = 0.25
+"""Largest rms distance of end and side from a steady motion [m]."""
+_ACCELERATION_MPS2 = 1.0
+"""Sigma of the velocity's rate of change; it counts where the scans do not lie evenly around [m/s^2]."""
+_FLOOR_MPS = 0.03
+"""Least sigma of a velocity [m/s]."""
+_MEMORY_S = 0.8
+"""An object that moved within this time before or after is dynamic [s]."""
+_REACH_M = 0.2
+"""Farthest that a point of an outline may be from the same outline in another scan [m] ..."""
+_MIN_SHARE, _MIN_GAIN = 0.4, 0.2
+"""... for this share of the points at least where the outline is moved with the velocity, and this share more
+than where it is not. An end that the field of view cuts off moves along with the LiDAR; the rest of the
+outline does not."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +66,7 @@ class ObjectVelocity:
     sigma_mps: float
 
 
-class Velocities:
+class ObjectVelocities:
     """Velocities of the movable objects of the latest scans, which are numbered without gaps as they come.
 
     An object's velocity is found when its scan comes, and again when all around it has been seen.
@@ -85,10 +75,9 @@ class Velocities:
         found: by the object's track and the scan.
     """
 
-    def __init__(self, config: VelocityConfig | None = None) -> None:
-        self.config = config or VelocityConfig()
-        self._scans: dict[int, _Seen] = {}
-        self._sightings: dict[int, dict[int, ObjectName]] = {}
+    def __init__(self) -> None:
+        self._scans: dict[int, _ScanOutlines] = {}
+        self._detections: dict[int, dict[int, ObjectName]] = {}
         self.found: dict[int, dict[int, ObjectVelocity]] = {}
 
     def add(
@@ -97,32 +86,32 @@ class Velocities:
         """A further scan, posed at ``wTl``, and the tracks of its objects.
 
         Returns:
-            Numbers of the earlier scans about which this tells something new.
+            Numbers of the earlier scans in which an object becomes dynamic, or static, by this.
         """
         before = max((seen.stamp_ns for seen in self._scans.values()), default=scan.stamp_ns)
-        self.remember(number, scan, tracks, wTl)
-        reach = round(1e9 * self.config.window_s)
+        self.insert(number, scan, tracks, wTl)
+        reach = round(1e9 * _WINDOW_S)
         whole = {k for k, seen in self._scans.items() if before <= seen.stamp_ns + reach < scan.stamp_ns}
-        return whole.union(*(self._judge(k) for k in sorted({number, *whole}))) - {number}
+        return whole.union(*(self._update(k) for k in sorted({number, *whole}))) - {number}
 
-    def remember(
+    def insert(
         self, number: int, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3
     ) -> None:
         """Keep a scan's outlines."""
-        self._scans[number] = _Seen.of(scan, tracks, wTl)
+        self._scans[number] = _ScanOutlines.of(scan, tracks, wTl)
         for name, track in self._scans[number].tracks.items():
-            self._sightings.setdefault(track, {})[number] = name
+            self._detections.setdefault(track, {})[number] = name
 
-    def judge_all(self) -> None:
-        """Look again at all scans, with all that has been seen."""
+    def update_all(self) -> None:
+        """Estimate the velocities in all scans, from all scans."""
         for number in self._scans:
-            self._judge(number)
+            self._update(number)
 
     def forget(self, before: int) -> None:
         """Drop all scans before one."""
         for old in [k for k in self._scans if k < before]:
             for track in self._scans.pop(old).tracks.values():
-                for by_track in (self._sightings, self.found):
+                for by_track in (self._detections, self.found):
                     by_track.get(track, {}).pop(old, None)
                     if not by_track.get(track, True):
                         del by_track[track]
@@ -134,7 +123,7 @@ class Velocities:
         return None if track is None else self.found.get(track, {}).get(number)
 
     def speeds(self, number: int) -> dict[ObjectName, float]:
-        """Speed of the objects of a scan that are known to have moved a little before or after [m/s]."""
+        """Speed of the objects of a scan that moved a little before or after [m/s]."""
         found = {}
         for name, track in self._scans[number].tracks.items() if number in self._scans else ():
             near = self._known_near(track, number)
@@ -143,11 +132,9 @@ class Velocities:
         return found
 
     def _known_near(self, track: int, number: int) -> dict[int, ObjectVelocity]:
-        """What is known of an object a little before or after a scan."""
+        """Velocities of an object a little before or after a scan."""
         known = self.found.get(track)
-        return (
-            {k: known[k] for k in self._around(number, self.config.memory_s) if k in known} if known else {}
-        )
+        return {k: known[k] for k in self._around(number, _MEMORY_S) if k in known} if known else {}
 
     def _around(self, number: int, seconds: float) -> list[int]:
         """The scans within some seconds of one, itself included, in their order."""
@@ -159,58 +146,59 @@ class Velocities:
             last += 1
         return list(range(first, last + 1))
 
-    def _judge(self, number: int) -> set[int]:
-        """Find the velocities of a scan's objects; scans in which that alone shows, or showed, motion."""
-        told = set[int]()
+    def _update(self, number: int) -> set[int]:
+        """Estimate the velocities of a scan's objects; scans in which only these show, or showed, motion."""
+        changed = set[int]()
         for name, track in self._scans[number].tracks.items():
-            found, known = self._followed(number, name), self.found.setdefault(track, {})
+            found, known = self._estimate(number, name), self.found.setdefault(track, {})
             if (found is None) == (number in known):
                 known.pop(number, None)
-                near = [k for k in self._around(number, self.config.memory_s) if k in self._sightings[track]]
-                told |= {k for k in near if not self._known_near(track, k)}
+                near = [k for k in self._around(number, _MEMORY_S) if k in self._detections[track]]
+                changed |= {k for k in near if not self._known_near(track, k)}
             if found is not None:
                 known[number] = found
             if not known:
                 del self.found[track]
-        return told
+        return changed
 
-    def _followed(self, number: int, name: ObjectName) -> ObjectVelocity | None:
+    def _estimate(self, number: int, name: ObjectName) -> ObjectVelocity | None:
         here = self._scans[number]
-        sightings = self._sightings[here.tracks[name]]
-        near = [(k, sightings[k]) for k in self._around(number, self.config.window_s) if k in sightings]
-        few = len(here.outlines[name]) < self.config.least_points
-        if few or len(near) < self.config.min_sightings:
+        detections = self._detections[here.tracks[name]]
+        near = [(k, detections[k]) for k in self._around(number, _WINDOW_S) if k in detections]
+        few = len(here.outlines[name]) < _MIN_POINTS
+        if few or len(near) < _MIN_DETECTIONS:
             return None
         times_s = np.array([1e-9 * (self._scans[k].stamp_ns - here.stamp_ns) for k, _ in near])
         centres = np.array([self._scans[k].centres[own] for k, own in near])
         rough = _slopes(times_s, centres)
-        if np.hypot(*rough) < self.config.least_mps:
+        if np.hypot(*rough) < _MIN_SPEED_MPS:
             return None
         outlines = [self._scans[k].outlines[own] for k, own in near]
         places = [self._scans[k].place for k, _ in near]
-        found = near_end_velocity(times_s, outlines, places, rough, self.config)
-        if found is None or not self._carried(found[0], here.outlines[name], times_s, outlines):
+        found = near_end_velocity(times_s, outlines, places, rough)
+        if found is None or not _is_carried(found[0], here.outlines[name], times_s, outlines):
             return None
         w_velocity, sigma_mps = found
         return ObjectVelocity(here.wTl.rotation().unrotate(np.append(w_velocity, 0.0)), sigma_mps)
 
-    def _carried(
-        self, w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
-    ) -> bool:
-        """Whether a velocity carries an outline to where the first and the last scan around show it."""
-        shares = []
-        for velocity in (w_velocity, np.zeros(2)):
-            distances = [
-                cdist(outline + times_s[i] * velocity, outlines[i]).min(axis=1)
-                for i in (0, -1)
-                if abs(times_s[i]) > 1e-3
-            ]
-            shares.append(float(np.mean(np.concatenate(distances) < self.config.reach_m)))
-        return shares[0] >= max(self.config.kept, shares[1] + self.config.gained)
+
+def _is_carried(
+    w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
+) -> bool:
+    """Whether a velocity carries an outline to where the first and the last scan around show it."""
+    shares = []
+    for velocity in (w_velocity, np.zeros(2)):
+        distances = [
+            cdist(outline + times_s[i] * velocity, outlines[i]).min(axis=1)
+            for i in (0, -1)
+            if abs(times_s[i]) > 1e-3
+        ]
+        shares.append(float(np.mean(np.concatenate(distances) < _REACH_M)))
+    return shares[0] >= max(_MIN_SHARE, shares[1] + _MIN_GAIN)
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _ScanOutlines:
     """A scan: stamp, pose, the LiDAR's place (2,); outlines (n, 2), centres, tracks of movable objects."""
 
     stored_apart: ClassVar[bool] = True
@@ -223,7 +211,7 @@ class _Seen:
     tracks: dict[ObjectName, int]
 
     @classmethod
-    def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _Seen:
+    def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _ScanOutlines:
         outlines = {}
         for c in MOVABLE_CLASSES:
             if (points := scan.boundaries.get(c)) is None:
@@ -262,14 +250,13 @@ def near_end_velocity(
     outlines: Sequence[FloatArray],
     places: Sequence[FloatArray],
     rough: FloatArray,
-    config: VelocityConfig,
 ) -> tuple[FloatArray, float] | None:
     """Velocity (2,) at time 0 and its deviation [m/s] of an outline (n, 2), seen from a place (2,) each time.
 
     None where it does not move steadily, or passes alongside.
 
     Args:
-        rough: (2,) velocity, good enough to tell along from across [m/s].
+        rough: (2,) velocity, good enough to separate along from across [m/s].
     """
     speed = float(np.hypot(*rough))
     axes = np.array([[rough[0], rough[1]], [-rough[1], rough[0]]]) / speed
@@ -278,15 +265,15 @@ def near_end_velocity(
         along, across = axes @ (outline - place).T
         if along.min() < 0.0 < along.max():
             return None
-        ends.append(axes @ place + [_near_end(along, config.end), _near_end(across, config.end)])
+        ends.append(axes @ place + [_near_end(along, _STRAY_SHARE), _near_end(across, _STRAY_SHARE)])
     X, t = np.stack(ends), times_s - times_s.mean()
     slopes = _slopes(times_s, X)
     variances = ((X - X.mean(axis=0) - t[:, None] * slopes) ** 2).sum(axis=0) / (len(t) - 2)
-    if variances.max() > config.max_scatter_m**2:
+    if variances.max() > _MAX_SCATTER_M**2:
         return None
-    drift = config.acceleration_mps2 * float(times_s.mean())
-    sigma_mps = np.sqrt(variances.mean() / (t @ t) + drift**2 + config.floor_mps**2)
-    if np.hypot(*slopes) < max(config.least_mps, config.least_sigmas * sigma_mps):
+    drift = _ACCELERATION_MPS2 * float(times_s.mean())
+    sigma_mps = np.sqrt(variances.mean() / (t @ t) + drift**2 + _FLOOR_MPS**2)
+    if np.hypot(*slopes) < max(_MIN_SPEED_MPS, _MIN_SIGMAS * sigma_mps):
         return None
     return axes.T @ slopes, float(sigma_mps)
 

@@ -59,10 +59,10 @@ def usable_points(
 def registration_cloud(
     points: FloatArray, voxel_m: float, neighbours: int, plane_ratio: float
 ) -> small_gicp.PointCloud:
-    """Downsampled cloud with covariances, in which no single surface direction drowns the others.
+    """Downsampled cloud with covariances, in which no single surface direction dominates.
 
-    A scan is mostly ground. Its points say nothing about motion along it, yet the rings they form
-    pull the registration towards no motion. Where one normal direction dominates, its points are
+    A scan is mostly ground. Its points do not constrain motion along it, yet the rings they form
+    bias the registration towards no motion. Where one normal direction dominates, its points are
     thinned evenly to ``plane_ratio`` times the number of all the others.
 
     Args:
@@ -89,8 +89,8 @@ def _along_main_direction(
 ) -> NDArray[np.bool_]:
     """(n,) whether a cloud's points (n, 4) lie on surfaces of its main direction.
 
-    Judged on a coarser cloud, for the nearest point of which each speaks: the covariances of the finer one
-    are estimated once only.
+    By the normal of the nearest point of a coarser cloud: the covariances of the finer one are estimated only
+    once.
     """
     coarse, tree = small_gicp.preprocess_points(cloud, _COARSER * voxel_m, neighbours, 1)
     normals = np.asarray(coarse.normals())[:, :3]
@@ -100,7 +100,7 @@ def _along_main_direction(
 
 
 _COARSER = 2.0
-"""Edge of the voxels in which surface directions are judged, in edges of those that are registered."""
+"""Edge of the voxels in which surface directions are estimated, in edges of those that are registered."""
 
 
 def surfaces(points: FloatArray, neighbours: int) -> small_gicp.PointCloud:

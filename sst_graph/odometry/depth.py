@@ -8,32 +8,24 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sst_graph.config import Settings, setting
 from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class DepthConfig(Settings):
-    """When LiDAR points around a feature tell its depth.
-
-    Attributes:
-        neighbours: points from which a feature's depth is interpolated.
-        radius_px: farthest neighbour [px].
-        max_spread: largest ratio of the farthest to the nearest neighbour's depth: beyond it,
-            foreground and background meet at the feature.
-        max_residual: largest root mean square misfit of a plane, relative to the inverse depth.
-        max_leverage: largest leverage of the feature's place: beyond it the plane is extrapolated.
-        range_sigma: relative sigma of a depth that even a perfect plane keeps.
-    """
-
-    neighbours: int = setting(8, at_least=3, at_most=100)
-    radius_px: float = setting(16.0, at_least=1.0, at_most=500.0)
-    max_spread: float = setting(1.3, at_least=1.0, at_most=100.0)
-    max_residual: float = setting(0.02, at_least=0.0001, at_most=10.0)
-    max_leverage: float = setting(0.7, at_least=0.01, at_most=100.0)
-    range_sigma: float = setting(0.005, at_least=0.0, at_most=1.0)
+_NEIGHBOURS = 8
+"""Points from which a feature's depth is interpolated."""
+_RADIUS_PX = 16.0
+"""Farthest neighbour [px]; scan lines of an HDL-64E are 5 px apart (0.4 deg at a focal length of 720 px)."""
+_MAX_SPREAD = 1.3
+"""Largest ratio of the farthest to the nearest neighbour's depth: beyond it, foreground and background meet
+at the feature."""
+_MAX_RESIDUAL = 0.02
+"""Largest root mean square misfit of a plane, relative to the inverse depth."""
+_MAX_LEVERAGE = 0.7
+"""Largest leverage of the feature's place: beyond it the plane is extrapolated."""
+RANGE_SIGMA = 0.005
+"""Relative sigma of a depth that even a perfect plane keeps: 2 cm, an HDL-64E's range noise, at 4 m."""
 
 
 @dataclass(frozen=True)
@@ -54,41 +46,38 @@ class InverseDepths:
         return np.isfinite(self.value)
 
 
-def inverse_depths(
-    uvs: FloatArray, cPs: FloatArray, camera: PinholeCamera, config: DepthConfig | None = None
-) -> InverseDepths:
+def inverse_depths(uvs: FloatArray, cPs: FloatArray, camera: PinholeCamera) -> InverseDepths:
     """Inverse depth at pixels uvs (n, 2) from points cPs (m, 3) in the camera [m].
 
     On a plane Z^-1 is an affine function of the pixel, so one is fitted to the neighbours of each
     feature; where it does not fit (an edge between foreground and background) or would be
     extrapolated the depth is unknown.
     """
-    config = config or DepthConfig()
     value = np.full(len(uvs), np.nan)
     sigma = np.full(len(uvs), np.nan)
     points = cPs[camera.in_front(cPs)]
     pixels = camera.project(points)
-    margin = config.radius_px
+    margin = _RADIUS_PX
     u, v = pixels.T
     near_image = (u > -margin) & (u < camera.width + margin) & (v > -margin) & (v < camera.height + margin)
     pixels, rho = pixels[near_image], 1.0 / points[near_image, 2]
-    if len(pixels) < config.neighbours or len(uvs) == 0:
+    if len(pixels) < _NEIGHBOURS or len(uvs) == 0:
         return InverseDepths(value, sigma)
     tree = cKDTree(pixels, balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(uvs, k=config.neighbours, distance_upper_bound=margin)
+    distance, index = tree.query(uvs, k=_NEIGHBOURS, distance_upper_bound=margin)
     full = np.isfinite(distance).all(axis=1)
     index, offsets = index[full], pixels[index[full]] - uvs[full, None, :]
     fitted, misfit, leverage = _plane_at_origin(offsets, rho[index])
     spread = rho[index].max(axis=1) / rho[index].min(axis=1)
     good = (
-        (spread < config.max_spread)
-        & (misfit < config.max_residual * fitted)
-        & (leverage < config.max_leverage)
+        (spread < _MAX_SPREAD)
+        & (misfit < _MAX_RESIDUAL * fitted)
+        & (leverage < _MAX_LEVERAGE)
         & (fitted > 0.0)
     )
     where = np.flatnonzero(full)[good]
     value[where] = fitted[good]
-    own = np.hypot(misfit * np.sqrt(leverage), config.range_sigma * fitted)
+    own = np.hypot(misfit * np.sqrt(leverage), RANGE_SIGMA * fitted)
     sigma[where] = own[good]
     return InverseDepths(value, sigma)
 

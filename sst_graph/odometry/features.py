@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.types import CameraImage, SemanticClass
 
@@ -24,27 +23,20 @@ UNTRACKED_CLASSES = (
 """Classes on which no corner is taken: what may move by itself, clouds, and what may be anything."""
 
 
-@dataclass(frozen=True)
-class FeatureConfig(Settings):
-    """Which corners are tracked, and when a track counts.
-
-    Attributes:
-        threshold: least grey-value contrast of a FAST corner.
-        cell_px: edge of the grid cells over which corners are spread [px].
-        per_cell: most corners of a cell.
-        mask_margin_px: corners keep this distance from untracked classes [px].
-        window_px: edge of the Lucas-Kanade window [px].
-        levels: pyramid levels above the full image.
-        max_round_trip_px: largest distance between a corner and its track there and back [px].
-    """
-
-    threshold: int = setting(12, at_least=1, at_most=255)
-    cell_px: int = setting(32, at_least=4, at_most=1000)
-    per_cell: int = setting(2, at_least=1, at_most=1000)
-    mask_margin_px: int = setting(5, at_least=0, at_most=100)
-    window_px: int = setting(17, at_least=3, at_most=101)
-    levels: int = setting(4, at_least=0, at_most=10)
-    max_round_trip_px: float = setting(0.5, at_least=0.01, at_most=100.0)
+_FAST_CONTRAST = 12
+"""Least grey-value contrast of a FAST corner; a lower one finds more corners in the dark, and more noise."""
+_CELL_PX = 32
+"""Edge of the grid cells over which corners are spread, so that one textured wall does not decide [px]."""
+_CORNERS_PER_CELL = 2
+"""Most corners of a cell; the time of a frame grows with it."""
+_MASK_MARGIN_PX = 5
+"""Corners keep this distance from untracked classes, for masks end a few pixels beside an object [px]."""
+_WINDOW_PX = 17
+"""Edge of the Lucas-Kanade window [px]."""
+_LEVELS = 4
+"""Pyramid levels above the full image: half a window at the coarsest is 8 * 2^4 = 128 px."""
+_MAX_ROUND_TRIP_PX = 0.5
+"""Largest distance between a corner and its track there and back [px]."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +60,7 @@ class Tracks:
 class FeatureTracker:
     """Tracks between consecutive images; keeps the last one."""
 
-    def __init__(self, config: FeatureConfig | None = None) -> None:
-        self.config = config or FeatureConfig()
+    def __init__(self) -> None:
         self._last: tuple[CameraImage, NDArray[np.uint8]] | None = None
 
     def add(self, image: CameraImage) -> Tracks | None:
@@ -89,60 +80,46 @@ class FeatureTracker:
             return Tracks(image_a.stamp_ns, image.stamp_ns, np.zeros((0, 2)), np.zeros((0, 2)))
         if gray.shape != gray_a.shape:
             raise DataError("visual odometry", f"image {gray.shape}", f"the size before, {gray_a.shape}")
-        corners = detect_corners(gray_a, trackable_area(image_a, self.config), self.config)
-        uv_a, uv_b = _track(gray_a, gray, corners, self.config)
+        corners = detect_corners(gray_a, trackable_area(image_a))
+        found, good = follow_corners(gray_a, gray, corners)
+        uv_a, uv_b = corners[good].astype(np.float64), found[good]
         # A corner that slid on to something that may move is no landmark.
         column, row = np.rint(uv_b).astype(np.intp).T
-        still = np.full(len(uv_b), True)
+        static = np.full(len(uv_b), True)
         if image.has_mask:
-            still = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
-        return Tracks(image_a.stamp_ns, image.stamp_ns, uv_a[still], uv_b[still])
+            static = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
+        return Tracks(image_a.stamp_ns, image.stamp_ns, uv_a[static], uv_b[static])
 
 
-def track_features(image_a: CameraImage, image_b: CameraImage, config: FeatureConfig | None = None) -> Tracks:
-    """FAST corners of image a, spread over the image, followed into image b and back.
-
-    Raises:
-        DataError: image b is not later than a, or of another size.
-    """
-    tracker = FeatureTracker(config)
-    tracker.add(image_a)
-    tracks = tracker.add(image_b)
-    assert tracks is not None
-    return tracks
-
-
-def detect_corners(
-    gray: NDArray[np.uint8], trackable: NDArray[np.uint8], config: FeatureConfig
-) -> NDArray[np.float32]:
+def detect_corners(gray: NDArray[np.uint8], trackable: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(n, 2) FAST corners [px], the strongest few of each grid cell, in row order of the cells.
 
     Args:
         gray: (h, w) picture.
         trackable: (h, w), 0 where no corner is wanted.
     """
-    detector = cv2.FastFeatureDetector.create(threshold=config.threshold)
+    detector = cv2.FastFeatureDetector.create(threshold=_FAST_CONTRAST)
     keypoints = detector.detect(gray, trackable)
     if not keypoints:
         return np.zeros((0, 2), np.float32)
     uvs = np.asarray(cv2.KeyPoint.convert(keypoints)).reshape(-1, 2)
     response = np.array([keypoint.response for keypoint in keypoints])
-    columns = gray.shape[1] // config.cell_px + 1
-    column, row = (uvs // config.cell_px).astype(np.intp).T
+    columns = gray.shape[1] // _CELL_PX + 1
+    column, row = (uvs // _CELL_PX).astype(np.intp).T
     cell = row * columns + column
     order = np.lexsort((-response, cell))
     ordered = cell[order]
     rank = np.arange(len(order)) - np.searchsorted(ordered, ordered)
-    return np.asarray(uvs[order[rank < config.per_cell]], np.float32)
+    return np.asarray(uvs[order[rank < _CORNERS_PER_CELL]], np.float32)
 
 
-def trackable_area(image: CameraImage, config: FeatureConfig) -> NDArray[np.uint8]:
+def trackable_area(image: CameraImage) -> NDArray[np.uint8]:
     """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask."""
     if not image.has_mask:
         return np.full(image.mask.shape, 255, np.uint8)
     table = np.zeros(256, np.uint8)
     table[list(UNTRACKED_CLASSES)] = 255
-    width = 2 * config.mask_margin_px + 1
+    width = 2 * _MASK_MARGIN_PX + 1
     barred = cv2.dilate(cv2.LUT(image.mask, table), np.ones((width, width), np.uint8))
     return np.asarray(cv2.bitwise_not(barred), np.uint8)
 
@@ -154,35 +131,23 @@ def gray_of(image: CameraImage) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY), np.uint8)
 
 
-def _track(
-    gray_a: NDArray[np.uint8],
-    gray_b: NDArray[np.uint8],
-    corners: NDArray[np.float32],
-    config: FeatureConfig,
-) -> tuple[FloatArray, FloatArray]:
-    """Corners that LK finds in b, inside the image, and that return to where they started."""
-    there, good = follow_corners(gray_a, gray_b, corners, config)
-    return corners[good].astype(np.float64), there[good]
-
-
 def follow_corners(
     gray_a: NDArray[np.uint8],
     gray_b: NDArray[np.uint8],
     corners: NDArray[np.float32],
-    config: FeatureConfig,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """(n, 2) where Lucas-Kanade finds corners (n, 2) of a in b [px], and (n,) whether it does: inside the
     image, and returning to where they started."""
     if len(corners) == 0:
         return np.zeros((0, 2)), np.zeros(0, np.bool_)
-    there, found = _flow(gray_a, gray_b, corners, None, config)
-    # Back from where it went: the pyramid has done its work, two levels check it.
-    back, found_back = _flow(gray_b, gray_a, there, corners, config)
+    there, found = _flow(gray_a, gray_b, corners, None)
+    # The way back starts from where the corner was: two pyramid levels are enough to check it.
+    back, found_back = _flow(gray_b, gray_a, there, corners)
     height, width = gray_a.shape[:2]
     good = (
         found
         & found_back
-        & (np.linalg.norm(back - corners, axis=1) < config.max_round_trip_px)
+        & (np.linalg.norm(back - corners, axis=1) < _MAX_ROUND_TRIP_PX)
         & np.all((there >= 0) & (there <= [width - 1, height - 1]), axis=1)
     )
     return there.astype(np.float64), np.asarray(good, np.bool_)
@@ -193,7 +158,6 @@ def _flow(
     gray_b: NDArray[np.uint8],
     uv_a: NDArray[np.float32],
     guess: NDArray[np.float32] | None,
-    config: FeatureConfig,
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(n, 2) pixels of b where Lucas-Kanade finds the windows about uv_a, and (n,) whether it does."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
@@ -201,8 +165,8 @@ def _flow(
         gray_b,
         uv_a,
         np.empty_like(uv_a) if guess is None else guess.copy(),
-        winSize=(config.window_px, config.window_px),
-        maxLevel=config.levels if guess is None else 1,
+        winSize=(_WINDOW_PX, _WINDOW_PX),
+        maxLevel=_LEVELS if guess is None else 1,
         criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02),
         flags=0 if guess is None else cv2.OPTFLOW_USE_INITIAL_FLOW,
     )

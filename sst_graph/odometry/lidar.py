@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import gtsam
@@ -16,7 +16,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, surfaces, usable_points
 from sst_graph.odometry.local_map import LocalMap, MappedCloud
-from sst_graph.odometry.stationary_objects import MoverConfig, StandingObjects
+from sst_graph.odometry.static_points import StaticPoints
 from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -25,78 +25,67 @@ MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TW
 """Classes whose members may move by themselves."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
-_MOST_RINGS = 30
-"""Most rings of shifts that are tried where the speed is unknown: each takes 8 registrations."""
-SETTLED_M = 5e-3
-"""Sweep compensation has settled where another pass would move no point farther than this [m]."""
+_MIN_VOXEL_M, _MAX_VOXEL_M = 0.1, 1.0
+"""Limits between which the voxels' edge is adapted from scan to scan [m]."""
+_TARGET_POINTS = 3000
+"""Number of registered points that the adaptation aims at; the time of a registration grows with it."""
+_MAP_VOXEL_M = 0.4
+"""Edge of the Gaussian voxels of the local map [m]."""
+_MAP_AGE = 20
+"""Scans after which a voxel that was not seen again leaves the map."""
+_MAX_POINTS = 40_000
+"""Most points of a scan that are read."""
+_MIN_POINTS = 200
+"""Fewest points that are registered; else movable classes are kept, or the scan fails."""
+_NEIGHBOURS = 6
+"""Points from which the covariance of a surface patch is estimated."""
+PLANE_RATIO = 0.5
+"""Most points of the main surface (ground), per point of another direction."""
+_MAX_DISTANCE_M = 1.0
+"""Farthest pair of a point and a voxel [m]."""
+_MAX_ITERATIONS = 30
+"""Most Gauss-Newton steps of a registration; it stops where a step is below 1e-4 rad and 5e-4 m."""
+_SEARCH_M, _SEARCH_STEP_M = 3.0, 0.6
+"""Where the speed is unknown (first pair, or after a failure), starts shifted up to this far in the LiDAR's
+horizontal plane, and this far apart, are tried [m]: 30 m/s at 10 Hz."""
+_SEARCH_ITERATIONS = 6
+"""Gauss-Newton steps from each such start."""
+_STANDSTILL_M, _STANDSTILL_INLIER_RATIO = 0.02, 0.65
+"""No farther shift is tried where the best of the nearest ones stays within this distance of the prediction
+with at least this fraction of its points paired: standstill [m, 1]. Along a street's walls a scan may well
+stay where it was started, which its neighbours show."""
+_MISSED_COST = 1.0
+"""What a point without a voxel to pair with costs in the choice among starts; a pair costs its squared,
+whitened residual."""
+_MIN_INLIER_RATIO = 0.3
+"""A registration with fewer points paired than this fraction has failed."""
+_COMPENSATIONS = 3
+"""Most registrations of one scan while its sweep compensation converges."""
+_CONVERGED_M = 5e-3
+"""Sweep compensation has converged where another pass would move no point farther than this [m]."""
+_INFLATION = 2.0
+"""Factor on the sigmas of the registration's own covariance, for pairs are correlated."""
+FLOOR_RAD, FLOOR_M = 1e-4, 2e-3
+"""Sigmas added to every motion for what the registration cannot know [rad, m]."""
+FAILED_RAD, FAILED_M = 0.1, 2.0
+"""Sigmas of a motion that was only predicted [rad, m]."""
 
 
 @dataclass(frozen=True)
 class LidarOdometryConfig(Settings):
-    """How scans are thinned, registered and trusted.
+    """Which points are registered.
 
     Attributes:
         voxel_m: edge of the voxels of which one point is registered, for the first scan [m].
-        min_voxel_m, max_voxel_m: limits between which the edge is adapted from scan to scan [m].
-        target_points: number of voxels that the adaptation aims at.
-        map_voxel_m: edge of the Gaussian voxels of the local map [m].
-        map_age: scans after which a voxel that was not seen again is forgotten.
         near_m, far_m: ranges between which points are used [m].
-        max_points: most points of a scan that are looked at.
-        min_points: fewest points that are registered; else movable classes are kept, or the scan fails.
-        neighbours: points from which the covariance of a surface patch is estimated.
-        plane_ratio: most points of the main surface (ground), per point of another direction.
-        max_distance_m: farthest pair of a point and a voxel [m].
-        max_iterations: Gauss-Newton steps of one registration.
-        search_m, search_step_m: where the speed is unknown (first pair, or after a failure), shifts of the
-            start up to this far in the LiDAR's horizontal plane, and this far apart, are tried [m].
-        search_iterations: Gauss-Newton steps of each trial.
-        rest_m, rest_inlier_ratio: no farther shift is tried where the best of the nearest ones stays within
-            this distance of the prediction [m] with at least this fraction of its points paired: it stands.
-            Along a street's walls a scan may well stay where it was begun; its neighbours tell.
-        missed_cost: what a point without a voxel to pair with costs in the choice among trials.
-        min_inlier_ratio: a registration with fewer points paired than this fraction has failed.
-        compensations: most registrations of one scan while its sweep compensation settles.
-        movers: how standing objects are told from moving ones.
-        inflation: factor on the sigmas of the registration's own covariance, for pairs are correlated.
-        floor_rad, floor_m: sigmas added to every motion for what the registration cannot know [rad, m].
-        failed_rad, failed_m: sigmas of a motion that was only predicted [rad, m].
     """
 
     voxel_m: float = setting(0.2, at_least=0.02, at_most=10.0)
-    min_voxel_m: float = setting(0.1, at_least=0.02, at_most=10.0)
-    max_voxel_m: float = setting(1.0, at_least=0.02, at_most=10.0)
-    target_points: int = setting(3000, at_least=10, at_most=1_000_000)
-    map_voxel_m: float = setting(0.4, at_least=0.02, at_most=10.0)
-    map_age: int = setting(20, at_least=1, at_most=1000)
     near_m: float = setting(1.0, at_least=0.0, at_most=100.0)
     far_m: float = setting(100.0, at_least=1.0, at_most=300.0)
-    max_points: int = setting(40_000, at_least=10, at_most=10_000_000)
-    min_points: int = setting(200, at_least=10, at_most=1_000_000)
-    neighbours: int = setting(6, at_least=5, at_most=100)
-    plane_ratio: float = setting(0.5, at_least=0.0, at_most=1000.0)
-    max_distance_m: float = setting(1.0, at_least=0.01, at_most=100.0)
-    max_iterations: int = setting(30, at_least=1, at_most=1000)
-    search_m: float = setting(3.0, at_least=0.0, at_most=100.0)
-    search_step_m: float = setting(0.6, at_least=0.05, at_most=10.0)
-    search_iterations: int = setting(6, at_least=1, at_most=100)
-    rest_m: float = setting(0.02, at_least=0.0, at_most=10.0)
-    rest_inlier_ratio: float = setting(0.65, at_least=0.0, at_most=1.0)
-    missed_cost: float = setting(1.0, at_least=0.0, at_most=1e6)
-    min_inlier_ratio: float = setting(0.3, at_least=0.0, at_most=1.0)
-    compensations: int = setting(3, at_least=1, at_most=20)
-    movers: MoverConfig = field(default_factory=MoverConfig)
-    inflation: float = setting(2.0, at_least=0.01, at_most=1000.0)
-    floor_rad: float = setting(1e-4, at_least=0.0, at_most=10.0)
-    floor_m: float = setting(2e-3, at_least=0.0, at_most=100.0)
-    failed_rad: float = setting(0.1, at_least=0.0001, at_most=100.0)
-    failed_m: float = setting(2.0, at_least=0.0001, at_most=1000.0)
 
     def __post_init__(self) -> None:
-        self.expect_at_most("min_voxel_m", self.max_voxel_m, "max_voxel_m")
         self.expect_at_most("near_m", self.far_m, "far_m")
-        self.expect_at_most("min_points", self.max_points, "max_points")
-        self.expect_at_most("search_m", _MOST_RINGS * self.search_step_m, f"{_MOST_RINGS} search_step_m")
 
 
 class LidarOdometry:
@@ -105,16 +94,16 @@ class LidarOdometry:
     def __init__(self, config: LidarOdometryConfig | None = None) -> None:
         self.config = config or LidarOdometryConfig()
         self._map: LocalMap | None = None
-        self._mapped: deque[MappedCloud] = deque(maxlen=self.config.map_age)
+        self._mapped: deque[MappedCloud] = deque(maxlen=_MAP_AGE)
         self._clouds = 0
-        self._objects = StandingObjects(self.config.movers)
+        self._static = StaticPoints()
         self._last: Scan | None = None
         self._wTl = np.eye(4)
         self._twist: FloatArray | None = None
         self._covariance = np.zeros((6, 6))
         self._voxel_m = self.config.voxel_m
         self._lost = True
-        self._parted: tuple[Scan, _Sweep, _Sweep] | None = None
+        self._split: tuple[Scan, _Sweep, _Sweep] | None = None
 
     @property
     def pose(self) -> gtsam.Pose3:
@@ -138,8 +127,8 @@ class LidarOdometry:
         # 1. Constant velocity predicts; registration to the map corrects.
         registration = self._register(scan, seconds)
         if self._twist is None and last.offsets_s is not None:
-            # 2. Only now is the first scan's own sweep known: build the map anew and register again.
-            for _ in range(self.config.compensations):
+            # 2. Only now is the first scan's own sweep known: rebuild the map and register again.
+            for _ in range(_COMPENSATIONS):
                 if registration is None:
                     break
                 self._twist, self._lost = registration.twist, False
@@ -150,46 +139,44 @@ class LidarOdometry:
 
     def _register(self, scan: Scan, seconds: float) -> _Registration | None:
         """Pose of the scan in the map, its sweep compensated by its own motion; None where it fails."""
-        config = self.config
         wTl = self._wTl @ _exp(self._twist, seconds)
         if self._lost:
-            wTl = self._searched(self._parts(scan)[0].at_stamp(self._twist), wTl)
+            wTl = self._best_start(self._parts(scan)[0].at_stamp(self._twist), wTl)
         twist: FloatArray | None = self._twist
-        still, movable = self._parts(scan)
-        for _ in range(config.compensations):
-            points, others = still.at_stamp(twist), movable.at_stamp(twist)
-            # What stands still among the movable objects helps where the rest says little.
-            standing = self._objects.still(_transformed(wTl, others), scan.stamp_ns)
-            found = self._align(np.concatenate([points, others[standing]]), wTl, seconds)
+        static, movable = self._parts(scan)
+        for _ in range(_COMPENSATIONS):
+            points, others = static.at_stamp(twist), movable.at_stamp(twist)
+            # Static objects of movable classes (parked cars) help where there is little else.
+            parked = self._static.find(_transformed(wTl, others), scan.stamp_ns)
+            found = self._align(np.concatenate([points, others[parked]]), wTl, seconds)
             if found is None or scan.offsets_s is None:
                 return found
             change = np.inf if twist is None else np.abs(found.twist - twist)[3:].max()
-            if change * np.abs(scan.offsets_s).max(initial=0.0) < SETTLED_M:
+            if change * np.abs(scan.offsets_s).max(initial=0.0) < _CONVERGED_M:
                 return found
             wTl, twist = found.wTl, found.twist
         return found
 
-    def _searched(self, points: FloatArray, wTl: FloatArray) -> FloatArray:
+    def _best_start(self, points: FloatArray, wTl: FloatArray) -> FloatArray:
         """The pose from which registration goes best, among shifts of the predicted one all around it.
 
         With nothing known of the speed, registration alone ends in the nearest of many local minima.
         """
-        config = self.config
-        if self._map is None or len(points) < config.min_points:
+        if self._map is None or len(points) < _MIN_POINTS:
             return wTl
-        cloud = registration_cloud(points, 2.0 * self._voxel_m, config.neighbours, config.plane_ratio)
+        cloud = registration_cloud(points, 2.0 * self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
         best, least, paired = wTl, np.inf, 0.0
-        for number, shift in enumerate(_shifts(config.search_m, config.search_step_m)):
+        for number, shift in enumerate(_shifts(_SEARCH_M, _SEARCH_STEP_M)):
             start = wTl.copy()
             start[:3, 3] += wTl[:3, :3] @ shift
-            result = self._registered(cloud, start, config.search_iterations)
+            result = self._registered(cloud, start, _SEARCH_ITERATIONS)
             found = np.asarray(result.T_target_source)
             missed = cloud.size() - result.num_inliers
-            misfit = (2.0 * result.error + config.missed_cost * missed) / cloud.size()
+            misfit = (2.0 * result.error + _MISSED_COST * missed) / cloud.size()
             if np.isfinite(found).all() and misfit < least:
                 best, least, paired = _orthonormal(found), misfit, result.num_inliers / cloud.size()
-            rests = float(np.linalg.norm(best[:3, 3] - wTl[:3, 3])) < config.rest_m
-            if number == _AROUND and rests and paired >= config.rest_inlier_ratio:
+            stands = float(np.linalg.norm(best[:3, 3] - wTl[:3, 3])) < _STANDSTILL_M
+            if number == _AROUND and stands and paired >= _STANDSTILL_INLIER_RATIO:
                 return best
         return best
 
@@ -202,7 +189,7 @@ class LidarOdometry:
             self._map.with_all(self._mapped),
             cloud,
             wTl,
-            max_correspondence_distance=self.config.max_distance_m,
+            max_correspondence_distance=_MAX_DISTANCE_M,
             num_threads=1,
             max_iterations=iterations,
             rotation_epsilon=1e-4,
@@ -211,57 +198,53 @@ class LidarOdometry:
 
     def _align(self, points: FloatArray, wTl: FloatArray, seconds: float) -> _Registration | None:
         """Points (n, 3) registered to the map from a start; None where that fails."""
-        config = self.config
-        if self._map is None or len(points) < config.min_points:
+        if self._map is None or len(points) < _MIN_POINTS:
             return None
-        cloud = registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio)
-        result = self._registered(cloud, wTl, config.max_iterations)
+        cloud = registration_cloud(points, self._voxel_m, _NEIGHBOURS, PLANE_RATIO)
+        result = self._registered(cloud, wTl, _MAX_ITERATIONS)
         found = np.asarray(result.T_target_source)
-        if not np.isfinite(found).all() or result.num_inliers < config.min_inlier_ratio * cloud.size():
+        if not np.isfinite(found).all() or result.num_inliers < _MIN_INLIER_RATIO * cloud.size():
             return None
         found = _orthonormal(found)
         twist = _log(np.linalg.inv(self._wTl) @ found) / seconds
-        return _Registration(found, cloud, twist, _registration_covariance(result, config))
+        return _Registration(found, cloud, twist, registration_covariance(result))
 
     def _advance(self, last: Scan, scan: Scan, registration: _Registration | None) -> RelativeMotion:
-        """Take the registered pose, or the predicted one, and answer the motion since the last scan."""
-        config = self.config
+        """Go on to the registered pose, or the predicted one; the motion since the last scan."""
         if registration is None or self._map is None:
             step = _exp(self._twist, (scan.stamp_ns - last.stamp_ns) * 1e-9)
             self._wTl = self._wTl @ step
             self._covariance = np.zeros((6, 6))
             self._restart_map(scan)
-            covariance = np.diag(np.repeat([config.failed_rad, config.failed_m], 3) ** 2)
+            covariance = np.diag(np.repeat([FAILED_RAD, FAILED_M], 3) ** 2)
         else:
             step = np.linalg.inv(self._wTl) @ registration.wTl
             self._wTl, self._twist = registration.wTl, registration.twist
             self._insert(registration.cloud)
-            self._remember(scan, registration.cloud.size())
+            self._after_registration(scan, registration.cloud.size())
             bHa = gtsam.Pose3(step).inverse().AdjointMap()
-            floor = np.repeat([config.floor_rad, config.floor_m], 3) ** 2
+            floor = np.repeat([FLOOR_RAD, FLOOR_M], 3) ** 2
             covariance = registration.covariance + bHa @ self._covariance @ bHa.T + np.diag(floor)
             self._covariance = registration.covariance
         ok = registration is not None
         self._lost = not ok
         return RelativeMotion(last.stamp_ns, scan.stamp_ns, gtsam.Pose3(step), covariance, ok)
 
-    def _remember(self, scan: Scan, registered: int) -> None:
+    def _after_registration(self, scan: Scan, registered: int) -> None:
         """Keep the movable objects for later comparison, and adapt the voxels to the number registered."""
-        config = self.config
         movable = self._parts(scan)[1].at_stamp(self._twist)
-        self._objects.remember(_transformed(self._wTl, movable), scan.stamp_ns)
-        edge = self._voxel_m * np.sqrt(registered / config.target_points)
-        self._voxel_m = float(np.clip(edge, config.min_voxel_m, config.max_voxel_m))
+        self._static.insert(_transformed(self._wTl, movable), scan.stamp_ns)
+        edge = self._voxel_m * np.sqrt(registered / _TARGET_POINTS)
+        self._voxel_m = float(np.clip(edge, _MIN_VOXEL_M, _MAX_VOXEL_M))
 
     def _restart_map(self, scan: Scan) -> None:
-        """Forget the map and begin it anew with a scan at the current pose."""
-        config = self.config
+        """Drop the map and start a new one with a scan at the current pose."""
         points = self._parts(scan)[0].at_stamp(self._twist)
         self._map = None
         self._mapped.clear()
-        if len(points) >= config.min_points:
-            self._map = LocalMap(config.map_voxel_m, config.map_age)
-            self._insert(registration_cloud(points, self._voxel_m, config.neighbours, config.plane_ratio))
+        if len(points) >= _MIN_POINTS:
+            self._map = LocalMap(_MAP_VOXEL_M, _MAP_AGE)
+            self._insert(registration_cloud(points, self._voxel_m, _NEIGHBOURS, PLANE_RATIO))
 
     def _insert(self, cloud: small_gicp.PointCloud) -> None:
         """Put a cloud into the map at the current pose."""
@@ -269,8 +252,8 @@ class LidarOdometry:
         self._clouds += 1
 
     def rebuild_map(self) -> None:
-        """Make the map anew of the latest scans alone, as one that was stored makes it."""
-        self._map = LocalMap(self.config.map_voxel_m, self.config.map_age) if self._mapped else None
+        """Build the map of the latest scans alone, as it is built after a restore."""
+        self._map = LocalMap(_MAP_VOXEL_M, _MAP_AGE) if self._mapped else None
 
     def __getstate__(self) -> dict[str, Any]:
         """All but the map; of the scans in it, points and poses."""
@@ -279,21 +262,21 @@ class LidarOdometry:
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
         vars(self).update(state)
-        clouds = [(n, surfaces(points, self.config.neighbours), wTl) for n, points, wTl in state["_mapped"]]
-        self._mapped = deque(clouds, maxlen=self.config.map_age)
+        clouds = [(n, surfaces(points, _NEIGHBOURS), wTl) for n, points, wTl in state["_mapped"]]
+        self._mapped = deque(clouds, maxlen=_MAP_AGE)
         self.rebuild_map()
 
     def _parts(self, scan: Scan) -> tuple[_Sweep, _Sweep]:
-        """What is still and what may move; the latter counts as still where too little else is left."""
+        """Static classes and movable ones; the latter count as static where too little else is left."""
         config = self.config
-        if self._parted is not None and self._parted[0] is scan:
-            return self._parted[1:]
-        points, classes, offsets = usable_points(scan, config.near_m, config.far_m, config.max_points)
+        if self._split is not None and self._split[0] is scan:
+            return self._split[1:]
+        points, classes, offsets = usable_points(scan, config.near_m, config.far_m, _MAX_POINTS)
         sweep, movable = _Sweep(points, offsets), _MOVABLE[classes]
-        if np.count_nonzero(~movable) < config.min_points:
+        if np.count_nonzero(~movable) < _MIN_POINTS:
             movable[:] = False
         parts = sweep.take(np.flatnonzero(~movable)), sweep.take(np.flatnonzero(movable))
-        self._parted = (scan, *parts)
+        self._split = (scan, *parts)
         return parts
 
 
@@ -345,13 +328,11 @@ class _Registration:
     covariance: FloatArray
 
 
-def _registration_covariance(
-    result: small_gicp.RegistrationResult, config: LidarOdometryConfig
-) -> FloatArray:
+def registration_covariance(result: small_gicp.RegistrationResult) -> FloatArray:
     """(6, 6) inverse Hessian scaled by the residual; small_gicp perturbs [rot, trans] on the right."""
     variance = 2.0 * result.error / max(result.num_inliers - 6, 1)
     hessian = np.asarray(result.H) + 1e-6 * np.eye(6)
-    return np.asarray(config.inflation**2 * variance * np.linalg.inv(hessian))
+    return np.asarray(_INFLATION**2 * variance * np.linalg.inv(hessian))
 
 
 _AROUND = 8

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.odometry.depth import DepthConfig, InverseDepths, inverse_depths
+from sst_graph.odometry.depth import RANGE_SIGMA, InverseDepths, inverse_depths
 from sst_graph.odometry.features import Tracks
-from sst_graph.odometry.relative import DirectionMotion, huber_weights, rays, skew
+from sst_graph.odometry.relative import MIN_NOISE_PX, DirectionMotion, huber_weights, rays, skew
 from sst_graph.odometry.starts import consensus_translation
 from sst_graph.types import RelativeMotion
 
@@ -25,36 +24,34 @@ PAIR_KNEE, PAIR_GATE = 2.0, 4.5
 """Whitened size of a residual pair from which it is down-weighted, and from which it is left out."""
 
 
+_MIN_DEPTHS = 10
+"""Fewest features with depth from which a metric motion is estimated."""
+_NEAREST_M = 1.0
+"""No feature lies nearer than this [m]."""
+_PRIOR_INVERSE_M, _PRIOR_SIGMA_INVERSE_M = 0.05, 0.1
+"""Inverse depth expected where none is measured, and its sigma [1/m]: so wide that it does not inform the
+length, yet at standstill it makes such a track a full constraint on the rotation."""
+_ITERATIONS = 15
+"""Most Gauss-Newton steps; it stops where a step is below 1e-5."""
+_FAILED_RAD, _FAILED_M = 0.1, 3.0
+"""Sigmas of a motion that could not be estimated [rad, m]: the way in 0.1 s at 30 m/s."""
+
+
 @dataclass(frozen=True)
-class MetricConfig(Settings):
-    """How metric motion is estimated from tracks and depth.
+class SharedErrors:
+    """Errors that all tracks of a motion have in common, which no residual shows.
 
     Attributes:
-        depth: how depth is interpolated at features.
-        min_depths: fewest features with depth from which a metric motion is estimated.
-        min_noise_px: track noise is never taken smaller than this [px].
-        nearest_m: no feature lies nearer than this [m].
-        prior_inverse_m, prior_sigma_inverse_m: inverse depth expected where none is measured, and its
-            sigma [1/m]; so wide that it tells nothing of the length, yet at standstill it makes
-            such a track a full constraint on the rotation.
-        iterations: Gauss-Newton steps.
         scale_sigma: relative sigma of the length that all depths share (calibration, interpolation).
-        floor_rad, floor_m: sigmas added to every motion for what tracks share [rad, m].
-        failed_rad, failed_m: sigmas of a motion that could not be estimated [rad, m].
+        floor_rad, floor_m: sigmas added to every motion [rad, m].
     """
 
-    depth: DepthConfig = field(default_factory=DepthConfig)
-    min_depths: int = setting(10, at_least=3, at_most=100_000)
-    min_noise_px: float = setting(0.05, at_least=0.001, at_most=10.0)
-    nearest_m: float = setting(1.0, at_least=0.01, at_most=100.0)
-    prior_inverse_m: float = setting(0.05, at_least=0.0, at_most=10.0)
-    prior_sigma_inverse_m: float = setting(0.1, at_least=0.0001, at_most=10.0)
-    iterations: int = setting(15, at_least=1, at_most=100)
-    scale_sigma: float = setting(0.006, at_least=0.0, at_most=1.0)
-    floor_rad: float = setting(1e-4, at_least=0.0, at_most=10.0)
-    floor_m: float = setting(2e-3, at_least=0.0, at_most=100.0)
-    failed_rad: float = setting(0.1, at_least=0.0001, at_most=100.0)
-    failed_m: float = setting(3.0, at_least=0.0001, at_most=1000.0)
+    scale_sigma: float = 0.006
+    floor_rad: float = 1e-4
+    floor_m: float = 2e-3
+
+
+_SHARED = SharedErrors()
 
 
 def metric_motion(
@@ -62,7 +59,6 @@ def metric_motion(
     direction_motion: DirectionMotion,
     depth_points_c: FloatArray,
     camera: PinholeCamera,
-    config: MetricConfig | None = None,
 ) -> RelativeMotion:
     """Pose of camera b in camera a with covariance, from reprojection of every track.
 
@@ -74,11 +70,9 @@ def metric_motion(
         direction_motion: start of the estimation, see :func:`relative_pose`.
         depth_points_c: (m, 3) LiDAR points in camera a at the instant of image a [m].
         camera: intrinsics of both images.
-        config: thresholds.
     """
-    config = config or MetricConfig()
-    depths = inverse_depths(tracks.uv_a, depth_points_c, camera, config.depth)
-    return motion_from_depths(tracks, direction_motion, depths, camera, config)
+    depths = inverse_depths(tracks.uv_a, depth_points_c, camera)
+    return motion_from_depths(tracks, direction_motion, depths, camera)
 
 
 def motion_from_depths(
@@ -86,33 +80,33 @@ def motion_from_depths(
     direction_motion: DirectionMotion,
     depths: InverseDepths,
     camera: PinholeCamera,
-    config: MetricConfig,
+    shared: SharedErrors = _SHARED,
 ) -> RelativeMotion:
     """:func:`metric_motion` with the inverse depth of each track already known."""
-    if np.count_nonzero(depths.known) < config.min_depths:
-        return _failed(tracks, direction_motion, config)
+    if np.count_nonzero(depths.known) < _MIN_DEPTHS:
+        return _failed(tracks, direction_motion)
     known = depths.known
-    rho = np.where(known, depths.value, config.prior_inverse_m)
-    sigma = np.where(known, depths.sigma, config.prior_sigma_inverse_m)
-    problem = _Problem(rays(tracks.uv_a, camera), tracks.uv_b, rho, sigma, known, camera, config)
+    rho = np.where(known, depths.value, _PRIOR_INVERSE_M)
+    sigma = np.where(known, depths.sigma, _PRIOR_SIGMA_INVERSE_M)
+    problem = _Problem(rays(tracks.uv_a, camera), tracks.uv_b, rho, sigma, known, camera)
     # 1. The best of a few starts.
-    noise = max(config.min_noise_px, direction_motion.noise_px)
-    pose = min(_starts(problem, direction_motion, config), key=lambda start: problem.cost(start, noise))
+    noise = max(MIN_NOISE_PX, direction_motion.noise_px)
+    pose = min(_starts(problem, direction_motion), key=lambda start: problem.cost(start, noise))
     # 2. Robust Gauss-Newton, the noise measured along the way.
-    for _ in range(config.iterations):
+    for _ in range(_ITERATIONS):
         terms, noise = problem.linearize(pose, noise)
         step = np.linalg.solve(terms.information + 1e-9 * np.eye(6), -terms.gradient)
         pose = pose.retract(step)
         if np.abs(step).max() < 1e-5:
             break
     terms, _ = problem.linearize(pose, noise)
-    if terms.depth_inliers < config.min_depths:
-        return _failed(tracks, direction_motion, config)
+    if terms.depth_inliers < _MIN_DEPTHS:
+        return _failed(tracks, direction_motion)
     # 3. Covariance, with what all tracks share.
     covariance = terms.covariance()
     t = pose.rotation().matrix().T @ pose.translation()
-    covariance[3:, 3:] += config.scale_sigma**2 * np.outer(t, t)
-    covariance += np.diag(np.repeat([config.floor_rad, config.floor_m], 3) ** 2)
+    covariance[3:, 3:] += shared.scale_sigma**2 * np.outer(t, t)
+    covariance += np.diag(np.repeat([shared.floor_rad, shared.floor_m], 3) ** 2)
     return RelativeMotion(tracks.from_ns, tracks.to_ns, pose, covariance)
 
 
@@ -163,7 +157,6 @@ class _Problem:
         rho, sigma: (n,) inverse depth and its sigma, the prior's where it is not measured [1/m].
         measured: (n,) whether it is.
         camera: intrinsics.
-        config: thresholds.
     """
 
     fa: FloatArray
@@ -172,7 +165,6 @@ class _Problem:
     sigma: FloatArray
     measured: BoolArray
     camera: PinholeCamera
-    config: MetricConfig
 
     def cost(self, pose: gtsam.Pose3, noise_px: float) -> float:
         """Truncated whitened squares of the tracks with depth, by which starts are compared."""
@@ -184,7 +176,7 @@ class _Problem:
     def linearize(self, pose: gtsam.Pose3, noise_px: float) -> tuple[_Terms, float]:
         """Normal equations at a pose, and the noise of the tracks found there [px]."""
         residuals = self._residuals(pose, noise_px)
-        noise = max(self.config.min_noise_px, robust_sigma(residuals.value[:, 1]))
+        noise = max(MIN_NOISE_PX, robust_sigma(residuals.value[:, 1]))
         along_sigma = np.hypot(noise, residuals.slope * self.sigma)
         if self.measured.any():
             # Depths that fit worse than they claim count for less.
@@ -225,7 +217,7 @@ class _Problem:
         centred = self.uv_b - [self.camera.cx, self.camera.cy]
         row = np.column_stack([line * focal, -np.einsum("ij,ij->i", line, centred)])
         top, bottom = np.einsum("ij,ij->i", row, far), row @ shift
-        fit = np.clip(top / np.where(np.abs(bottom) > 1e-9, bottom, np.inf), 0.0, 1.0 / self.config.nearest_m)
+        fit = np.clip(top / np.where(np.abs(bottom) > 1e-9, bottom, np.inf), 0.0, 1.0 / _NEAREST_M)
         gain = slope**2 / noise_px**2
         blend = (gain * fit + self.rho / self.sigma**2) / (gain + 1.0 / self.sigma**2)
         rho = np.where(self.measured, self.rho, blend)
@@ -256,15 +248,14 @@ class _Problem:
         )
 
 
-def _starts(problem: _Problem, motion: DirectionMotion, config: MetricConfig) -> list[gtsam.Pose3]:
+def _starts(problem: _Problem, motion: DirectionMotion) -> list[gtsam.Pose3]:
     """Poses from which to begin: each rotation with the translation that most depths agree on."""
     camera, known = problem.camera, problem.measured
     fa, fb, rho = problem.fa[known], rays(problem.uv_b[known], camera), problem.rho[known]
-    noise = max(config.min_noise_px, motion.noise_px) / min(camera.fx, camera.fy)
+    noise = max(MIN_NOISE_PX, motion.noise_px) / min(camera.fx, camera.fy)
     rotations = (motion.rotation, motion.turn) if motion.ok else (motion.turn,)
     return [
-        gtsam.Pose3(aRb, consensus_translation(aRb, fa, fb, rho, noise, config.depth.range_sigma))
-        for aRb in rotations
+        gtsam.Pose3(aRb, consensus_translation(aRb, fa, fb, rho, noise, RANGE_SIGMA)) for aRb in rotations
     ]
 
 
@@ -273,8 +264,8 @@ def robust_sigma(values: FloatArray) -> float:
     return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
 
 
-def _failed(tracks: Tracks, motion: DirectionMotion, config: MetricConfig) -> RelativeMotion:
-    """The rotation, if it is known, and no idea of the translation."""
-    sigmas = np.repeat([config.failed_rad, config.failed_m], 3)
+def _failed(tracks: Tracks, motion: DirectionMotion) -> RelativeMotion:
+    """The rotation, if it is known, and a translation of zero with a wide sigma."""
+    sigmas = np.repeat([_FAILED_RAD, _FAILED_M], 3)
     pose = gtsam.Pose3(motion.rotation, np.zeros(3))
     return RelativeMotion(tracks.from_ns, tracks.to_ns, pose, np.diag(sigmas**2), ok=False)

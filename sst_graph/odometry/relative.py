@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.features import Tracks
 
@@ -20,25 +19,19 @@ EPIPOLE_PX = 40.0
 """Tracks nearer to the epipole than this lose their weight [px]."""
 
 
-@dataclass(frozen=True)
-class RelativeConfig(Settings):
-    """How the epipolar geometry of two images is found.
-
-    Attributes:
-        threshold_px: distance from the epipolar line up to which a track supports a hypothesis [px].
-        confidence: wanted probability of having tried an uncontaminated sample.
-        min_tracks: fewest tracks from which anything is estimated.
-        min_noise_px: track noise is never taken smaller than this [px].
-        min_parallax_ratio: the direction counts only where the parallax is this many times the noise.
-        iterations: Gauss-Newton steps of the refinement.
-    """
-
-    threshold_px: float = setting(1.0, at_least=0.01, at_most=100.0)
-    confidence: float = setting(0.999, at_least=0.1, at_most=0.999999)
-    min_tracks: int = setting(20, at_least=6, at_most=100_000)
-    min_noise_px: float = setting(0.05, at_least=0.001, at_most=10.0)
-    min_parallax_ratio: float = setting(4.0, at_least=0.0, at_most=1000.0)
-    iterations: int = setting(8, at_least=1, at_most=100)
+_INLIER_PX = 1.0
+"""Distance from the epipolar line up to which a track supports a five-point hypothesis [px]."""
+_CONFIDENCE = 0.999
+"""Wanted probability of having tried a sample without outliers."""
+_MIN_TRACKS = 20
+"""Fewest tracks from which anything is estimated: four times the five that a hypothesis needs."""
+MIN_NOISE_PX = 0.05
+"""Track noise is never taken smaller than this, so that tracks without any do not divide by zero [px]."""
+_MIN_PARALLAX_RATIO = 4.0
+"""The direction counts only where the parallax is this many times the noise; below, the five-point method's
+direction is noise."""
+_ITERATIONS = 8
+"""Most Gauss-Newton steps of the refinement; it stops where a step is below 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -68,47 +61,42 @@ class DirectionMotion:
     ok: bool
 
 
-def relative_pose(
-    tracks: Tracks, camera: PinholeCamera, config: RelativeConfig | None = None
-) -> DirectionMotion:
+def relative_pose(tracks: Tracks, camera: PinholeCamera) -> DirectionMotion:
     """Rotation and unit direction between two images, with covariance.
 
     Five-point essential matrix (Nister, PAMI 2004) in USAC-MAGSAC (Barath et al., CVPR 2020), then
-    least squares on the distance from the epipolar line in image b. Where the parallax drowns in
+    least squares on the distance from the epipolar line in image b. Where the parallax is lost in
     the noise only a rotation is estimated: the five-point direction would be noise.
     """
-    config = config or RelativeConfig()
-    if len(tracks) < config.min_tracks:
+    if len(tracks) < _MIN_TRACKS:
         return _unknown(len(tracks))
     fa, fb = rays(tracks.uv_a, camera), rays(tracks.uv_b, camera)
     # 1. Rotation alone, and what it leaves unexplained.
     rotation, left = _rotation_only(fa, fb, camera)
     # 2. Least squares from the five points, and from the direction that best suits that rotation.
     starts = [(rotation, _direction_given_rotation(rotation, fa, fb))]
-    hypothesis = _five_point(tracks, fa, fb, camera, config)
+    hypothesis = _five_point(tracks, fa, fb, camera)
     if hypothesis is not None:
         starts.append(hypothesis)
-    refined = [_refine(aRb, direction, fa, fb, camera, config) for aRb, direction in starts]
+    refined = [_refine(aRb, direction, fa, fb, camera) for aRb, direction in starts]
     best = min(refined, key=lambda one: one.noise_px)
     # 3. The direction means something only where there is parallax to see it by.
     size = _trimmed_size(left[best.inliers])
-    if size > config.min_parallax_ratio * np.sqrt(2.0) * best.noise_px:
+    if size > _MIN_PARALLAX_RATIO * np.sqrt(2.0) * best.noise_px:
         direction = best.direction * _side(best.rotation, best.direction, fa[best.inliers], fb[best.inliers])
         found, turn = gtsam.Rot3(best.rotation), gtsam.Rot3(rotation)
         return DirectionMotion(
             found, turn, direction, best.covariance, best.inliers, best.noise_px, size, True
         )
-    return _turn(rotation, left, fb, camera, config)
+    return _turn(rotation, left, fb, camera)
 
 
-def _turn(
-    aRb: FloatArray, left: FloatArray, fb: FloatArray, camera: PinholeCamera, config: RelativeConfig
-) -> DirectionMotion:
+def _turn(aRb: FloatArray, left: FloatArray, fb: FloatArray, camera: PinholeCamera) -> DirectionMotion:
     """The rotation alone: the parallax is too small to see a direction."""
-    noise = max(config.min_noise_px, 1.4826 * float(np.median(np.abs(left))))
+    noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(left))))
     inliers = np.linalg.norm(left, axis=1) < 4.0 * noise
     covariance = np.diag([1.0] * 3 + [np.pi**2] * 2)
-    if np.count_nonzero(inliers) >= config.min_tracks:
+    if np.count_nonzero(inliers) >= _MIN_TRACKS:
         J = _rotation_jacobian(np.eye(3), fb[inliers], camera)
         covariance[:3, :3] = noise**2 * np.linalg.inv(J.T @ J)
     size, forward = _trimmed_size(left[inliers]), np.array([0.0, 0.0, 1.0])
@@ -155,7 +143,7 @@ class _Refined:
 
 
 def _five_point(
-    tracks: Tracks, fa: FloatArray, fb: FloatArray, camera: PinholeCamera, config: RelativeConfig
+    tracks: Tracks, fa: FloatArray, fb: FloatArray, camera: PinholeCamera
 ) -> tuple[FloatArray, FloatArray] | None:
     """aRb (3, 3) and direction (3,) of the best essential matrix, or None."""
     essential, mask = cv2.findEssentialMat(
@@ -163,8 +151,8 @@ def _five_point(
         np.ascontiguousarray(tracks.uv_b),
         camera.matrix,
         method=cv2.USAC_MAGSAC,
-        prob=config.confidence,
-        threshold=config.threshold_px,
+        prob=_CONFIDENCE,
+        threshold=_INLIER_PX,
     )
     if essential is None or np.shape(essential) != (3, 3) or not np.isfinite(essential).all():
         return None
@@ -213,12 +201,11 @@ def _refine(
     fa: FloatArray,
     fb: FloatArray,
     camera: PinholeCamera,
-    config: RelativeConfig,
 ) -> _Refined:
     """Robust Gauss-Newton on r = fa.[t]x aRb.fb / |epipolar line| (in image b, px)."""
-    for _ in range(config.iterations):
+    for _ in range(_ITERATIONS):
         residual, J = _line_distance(aRb, direction, fa, fb, camera)
-        noise = max(config.min_noise_px, 1.4826 * float(np.median(np.abs(residual))))
+        noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(residual))))
         weighted = huber_weights(residual / noise)[:, None] * J
         normal = weighted.T @ J
         step = -np.linalg.solve(normal + 1e-9 * np.eye(5) * np.trace(normal), weighted.T @ residual)
@@ -227,7 +214,7 @@ def _refine(
         if np.abs(step).max() < 1e-5:
             break
     residual, J = _line_distance(aRb, direction, fa, fb, camera)
-    noise = max(config.min_noise_px, 1.4826 * float(np.median(np.abs(residual))))
+    noise = max(MIN_NOISE_PX, 1.4826 * float(np.median(np.abs(residual))))
     supporters = np.abs(residual) < 4.0 * noise
     variance = noise**2 * _cost_of_weights(residual[supporters] / noise)
     information = J[supporters].T @ J[supporters]

@@ -1,14 +1,14 @@
 """Motions of a sensor on a vehicle, smoothed forth and back.
 
 Registration errs at each stamp: a pose that is 1 cm too far ahead makes one interval too long and the next
-too short. A vehicle's twist does not jump like that, so most of it can be told apart: the twist is an
+too short. A vehicle's twist does not jump like that, so most of it can be separated: the twist is an
 integrated Wiener process (white jerk), observed as its mean over each interval plus the difference of two
 pose errors,
 
     z_k = w_k + (n_{k+1} - n_k) / h_k,
 
-each of the six axes by itself. How rough the motion is, and by how much the claimed covariance errs, is told
-by the motions themselves: both are averaged over under their posterior (Saerkkae, Bayesian Filtering and
+each of the six axes by itself. The motions themselves determine how rough the motion is, and by how much the
+claimed covariance errs: both are averaged over under their posterior (Saerkkae, Bayesian Filtering and
 Smoothing, 2013, ch. 4, 8 and 12).
 """
 
@@ -22,28 +22,28 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.odometry.standing import overlap
+from sst_graph.odometry.standstill import overlap
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
 
 _SHORTEST = 5
-"""Fewest motions in a row that tell how smooth they are."""
+"""Fewest motions in a row that determine how smooth they are."""
 _ROUGHNESS = np.logspace(-5.0, 3.0, 9)
 """Candidates for the variance that the jerk adds to the twist in an interval, over the noise's."""
 _SCALES = 2.0 ** np.arange(-4, 2)
-"""Candidates for the true over the claimed covariance: what is far beyond the claim is motion, not noise."""
+"""Candidates for the true over the claimed covariance: what is far beyond it is motion, not noise."""
 _PRIOR_WEIGHT = 4.0
-"""So many motions' worth of belief that the claimed covariance is right."""
+"""Weight of the prior that the claimed covariance is right, in motions."""
 _DIFFUSE = (1e8, 1e6)
 """Variances of twist and acceleration before the first motion, in units of the noise."""
 
 
 def smoothed(motions: Sequence[RelativeMotion]) -> list[RelativeMotion]:
-    """The motions without the noise that a vehicle cannot follow; standstill and failures stay as they are.
+    """The motions without noise that a vehicle cannot follow; standstill and failures stay as they are.
 
     Args:
-        motions: consecutive, stamps rising; exactly none at all where the sensor stands.
+        motions: consecutive, stamps rising; exactly the identity at standstill.
 
     Returns:
         As many motions; the covariance of a smoothed one is diagonal, and nearly common to its neighbours.
@@ -58,7 +58,7 @@ class MotionSmoother:
     """
 
     def __init__(self, reach: int | None = None) -> None:
-        """reach: how many of the latest motions are smoothed anew in each call; None: all."""
+        """reach: how many of the latest motions are smoothed again in each call; None: all."""
         self._reach = reach
         self._runs: list[_Run] = []
 
@@ -66,15 +66,15 @@ class MotionSmoother:
         """As :func:`smoothed`; a motion that an earlier call had is known by being the same object."""
         result, runs = list(motions), []
         for start, end in _ranges(motions):
-            run = self._going_on(motions[start:end])
+            run = self._continued(motions[start:end])
             run.smooth(self._reach)
             result[start:end] = run.smoothed
             runs.append(run)
         self._runs = runs
         return result
 
-    def _going_on(self, motions: Sequence[RelativeMotion]) -> _Run:
-        """The run of these motions: an earlier one that goes on with them, or a new one."""
+    def _continued(self, motions: Sequence[RelativeMotion]) -> _Run:
+        """The run of these motions: an earlier one that they continue, or a new one."""
         for run in self._runs:
             first, alike = overlap(run.motions, motions)
             if alike:
@@ -103,7 +103,7 @@ class _Step:
     Attributes:
         mean, covariance: (6, r, 4), (6, r, 4, 4) of [twist, acceleration, pose errors before and after].
         transition: (4, 4) that led here from the motion before.
-        ahead: (6, r, 4, 4) covariance that it led to, before this motion was heard.
+        ahead: (6, r, 4, 4) covariance that it led to, before this motion was used.
         gain: (6, r, 4, 4) of the smoother (Rauch, Tung, Striebel) from here to the motion before.
         squares, log_sizes: (6, r) sums so far of squared, whitened innovations, and of their log variances.
     """
@@ -134,7 +134,7 @@ class _Run:
         self._sigmas = np.sqrt(np.diag(first.covariance)) / first.seconds
 
     def forget(self, count: int) -> None:
-        """Drop the first motions; what they said of the others stays."""
+        """Drop the first motions; their information on the others stays."""
         del self.motions[:count], self.smoothed[:count], self._steps[:count]
         self._forgotten += count
 
@@ -143,9 +143,9 @@ class _Run:
         del self.motions[length:], self.smoothed[length:], self._steps[length:]
 
     def extend(self, motions: Sequence[RelativeMotion]) -> None:
-        """Take in the motions that follow."""
+        """Filter the motions that follow."""
         for motion in motions:
-            predicted = self._predicted(motion) if self.motions else self._beginning(motion)
+            predicted = self._predicted(motion) if self.motions else self._initial(motion)
             self._steps.append(self._updated(predicted, motion))
             self.motions.append(motion)
             self.smoothed.append(motion)
@@ -164,10 +164,10 @@ class _Run:
             covariance = before.covariance + closer
             twists.append(mean[..., 0])
             variances.append(covariance[..., 0, 0])
-        answers = self._answers(oldest, np.stack(twists[::-1]), np.stack(variances[::-1]))
-        self.smoothed[oldest:] = answers
+        found = self._smoothed_motions(oldest, np.stack(twists[::-1]), np.stack(variances[::-1]))
+        self.smoothed[oldest:] = found
 
-    def _beginning(self, motion: RelativeMotion) -> _Step:
+    def _initial(self, motion: RelativeMotion) -> _Step:
         """What is known before the first motion."""
         shape = (6, len(_ROUGHNESS))
         covariance = np.zeros((*shape, 4, 4))
@@ -196,10 +196,10 @@ class _Run:
         h = np.array([1.0, 0.0, -1.0 / seconds, 1.0 / seconds])
         claimed = self._pose_variances(motion)
         before = self._pose_variances(self.motions[-1]) if self.motions else claimed
-        rest = np.maximum(claimed - before, 0.0) / seconds**2
+        excess = np.maximum(claimed - before, 0.0) / seconds**2
         innovation = (motion.mean_twist / self._sigmas)[:, None] - predicted.mean @ h
         cross = predicted.covariance @ h
-        size = cross @ h + rest[:, None]
+        size = cross @ h + excess[:, None]
         gain = cross / size[..., None]
         return replace(
             predicted,
@@ -223,7 +223,9 @@ class _Run:
         scale = (shares * _SCALES).sum(axis=2) / np.maximum(by_roughness, 1e-300)
         return by_roughness / by_roughness.sum(axis=1, keepdims=True), scale
 
-    def _answers(self, first: int, twists: FloatArray, variances: FloatArray) -> list[RelativeMotion]:
+    def _smoothed_motions(
+        self, first: int, twists: FloatArray, variances: FloatArray
+    ) -> list[RelativeMotion]:
         """Motions from the first one on, from their twists and variances (k, 6, r) under each roughness."""
         shares, scale = self._weights(self._steps[-1])
         mean = (shares * twists).sum(axis=2)

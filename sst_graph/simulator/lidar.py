@@ -67,8 +67,8 @@ class Lidar:
         # Half a radius is the standard deviation of a uniform disc along one axis.
         half = config.beam_divergence_mrad * 1e-3 / 4.0
         beams = cast_lidar(triangles, nominal, (-half, half) if half > 0.0 else (0.0,), motion)
-        faces, reach = _mixed(beams, rng)
-        returns = self._returns(snapshot, triangles, faces, reach, nominal, seconds, rng)
+        hits = _mixed(beams, rng)
+        returns = self._returns(snapshot, triangles, hits, nominal, seconds, rng)
         if motion is None or config.sweep_output != "compensated":
             return returns
         return _compensated(returns, ego, stamp_s)
@@ -77,17 +77,20 @@ class Lidar:
         self,
         snapshot: Snapshot,
         triangles: FloatArray,
-        faces: IndexArray,
-        reach: FloatArray,
+        hits: tuple[IndexArray, FloatArray],
         columns: Columns,
         seconds: FloatArray,
         rng: np.random.Generator,
     ) -> Returns:
-        """The returns of the rays that come back, with noise, in the order of the file."""
+        """The returns of the rays that come back, with noise, in the order of the file.
+
+        hits: face (rings, columns) that each ray hits, -1 for none, and its range [m].
+        """
         config = self.config
         order = np.argsort(np.mod(columns.azimuths, 2 * np.pi))
         # Rings from the top, columns counter-clockwise from forward.
-        faces, reach, slopes = faces[::-1][:, order], reach[::-1][:, order], self.slopes[::-1]
+        faces, reach = (values[::-1][:, order] for values in hits)
+        slopes = self.slopes[::-1]
         azimuth = columns.azimuths[order]
         shown = (faces >= 0) & (np.abs(azimuth) <= np.deg2rad(config.azimuth_limit_deg))
         ring, column = np.nonzero(shown)

@@ -29,7 +29,7 @@ LIDAR_HEIGHT_M = 1.73
 
 
 @dataclass(frozen=True)
-class Mover:
+class MovingVehicle:
     """A vehicle or a person that moves along the street.
 
     Attributes:
@@ -84,7 +84,7 @@ class Street:
         static: all faces that never move.
         owners: (n,) object of each static face; centres (o, 2) and radii (o,) of the objects [m].
         instances: (n,) uint16 instance of each static face.
-        movers: what moves.
+        moving: vehicles that move.
         sun: (3,) unit vector to the sun.
         sunlight: share of the light that comes from the sun.
     """
@@ -96,7 +96,7 @@ class Street:
     centres: FloatArray
     radii: FloatArray
     instances: NDArray[np.uint16]
-    movers: tuple[Mover, ...]
+    moving: tuple[MovingVehicle, ...]
     sun: FloatArray
     sunlight: float
 
@@ -117,13 +117,13 @@ class Street:
         ]
         instances, velocities = [self.instances[pick]], [np.zeros((len(pick), 3, 3))]
         ego_s, half = float(np.interp(t, self.ego.t, self.ego.s)), 0.02
-        for mover in self.movers:
-            if abs(mover.arc_length(t) - ego_s) > range_m:
+        for vehicle in self.moving:
+            if abs(vehicle.arc_length(t) - ego_s) > range_m:
                 continue
-            mesh = mover.mesh_at(self.path, t)
-            later, earlier = mover.mesh_at(self.path, t + half), mover.mesh_at(self.path, t - half)
+            mesh = vehicle.mesh_at(self.path, t)
+            later, earlier = vehicle.mesh_at(self.path, t + half), vehicle.mesh_at(self.path, t - half)
             meshes.append(mesh)
-            instances.append(np.full(len(mesh), mover.instance, np.uint16))
+            instances.append(np.full(len(mesh), vehicle.instance, np.uint16))
             velocities.append((later.triangles - earlier.triangles) / (2 * half))
         return Snapshot(merged(meshes), np.concatenate(instances), np.concatenate(velocities))
 
@@ -177,17 +177,22 @@ def build_street(config: SimulationConfig) -> Street:
     _lay_ground(builder, profile, root, start, end)
     _raise_buildings(builder, profile, np.random.default_rng([config.seed, 3]), start, end)
     _plant(builder, profile, np.random.default_rng([config.seed, 4]), start, end)
-    _park(builder, profile, angled, config, np.random.default_rng([config.seed, 5]), (start, end), sun)
-    movers = _set_moving(
+    _park(builder, profile, angled, config, (start, end), sun)
+    moving = _set_moving(
         builder, profile, config, np.random.default_rng([config.seed, 6]), (t, s, start, end), sun
     )
     ego_rng = np.random.default_rng([config.seed, 7])
     ego = ego_motion(config, path, s, -profile.lane / 2, LIDAR_HEIGHT_M, ego_rng)
-    return _assembled(builder, path, ego, movers, sun, float(root.uniform(0.35, 0.65)))
+    return _assembled(builder, path, ego, moving, sun, float(root.uniform(0.35, 0.65)))
 
 
 def _assembled(
-    builder: _Builder, path: Path, ego: EgoMotion, movers: list[Mover], sun: FloatArray, sunlight: float
+    builder: _Builder,
+    path: Path,
+    ego: EgoMotion,
+    moving: list[MovingVehicle],
+    sun: FloatArray,
+    sunlight: float,
 ) -> Street:
     """The street from its objects."""
     sizes = np.array([len(mesh) for mesh in builder.meshes])
@@ -197,7 +202,7 @@ def _assembled(
     owners = np.repeat(np.arange(len(sizes)), sizes)
     instances = np.array(builder.instances, dtype=np.uint16)[owners]
     return Street(
-        path, ego, merged(builder.meshes), owners, centres, radii, instances, tuple(movers), sun, sunlight
+        path, ego, merged(builder.meshes), owners, centres, radii, instances, tuple(moving), sun, sunlight
     )
 
 
@@ -294,11 +299,11 @@ def _park(
     profile: scenery.Profile,
     angled: tuple[bool, bool],
     config: SimulationConfig,
-    rng: np.random.Generator,
     ends: tuple[float, float],
     sun: FloatArray,
 ) -> None:
     """Parked vehicles in the parking lanes of both sides."""
+    rng = np.random.default_rng([config.seed, 5])
     density = config.vehicle_density * (1.0 - config.moving_fraction) / 2.0
     for side, kerb, slanted in ((-1.0, profile.kerbs[0], angled[0]), (1.0, profile.kerbs[1], angled[1])):
         s, slant = ends[0] + rng.uniform(3.0, 9.0), rng.uniform(0.9, 1.5)
@@ -330,30 +335,30 @@ def _set_moving(
     rng: np.random.Generator,
     way: tuple[FloatArray, FloatArray, float, float],
     sun: FloatArray,
-) -> list[Mover]:
+) -> list[MovingVehicle]:
     """Vehicles before and behind the ego vehicle in its lane, and oncoming ones in the other."""
     t, ego_s, start, end = way
-    density, movers = config.vehicle_density * config.moving_fraction / 2.0, []
+    density, moving = config.vehicle_density * config.moving_fraction / 2.0, []
     if density > 0.0:
         speed = float(rng.uniform(6.0, 11.0))
         at = float(ego_s[0]) - 80.0 + rng.exponential(1.0 / density)
         while at < end + speed * (t[-1] - t[0]):
             s = at - speed * (t - t[0]) + 0.6 * np.sin(0.5 * t + rng.uniform(0, 6))
-            movers.append((s, profile.lane / 2 + rng.normal(0.0, 0.1), True))
+            moving.append((s, profile.lane / 2 + rng.normal(0.0, 0.1), True))
             at += 10.0 + rng.exponential(max(1.0 / density - 10.0, 1.0))
         for direction in (1.0, -1.0):
             gap = 9.0 + rng.exponential(min(0.5 / density, 20.0))
             while gap < 80.0:
                 delayed = np.interp(t + direction * 0.05 * gap, t, ego_s)
-                movers.append((delayed + direction * gap, -profile.lane / 2 + rng.normal(0.0, 0.15), False))
+                moving.append((delayed + direction * gap, -profile.lane / 2 + rng.normal(0.0, 0.15), False))
                 gap += 10.0 + rng.exponential(max(1.0 / density - 10.0, 1.0))
     result = []
-    for s, left, turned in movers:
+    for s, left, turned in moving:
         s = np.clip(s, start + 5.0, end - 5.0)
         vehicle = random_truck(rng) if rng.uniform() < 0.5 * config.truck_fraction else random_car(rng)
         yaw = float(builder.path.yaw_at(np.array([np.median(s)]))[0]) + (np.pi if turned else 0.0)
         mesh = _with_shadow(vehicle, yaw, sun)
-        result.append(Mover(mesh, builder.new_instance(), t, s, float(left), turned))
+        result.append(MovingVehicle(mesh, builder.new_instance(), t, s, float(left), turned))
     return result
 
 

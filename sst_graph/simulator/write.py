@@ -126,6 +126,6 @@ def _truth(drive: SimulatedDrive) -> dict[str, object]:
         "camera": "image_2",
         "T_world_lidar": [drive.wTl(stamp * 1e-9).matrix().tolist() for stamp in drive.stamps_ns],
         "T_world_camera": [drive.wTc(stamp * 1e-9).matrix().tolist() for stamp in drive.stamps_ns],
-        "moving_instances": sorted(mover.instance for mover in drive.street.movers),
+        "moving_instances": sorted(vehicle.instance for vehicle in drive.street.moving),
         "config": asdict(drive.config),
     }

@@ -21,15 +21,13 @@ from sst_graph.errors import DataError
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.features.lidar_edges import BoundaryConfig
-from sst_graph.objects.persistence import ObjectName
+from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
 VEHICLES = (SemanticClass.VEHICLE,)
-_PREPARE = PrepareConfig(boundary=BoundaryConfig(bottom_edges=False))
 SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
 """In somebody else's graph nobody corrects the information afterwards: a side of an object counts once."""
 SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
@@ -123,7 +121,9 @@ def features_of(
     scan: Scan | ScanFeatures, image: CameraImage | ImageFeatures, classes: Sequence[SemanticClass]
 ) -> tuple[ScanFeatures, ImageFeatures]:
     """What :func:`align_frame` needs of a scan and an image."""
-    points = scan_features(0, scan, classes, _PREPARE) if isinstance(scan, Scan) else scan
+    points = scan
+    if isinstance(points, Scan):
+        points = scan_features(0, points, classes, PrepareConfig(), with_lower_edges=False)
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
     return points, contours
 

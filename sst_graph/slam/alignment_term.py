@@ -26,7 +26,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.pose_alignment import pose_alignment_factor
 from sst_graph.factors.reprojection import residuals
 from sst_graph.factors.robust import KernelKind, RobustKernel
-from sst_graph.objects.persistence import ObjectName
+from sst_graph.objects.occupancy import ObjectName
 from sst_graph.slam.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
 from sst_graph.slam.object_sides import ObjectSides

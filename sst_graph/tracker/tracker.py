@@ -226,7 +226,7 @@ class Tracker(Tracking):
         if smoother is None:
             return False
         self.stop_settling()
-        self.window.judge_all()
+        self.window.dynamics.test_all()
         self.matcher.look_below(smoother.point)
         alive = self.window.objects.live
         try:
@@ -240,7 +240,7 @@ class Tracker(Tracking):
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
         if at_last:
-            self.trial.look_last(self.watch, smoother, self.known, self.window.restless())
+            self.trial.look_last(self.watch, smoother, self.known, self.window.dynamics.recently_moving())
         self.settled = True
         return rests
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import contradiction_of, told_by
-from sst_graph.batch.lower_edges import without_undersides
 from sst_graph.covariance.considered import Considered, considered
 from sst_graph.covariance.observability import open_directions
 from sst_graph.drive.preparation import ScanFeatures, image_features, scan_features
@@ -140,7 +139,7 @@ class Tracking:
         check_lateness(image, self.window, self.point.offset_s, self.config.late_s)
         self.image_order.take(image.stamp_ns, moved_ns != 0)
         self.clocks.take_image(image.stamp_ns, self.window.place)
-        picture = self.config.calibration.prepare.picture
+        picture = self.config.calibration.prepare.picture.use
         self.window.add_image(image_features(self.window.next_image, image, self.classes, picture))
         self._forget_images()
         return self.answer(image.stamp_ns)
@@ -165,9 +164,8 @@ class Tracking:
     def _features(self, scan: Scan) -> tuple[ScanFeatures, RelativeMotion | None]:
         """What is kept of a scan, and the motion that led to it."""
         prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
-        if self.config.calibration.undersides.use == "never":
-            prepare = without_undersides(prepare)
-        features = scan_features(self.window.next_scan, scan, self.classes, prepare)
+        used = self.config.calibration.undersides.use != "never"
+        features = scan_features(self.window.next_scan, scan, self.classes, prepare, with_lower_edges=used)
         motion = self.odometry.add(scan)
         self.last_scan = scan
         return features, motion
@@ -198,7 +196,7 @@ class Tracking:
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""
         smoother, known, window = started.smoother, started.known, self.window
-        if why := self.trial.check(self.watch, smoother, known, window.restless()):
+        if why := self.trial.check(self.watch, smoother, known, window.dynamics.recently_moving()):
             return self._refuse_start(stamp_ns, len(window.scans) // 2, why)
         self.known, self.smoother = known, smoother
         self.tests.look(smoother)
@@ -237,7 +235,10 @@ class Tracking:
         waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
         new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
+        restless, matches = (
+            self.window.dynamics.recently_moving(),
+            {scan: len(found[scan].pair) for scan in new},
+        )
         chi2 = self.watch.take(sorted(waiting), matches, before, self.known.joint, smoother.model, restless)
         changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
         if changed is not None:
@@ -252,7 +253,7 @@ class Tracking:
         first = self.window.first_scan
         if new or not missing <= {number}:
             smoother.update(found, missing, first, self.window.objects.live)
-            self.window.judged_anew -= chosen
+            self.window.dynamics.changed_scans -= chosen
         self.entered.extend(new)
         self._begin_or_end_settling(number)
         self.known = Known.of(smoother)
@@ -268,7 +269,7 @@ class Tracking:
 
     def begin_settling(self) -> None:
         """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
-        self.window.judge_all()
+        self.window.dynamics.test_all()
         self.settling = Settling(self.matcher, self.config.settle_scans)
         self.window.held = self.window.first_scan == self.milestones.first
 

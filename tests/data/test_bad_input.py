@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from sst_graph.data import Loader, loader_names, open_source, register_loader
+from sst_graph.drive.input_statistics import image_statistics
 from sst_graph.drive.preparation import prepare_drive
-from sst_graph.drive.survey import image_facts
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
 
@@ -335,7 +335,7 @@ def test_a_name_that_would_write_to_the_terminal_is_shown(drive: Path) -> None:
 
 
 def test_missing_pictures_are_no_repeated_picture() -> None:
-    """What the survey compares of images without pictures is their masks."""
+    """What the statistics compares of images without pictures is their masks."""
     masks = [np.full((6, 8), c, np.uint8) for c in (0, 1, 1)]
-    a, b, c = (image_facts(k, CameraImage(k, mask, NO_PICTURE)) for k, mask in enumerate(masks))
+    a, b, c = (image_statistics(k, CameraImage(k, mask, NO_PICTURE)) for k, mask in enumerate(masks))
     assert a.picture_digest != b.picture_digest == c.picture_digest and not a.profiles

@@ -9,7 +9,6 @@ import pytest
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import experiment
 from sst_graph.experiments.slam import MEASURES, SlamConfig, Street, markdown, solve_street
-from sst_graph.odometry import LoopConfig
 from sst_graph.simulator import SimulationConfig
 
 
@@ -50,7 +49,8 @@ def test_a_small_street() -> None:
             vehicle_density=0.3,
             moving_fraction=0.0,
         ),
-        loops=LoopConfig(every=3, min_seconds=0.4),
+        loop_every=3,
+        loop_min_s=0.4,
     )
     found = solve_street(config, "fog", 4)
     assert found.closures >= 3

@@ -39,8 +39,8 @@ def scene(
     )
 
 
-def found_in(scan: Scan, config: BoundaryConfig | None = None) -> Boundaries:
-    return find_boundaries(scan, [VEHICLE], config)[VEHICLE]
+def found_in(scan: Scan, config: BoundaryConfig | None = None, with_lower_edges: bool = True) -> Boundaries:
+    return find_boundaries(scan, [VEHICLE], config, with_lower_edges)[VEHICLE]
 
 
 def polar_deg(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -95,7 +95,7 @@ def test_bottom_half_way_to_the_ring_that_meets_the_ground(ground_m: float) -> N
     between = 0.5 * (np.tan(last) + np.tan(last - np.radians(RING_DEG))) * 10.0
     np.testing.assert_allclose(bottom.lPs[:, 2], between, atol=2e-4)
     np.testing.assert_array_less(bottom.outward[:, 2], bottom.lPs[:, 2])
-    assert Edge.BOTTOM not in found_in(cut, BoundaryConfig(bottom_edges=False)).edges
+    assert Edge.BOTTOM not in found_in(cut, with_lower_edges=False).edges
 
 
 def test_nothing_where_the_neighbour_is_nearer_or_as_far() -> None:
@@ -188,14 +188,14 @@ def test_objects_by_instance_and_by_place() -> None:
     rng = np.random.default_rng(0)
     centres = np.array([[5.0, 0.0, 0.0], [5.0, 4.0, 0.0], [9.0, 0.0, 0.0]])
     points = np.repeat(centres, [60, 60, 8], axis=0) + rng.uniform(-0.4, 0.4, (128, 3))
-    mask, config = np.ones(128, dtype=bool), BoundaryConfig()
-    by_place = split_objects(points, mask, None, config)
+    mask = np.ones(128, dtype=bool)
+    by_place = split_objects(points, mask, None, 15)
     # Two objects 4 m apart, and one of too few points.
     assert len(set(by_place[:60])) == 1 and len(set(by_place[60:120])) == 1
     assert by_place[0] != by_place[60] and by_place[0] >= 0 and (by_place[120:] == -1).all()
     names = np.repeat([7, 7, 9], [60, 60, 8]).astype(np.uint16)
-    assert split_objects(points, mask, names, config).tolist() == [7] * 120 + [-1] * 8
+    assert split_objects(points, mask, names, 15).tolist() == [7] * 120 + [-1] * 8
     names[3] = 0
-    np.testing.assert_array_equal(split_objects(points, mask, names, config), by_place)
+    np.testing.assert_array_equal(split_objects(points, mask, names, 15), by_place)
     mask[:60] = False
-    assert (split_objects(points, mask, None, config)[:60] == -1).all()
+    assert (split_objects(points, mask, None, 15)[:60] == -1).all()

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 import pytest
 
-from sst_graph.config import from_dict
-from sst_graph.errors import ConfigError
-from sst_graph.features.image_edges import PictureConfig, PictureEdges
+from sst_graph.features.image_edges import PictureEdges
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.types import SemanticClass
 
@@ -41,8 +37,8 @@ def mask(left: float = 0.0, right: float = 0.0, top: float = 0.0, bottom: float 
     return found
 
 
-def field(labels: np.ndarray, pixels: np.ndarray | None = None, **settings: Any) -> ContourMap:
-    found = ContourMap.of(labels, VEHICLE, pixels, PictureConfig(**settings))
+def field(labels: np.ndarray, pixels: np.ndarray | None = None) -> ContourMap:
+    found = ContourMap.of(labels, VEHICLE, pixels)
     assert found is not None
     return found
 
@@ -86,7 +82,7 @@ def test_a_mirrored_picture_is_followed_alike() -> None:
         mirrored = field(np.flip(labels, axis), np.flip(pixels, axis))
         difference = np.flip(mirrored.distance, axis) - plain.distance
         near = np.abs(plain.distance) < 6.0
-        # Every second pixel is asked, not the same ones.
+        # Every second pixel is evaluated, not the same ones.
         assert np.abs(difference[near]).mean() < 0.05 and abs(difference[near].mean()) < 0.01
 
 
@@ -100,8 +96,7 @@ def test_what_is_not_seen_is_not_matched() -> None:
         feet = followed.look_up(np.stack([np.full(len(rows), column), rows], axis=1))
         assert feet.valid[rows < 80].all() and not feet.valid[rows > 100].any()
     assert not followed.look_up(np.array([SIDES["bottom"][0]])).valid[0]
-    everywhere = field(mask(left=2), pixels, min_share=0.0)
-    assert everywhere.look_up(np.array([[LEFT - 4.0, 105.0]])).valid[0]
+    assert field(mask(left=2)).look_up(np.array([[LEFT - 4.0, 105.0]])).valid[0]
 
 
 @pytest.mark.parametrize("noise", [0.0, 25.0])
@@ -137,7 +132,6 @@ def test_where_the_picture_is_not_asked() -> None:
     labels = mask(left=2)
     plain = field(labels)
     for found in (
-        field(labels, picture(), use=False),
         field(labels, np.zeros((0, 0, 3), np.uint8)),
         field(labels, picture()[:-1]),
     ):
@@ -164,12 +158,6 @@ def test_an_object_that_the_border_cuts() -> None:
     )
     feet = field(labels, pixels).look_up(np.array([[LEFT + 3.0, 80.0]]))
     assert feet.valid[0] and feet.feet[0, 0] == pytest.approx(LEFT - 0.5, abs=0.15)
-
-
-@pytest.mark.parametrize("setting", [{"reach_px": 0.0}, {"mask_sigma_px": 0.0}, {"along_px": 1}])
-def test_settings_out_of_range(setting: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=f"^{next(iter(setting))}: found .* expected at least"):
-        from_dict(PictureConfig, setting)
 
 
 def test_a_very_long_contour() -> None:

@@ -16,7 +16,8 @@ from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
 from sst_graph.graph.matching import DriveMatches, match_all, outlines_of
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.objects.tracks import Mover, ObjectId, object_tracks
+from sst_graph.objects.dynamic_objects import DynamicObject
+from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.objects.velocity import ObjectVelocity
 from sst_graph.types import SemanticClass
 
@@ -183,8 +184,11 @@ def test_moving_objects_are_matched_where_they_are() -> None:
     """An object that drives along beside the LiDAR has the gradient of its own velocity in the offset."""
     drive, state = moving(False), State(standing_street().truth.cTl, (0.03,))
     tracks = object_tracks(drive)
-    fast = {name: Mover(8.0, ObjectVelocity(np.array([4.0, 1.0, 0.0]), 0.03)) for name in list(tracks)[::2]}
-    slow: dict[ObjectId, Mover] = {name: Mover(0.06) for name in list(tracks)[1::2]}
+    fast = {
+        name: DynamicObject(8.0, ObjectVelocity(np.array([4.0, 1.0, 0.0]), 0.03))
+        for name in list(tracks)[::2]
+    }
+    slow: dict[ObjectId, DynamicObject] = {name: DynamicObject(0.06) for name in list(tracks)[1::2]}
     found = Tracks([drive]).seeing(tracks, fast | slow)
     matches = match_all(outlines_of([drive], found, PLAIN), state, KERNEL)
     pairs = [pair for own in matches for pair in own.by_pair()]

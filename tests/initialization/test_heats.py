@@ -6,8 +6,7 @@ import gtsam
 import numpy as np
 from streets import prepared_street, standing_street
 
-from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
-from sst_graph.features.image_edges import PictureConfig
+from sst_graph.drive.preparation import Drive, PictureConfig, PrepareConfig, prepare_drive
 from sst_graph.graph.building import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data import open_source
 from sst_graph.odometry.lidar import lidar_odometry
-from sst_graph.odometry.standing import standing_frames
+from sst_graph.odometry.standstill import standstill_frames
 from sst_graph.odometry.visual import visual_odometry
 from sst_graph.types import CameraImage, RelativeMotion, Scan, Source
 
@@ -65,7 +65,7 @@ def test_visual_speed_and_standing_frames_of_the_stop_drive() -> None:
     relative = lengths_of([motion.aTb for motion in motions])[moving] / true[moving] - 1.0
     assert np.median(np.abs(relative)) < 0.03
     assert np.abs(relative).max() < 0.2
-    standing = np.flatnonzero(standing_frames(motions))
+    standing = np.flatnonzero(standstill_frames(motions))
     # NOTES: the car stands from frame 53 on and still rolls at 0.4 m/s at frame 48
     assert set(range(54, 60)) <= set(standing.tolist())
     assert standing.min() >= 52
@@ -79,7 +79,7 @@ def test_visual_speed_of_the_parked_drive() -> None:
     relative = lengths_of([motion.aTb for motion in motions]) / true - 1.0
     assert np.median(np.abs(relative)) < 0.03
     assert np.abs(relative).max() < 0.05
-    assert not standing_frames(motions).any()
+    assert not standstill_frames(motions).any()
 
 
 @pytest.mark.drives

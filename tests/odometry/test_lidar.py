@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError
 from sst_graph.odometry.cloud import compensate_sweep, registration_cloud, usable_points
-from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig, lidar_odometry
-from sst_graph.odometry.stationary_objects import MoverConfig, StandingObjects
+from sst_graph.odometry.lidar import LidarOdometry, lidar_odometry
+from sst_graph.odometry.static_points import StaticPoints
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Scan, SemanticClass
 
@@ -194,16 +194,16 @@ def test_ground_does_not_drown_the_walls() -> None:
 # --- movable objects --------------------------------------------------------------------------------------
 
 
-def test_standing_objects_are_told_from_moving_ones() -> None:
-    memory = StandingObjects(MoverConfig(memory_s=0.5))
-    for k in range(6):
+def test_static_objects_are_distinguished_from_dynamic_ones() -> None:
+    memory = StaticPoints()
+    for k in range(7):
         points = np.concatenate([box((10.0, 4.0), k), box((10.0 + 0.1 * k, -4.0), 100 + k)])
-        still = memory.still(points, k * PERIOD_NS)
-        memory.remember(points, k * PERIOD_NS)
-        if k < 5:
-            assert not still.any()
-    assert still[:1200].all()
-    assert not still[1200:].any()
+        static = memory.find(points, k * PERIOD_NS)
+        memory.insert(points, k * PERIOD_NS)
+        if k < 6:
+            assert not static.any()
+    assert static[:1200].all()
+    assert not static[1200:].any()
 
 
 def test_a_moving_truck_does_not_pull_the_motion() -> None:
@@ -253,7 +253,7 @@ def test_only_vehicles_are_better_than_nothing() -> None:
     vehicles = [
         Scan(s.stamp_ns, s.points, np.full(len(s.points), SemanticClass.VEHICLE, np.uint8)) for s in scans
     ]
-    motions = lidar_odometry(vehicles, LidarOdometryConfig())
+    motions = lidar_odometry(vehicles)
     assert all(motion.ok for motion in motions)
     assert motions[-1].aTb.translation()[0] == pytest.approx(0.2, abs=0.01)
 

@@ -10,7 +10,7 @@ import pytest
 from stored import simulated
 
 from sst_graph.errors import DataError
-from sst_graph.odometry import LoopConfig, RegisteredScan, loop_closures, scan_to_scan
+from sst_graph.odometry import RegisteredScan, loop_closures, scan_to_scan
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import Scan
 
@@ -68,7 +68,7 @@ def test_loops_close_between_scans_of_one_place() -> None:
     drifted = [
         pose * gtsam.Pose3.Expmap(0.04 * k * np.array([0, 0, 0.03, 1, 1, 0])) for k, pose in enumerate(poses)
     ]
-    closures = loop_closures(scans, drifted, LoopConfig(every=2, min_seconds=1.5, max_distance_m=2.0))
+    closures = loop_closures(scans, drifted, every=2, min_seconds=1.5, max_distance_m=2.0)
     assert len(closures) >= 3
     for closure in closures:
         seconds = (source.stamps_ns[closure.second] - source.stamps_ns[closure.first]) * 1e-9
@@ -85,7 +85,7 @@ def test_what_does_not_overlap_closes_no_loop() -> None:
     motion = scans[0].motion_to(scans[-1], far)
     assert not motion.ok and motion.aTb.equals(far, 1e-9)
     assert np.sqrt(motion.covariance[3, 3]) > 1.0
-    assert not loop_closures(scans, poses, LoopConfig(every=2, min_seconds=100.0))
+    assert not loop_closures(scans, poses, every=2, min_seconds=100.0)
 
 
 def test_refuses_what_is_no_pair() -> None:

@@ -16,7 +16,6 @@ from sst_graph.cli import main
 from sst_graph.errors import ConfigError
 from sst_graph.odometry.sweep import (
     SWEEP_KEY,
-    SweepConfig,
     SweepDecision,
     SweptSource,
     decide_sweep,
@@ -24,7 +23,7 @@ from sst_graph.odometry.sweep import (
     with_sweep_of,
 )
 from sst_graph.odometry.sweep.estimate import CANDIDATES, Evidence, estimate
-from sst_graph.odometry.sweep.window import SECTORS, SweepWindowConfig, Window
+from sst_graph.odometry.sweep.window import SECTORS, Window
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import Frame, Scan
@@ -186,7 +185,7 @@ def _hall(
         (1.0, 180.0, 0.3, 70.0, "counterclockwise"),
     ],
 )
-def test_the_sweep_of_a_hall_is_told(
+def test_the_sweep_of_a_hall(
     fraction: float, start_deg: float, yaw_rate: float, limit_deg: float, kind: str
 ) -> None:
     found = decide_sweep(_hall(6.0, fraction, start_deg, yaw_rate, limit_deg), 14)
@@ -207,7 +206,7 @@ def test_the_start_of_a_fast_turn_is_found() -> None:
 
 
 @pytest.mark.parametrize("fraction", [0.0, -1.0])
-def test_what_drives_along_does_not_decide(fraction: float) -> None:
+def test_an_object_that_drives_along_does_not_decide(fraction: float) -> None:
     """A truck beside the vehicle that no label tells from the static scene."""
     hall = _hall(6.0, fraction, 180.0)
     along, up = np.meshgrid(np.arange(-3.0, 5.0, 0.15), np.arange(-1.2, 2.0, 0.2))
@@ -216,16 +215,16 @@ def test_what_drives_along_does_not_decide(fraction: float) -> None:
     def scan(k: int) -> Scan:
         seen = hall(k)
         noise = np.random.default_rng([9, k]).normal(0.0, 0.01, side.shape)
-        creeping = side + noise + [0.03 * k, 0.0, 0.0]
-        points = np.concatenate([seen.points, creeping.astype(np.float32)])
+        moving = side + noise + [0.03 * k, 0.0, 0.0]
+        points = np.concatenate([seen.points, moving.astype(np.float32)])
         return Scan(seen.stamp_ns, points, np.full(len(points), 3, np.uint8))
 
     found = decide_sweep(scan, 14)
     assert found.kind in ("undecided", "compensated" if fraction == 0.0 else "clockwise"), found.sentence
 
 
-def test_one_thing_alone_excludes_no_hypothesis() -> None:
-    """Groups of matches add up; one that speaks ever so loudly adds no more than its share of being wrong."""
+def test_one_group_alone_excludes_no_hypothesis() -> None:
+    """Groups of matches add up; the contribution of one is bounded."""
     quiet, loud = np.full((20, SECTORS), -1.0), np.zeros((20, SECTORS))
     loud[3] = -1e6
     flat = np.full((20, SECTORS), 1e-3)
@@ -242,29 +241,28 @@ def test_one_thing_alone_excludes_no_hypothesis() -> None:
 def test_groups_of_matches_add_up_to_the_registration() -> None:
     """By cell or by direction, with the poses following: the sums are the eliminated normal equations."""
     hall = _hall(6.0, -1.0, 180.0)
-    window = Window([hall(k) for k in range(6)], 0.1, SweepWindowConfig())
+    window = Window([hall(k) for k in range(6)], 0.1)
     found = estimate([window])
     present = found.linearized_at[0] * CANDIDATES[found.linearized_at[1]]
     sums = window.surface_sums(CANDIDATES.T, found.normals[0], present)
-    told = found.evidence([window])
+    evidence = found.evidence([window])
     for by in sums:
         np.testing.assert_allclose(by.information.sum(axis=0), found.quadratic.curvature, rtol=1e-3)
         slope = found.quadratic.slope
         np.testing.assert_allclose(by.origin.sum(axis=0), -slope, atol=2e-3 * np.abs(slope).max())
-    assert abs(found.fraction + 1.0) < 5.0 * told.sigma[found.sector] < 0.5
+    assert abs(found.fraction + 1.0) < 5.0 * evidence.sigma[found.sector] < 0.5
     # Noise of 10 mm at both ends of a match.
     assert 0.008 < np.sqrt(window.errors.own) < 0.03 and np.sqrt(window.errors.shared) < 0.01
 
 
-def test_nothing_is_decided_where_nothing_tells() -> None:
-    standing = decide_sweep(_hall(0.0, -1.0, 180.0), 14)
-    assert standing.kind == "standing" and standing.timing.instant
+def test_nothing_is_decided_without_evidence() -> None:
+    still = decide_sweep(_hall(0.0, -1.0, 180.0), 14)
+    assert still.kind == "standstill" and still.timing.instant
     crawling = decide_sweep(_hall(0.5, -1.0, 180.0), 14)
     assert crawling.kind == "undecided" and crawling.timing.instant
     assert {timing.fraction for timing in crawling.others} == {-1.0, 1.0}
-    certain = SweepConfig(error_rate=1e-12)
     hall = _hall(2.0, -1.0, 180.0, limit_deg=60.0)
-    assert decide_sweep(hall, 14, certain).kind == "undecided"
+    assert decide_sweep(hall, 14).kind == "undecided"
     single = decide_sweep(_hall(6.0, -1.0, 180.0), 1)
     assert single.kind == "undecided"
 
@@ -279,7 +277,7 @@ def test_nothing_is_decided_where_nothing_tells() -> None:
         ("compensated", "clockwise", "compensated"),
     ],
 )
-def test_the_sweep_of_a_street_is_told(output: Any, sense: Any, kind: str) -> None:
+def test_the_sweep_of_a_street(output: Any, sense: Any, kind: str) -> None:
     drive = simulate(replace(STREET, sweep_output=output, sweep_sense=sense))
     found = decide_sweep(drive.scan, len(drive))
     assert found.kind == kind, found.sentence
@@ -312,10 +310,10 @@ def test_a_source_is_read_once_and_its_own_times_are_kept() -> None:
     given = with_sweep(timed)
     assert given.sweep_decision.kind == "given"
     np.testing.assert_array_equal(given[1].scan.offsets_s, timed[1].scan.offsets_s)  # type: ignore[union-attr]
-    assert with_sweep(source, SweepConfig(decide=False)).sweep_decision.kind == "given"
+    assert with_sweep(source, decide=False).sweep_decision.kind == "given"
 
 
-def test_a_result_tells_the_sweep_and_pictures_follow_it() -> None:
+def test_the_sweep_of_a_result_is_used_again() -> None:
     decision = SweepDecision("clockwise", SweepTiming(-1.0, np.pi, 0.1), -0.97, 0.05)
     drive = simulate(replace(STREET, frames=3, sweep_output="raw"))
     again = with_sweep_of(drive, {SWEEP_KEY: {drive.name: decision.to_dict()}})

@@ -44,7 +44,7 @@ def vehicle_agreement(source: SimulatedDrive, scan: Scan, image: CameraImage) ->
     1.5 px to the mask's border are left out.
     """
     assert scan.instances is not None
-    moving = [mover.instance for mover in source.street.movers]
+    moving = [vehicle.instance for vehicle in source.street.moving]
     parked = (scan.classes == SemanticClass.VEHICLE) & ~np.isin(scan.instances, moving)
     stamp = scan.stamp_ns * 1e-9
     offsets = np.zeros(len(scan.points)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
@@ -196,8 +196,8 @@ def test_motion_has_a_stop_and_a_drive(motion: Any) -> None:
 
 
 def test_the_number_of_moving_vehicles_follows_the_configuration() -> None:
-    assert not drive(moving_fraction=0.0).street.movers
-    assert len(drive(moving_fraction=0.5).street.movers) >= 5
+    assert not drive(moving_fraction=0.0).street.moving
+    assert len(drive(moving_fraction=0.5).street.moving) >= 5
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,9 @@ import pytest
 from alignment_streets import WIDE, D, E, Street, X, isam2_params, simulated_street
 
 from sst_graph import AlignmentKeys, AlignmentTerm, Trajectory, open_source, solve_with_terms
-from sst_graph.drive.preparation import prepare_drive
+from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors import time_offset_prior
-from sst_graph.slam.align import _PREPARE
 from sst_graph.slam.alignment_term import TermConfig, TermMatches, TermState
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.incremental_terms import IncrementalTerms, Solver
@@ -248,8 +247,8 @@ def test_refuses_what_is_no_term(street: Street) -> None:
 
 def real(path: Path) -> Street:
     source = open_source(path, image_shift=1)
-    config = replace(_PREPARE, use_visual_odometry=False)
-    drive = prepare_drive(source, [SemanticClass.VEHICLE], config)
+    config = PrepareConfig(use_visual_odometry=False)
+    drive = prepare_drive(source, [SemanticClass.VEHICLE], config, with_lower_edges=False)
     assert source.truth is not None and source.truth.time_offset_s is not None
     truth = source.truth.cTl, source.truth.time_offset_s
     return Street(drive.camera, drive.scans, drive.images, drive.lidar_motions, *truth)

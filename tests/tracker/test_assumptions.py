@@ -263,9 +263,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
 
-def test_a_checkpoint_holds_what_is_estimated(
-    leaving: Tracker, bent: KeptDrive, tmp_path: Path
-) -> None:
+def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive, tmp_path: Path) -> None:
     assert leaving.smoother is not None and leaving.smoother.sums.recent
     save_checkpoint(leaving, tmp_path / "tracker")
     again = load_checkpoint(tmp_path / "tracker")

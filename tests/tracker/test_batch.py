@@ -15,7 +15,8 @@ from sst_graph.drive.preparation import prepare_drive
 from sst_graph.graph.building import Tracks, tracked_objects
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, underside_track
-from sst_graph.objects.tracks import moving_objects, object_tracks
+from sst_graph.objects.dynamic_objects import find_dynamic_objects
+from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass
 
@@ -68,7 +69,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     # The same objects are left out, and each object's bias and the uncertainty agree.
     positions = [number for number, _ in tracker.window.scans]
     tracks = object_tracks(drive)
-    moving = moving_objects(drive, tracks)
+    moving = find_dynamic_objects(drive, tracks)
     found, found_moving = tracker.window.objects_of(positions)
     assert found == tracks
     assert moving and set(found_moving) == set(moving)

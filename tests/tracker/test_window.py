@@ -9,7 +9,8 @@ import pytest
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import Boundaries
-from sst_graph.objects.tracks import moving_objects, object_tracks
+from sst_graph.objects.dynamic_objects import find_dynamic_objects
+from sst_graph.objects.tracks import object_tracks
 from sst_graph.objects.velocity import ObjectVelocity
 from sst_graph.tracker.window.window import OBJECT_MEMORY, Window
 from sst_graph.types import RelativeMotion, SemanticClass
@@ -71,9 +72,9 @@ def _window(drive: Drive, scans: int) -> Window:
 def test_objects_are_judged_as_the_batch_judges_them() -> None:
     drive = _drive(30)
     tracks = object_tracks(drive)
-    speeds = moving_objects(drive, tracks)
+    speeds = find_dynamic_objects(drive, tracks)
     window = _window(drive, 40)
-    window.judge_all()
+    window.dynamics.test_all()
     found, moving = window.objects_of(range(30))
     assert found == tracks
     assert {number for _, _, number in speeds} == {1, 2, 3, 4}
@@ -88,14 +89,14 @@ def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
     window = Window(CAMERA, 40)
     noticed, later = None, set[int]()
     for k, scan in enumerate(drive.scans):
-        window.judged_anew.clear()
+        window.dynamics.changed_scans.clear()
         window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
         if noticed is not None:
-            later |= window.judged_anew
-        elif (VEHICLE, 2) in window.moving.get(k, {}):
+            later |= window.dynamics.changed_scans
+        elif (VEHICLE, 2) in window.dynamics.path_speeds.get(k, {}):
             noticed = k
     assert noticed is not None and 10 < noticed < 18
-    moving = {n for n, speeds in window.moving.items() if (VEHICLE, 2) in speeds}
+    moving = {n for n, speeds in window.dynamics.path_speeds.items() if (VEHICLE, 2) in speeds}
     before = {n for n in moving if n < noticed}
     assert before and before <= later
 
@@ -107,16 +108,16 @@ def test_an_object_that_moved_lately_is_restless() -> None:
     for k, scan in enumerate(drive.scans):
         window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
         names = {track: number for (_, number), track in window.tracks[k].items()}
-        restless[k] = {names[track] for track in window.restless() if track in names}
-        assert {n for _, n in window.moving.get(k, {})} <= restless[k]
-    assert 3 not in {n for _, n in window.moving.get(20, {})} and 3 in restless[20]
+        restless[k] = {names[track] for track in window.dynamics.recently_moving() if track in names}
+        assert {n for _, n in window.dynamics.path_speeds.get(k, {})} <= restless[k]
+    assert 3 not in {n for _, n in window.dynamics.path_speeds.get(20, {})} and 3 in restless[20]
     assert 3 not in restless[39] and {1, 2} <= restless[39]
     assert all(0 not in names for names in restless.values())
     # One whose velocity is known at its newest sighting may be asked.
     (one,) = [track for (_, number), track in window.tracks[39].items() if number == 1]
-    assert one in window.restless()
-    window.velocities.found[one] = {39: ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2)}
-    assert one not in window.restless()
+    assert one in window.dynamics.recently_moving()
+    window.dynamics.velocities.found[one] = {39: ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2)}
+    assert one not in window.dynamics.recently_moving()
 
 
 def test_nothing_grows_with_the_drive() -> None:
@@ -124,8 +125,8 @@ def test_nothing_grows_with_the_drive() -> None:
     for window in (short, long):
         first = window.first_scan
         assert len(window.scans) == 10
-        assert min([*window.tracks, *window.moving]) >= first
-        kept = [s for seen in window.sightings.values() for s in seen]
+        assert min([*window.tracks, *window.dynamics.path_speeds]) >= first
+        kept = [s for seen in window.dynamics.detections.values() for s in seen]
         assert window.last_stamp_ns is not None
         assert min(s.stamp_ns for s in kept) >= window.last_stamp_ns - 1_600_000_000
     assert len(long.objects.live) == len(short.objects.live) == 4
@@ -136,4 +137,6 @@ def test_scans_that_are_cut_off_leave_nothing_behind() -> None:
     """A checkpoint made right after an alarm holds the scans that are left, and what is known of these."""
     window = _window(_drive(12), 40)
     window.keep_scans(4)
-    assert [number for number, _ in window.scans] == sorted(window.persistence.shares) == [8, 9, 10, 11]
+    assert (
+        [number for number, _ in window.scans] == sorted(window.dynamics.occupancy.shares) == [8, 9, 10, 11]
+    )

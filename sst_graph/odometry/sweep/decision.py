@@ -9,18 +9,19 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from sst_graph.config import Settings, setting
-from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
-from sst_graph.odometry.sweep.estimate import CANDIDATES, Estimate, at_hypothesis, estimate, start_of
-from sst_graph.odometry.sweep.window import SECTORS, SweepWindowConfig, Window
+from sst_graph.config import Settings
+from sst_graph.odometry.lidar import LidarOdometry
+from sst_graph.odometry.sweep.estimate import Estimate, at_hypothesis, estimate, start_of
+from sst_graph.odometry.sweep.window import SECTORS, Window
 from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
 
 _LOG = logging.getLogger(__name__)
 
 Hypothesis = Literal["compensated", "clockwise", "counterclockwise"]
-SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided", "standing", "given"]
-"""One of the hypotheses, or: none is excluded; nothing moved, so that none matters; not asked."""
+SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided", "standstill", "given"]
+"""One of the hypotheses; or none, for they are not excluded, or do not matter at standstill, or the times are
+given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
 REMEDY = (
@@ -28,44 +29,43 @@ REMEDY = (
 )
 
 
+_SAMPLED_PAIRS = 6
+"""Pairs of consecutive scans, spread over the drive, that give the speed."""
+_MAX_WINDOWS = 6
+"""Most windows that are registered, the fastest first, as long as they may decide."""
+_WINDOW_SCANS = 12
+"""Scans of a window."""
+_STEP_M, _STEP_RAD = 0.8, 0.15
+"""Motion from one scan of a window to the next that is aimed at, at low speed by leaving scans out [m,
+rad]."""
+_MAX_SKIPPED = 7
+"""Most scans left out between two of a window."""
+_STANDSTILL_MPS, _STANDSTILL_RADPS = 0.1, 0.02
+"""A vehicle that is nowhere faster is at standstill [m/s, rad/s]."""
+_MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 3.0, 0.25
+"""Least motion from the first scan of a window to its last: with less, surfaces are seen from one side only,
+with the same errors in every scan [m, rad]."""
+_ERROR_RATE = 0.001
+"""A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: as much speaks against the true
+one in this share of drives at most, where the error model holds."""
+_TOLERANCE = 0.2
+"""The estimated share may differ so much from 0 or 1 beside three of its sigmas."""
+_LONG_SWEEP_M = 1.0
+"""Where the vehicle moves farther in a turn, a wrong hypothesis keeps the matches made under it, and all
+hypotheses are tried as starts [m]."""
+_MIN_EXPECTED = 0.5
+"""Share of the evidence needed below which no more windows are registered."""
+
+
 @dataclass(frozen=True)
 class SweepConfig(Settings):
-    """How the sweep of scans without times is decided.
+    """Scans without times of their points.
 
     Attributes:
-        decide: whether it is; False takes such points as compensated.
-        window: how scans are registered to one another.
-        places: pairs of consecutive scans, spread over the drive, whose speed is looked at first.
-        windows: most stretches that are registered, the fastest first, as long as they may decide it.
-        scans: of a stretch.
-        step_m, step_rad: motion from one scan of a stretch to the next that is aimed at, where the vehicle is
-            slow by leaving scans out [m, rad].
-        most_skipped: most scans left out between two of a stretch.
-        rest_mps, rest_radps: a vehicle that is nowhere faster stands [m/s, rad/s].
-        travel_m, travel_rad: a stretch tells nothing where the vehicle moves less from its first scan to its
-            last: surfaces are then seen from one side only, with the same errors in every scan [m, rad].
-        error_rate: a hypothesis is excluded where another is 1 / error_rate times as likely: so much against
-            the right one is found in this share of drives at most, where the error model holds.
-        tolerance: the estimated share may differ so much from 0 or 1 beside three of its sigmas.
-        long_sweep_m: where the vehicle moves farther in a turn, matches made under a wrong hypothesis hold
-            themselves up, and all are tried from the start [m].
+        decide: whether the sweep is decided from the scans; False uses such points as compensated.
     """
 
     decide: bool = True
-    window: SweepWindowConfig = field(default_factory=SweepWindowConfig)
-    places: int = setting(6, at_least=1, at_most=1000)
-    windows: int = setting(6, at_least=1, at_most=100)
-    scans: int = setting(12, at_least=2, at_most=200)
-    step_m: float = setting(0.8, at_least=0.001, at_most=100.0)
-    step_rad: float = setting(0.15, at_least=0.001, at_most=7.0)
-    most_skipped: int = setting(7, at_least=0, at_most=1000)
-    rest_mps: float = setting(0.1, at_least=0.0, at_most=100.0)
-    rest_radps: float = setting(0.02, at_least=0.0, at_most=10.0)
-    travel_m: float = setting(3.0, at_least=0.0, at_most=1000.0)
-    travel_rad: float = setting(0.25, at_least=0.0, at_most=100.0)
-    error_rate: float = setting(0.001, at_least=1e-12, at_most=0.5)
-    tolerance: float = setting(0.2, at_least=0.0, at_most=2.0)
-    long_sweep_m: float = setting(1.0, at_least=0.0, at_most=1000.0)
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,11 @@ class SweepDecision:
         kind: the hypothesis, or why there is none.
         timing: times of the points as they are used.
         fraction, sigma: estimated share of the sweep in the points, -1 (clockwise) to 1, and its standard
-            deviation, at the start of the turn that fits best; sigma infinite where nothing tells.
+            deviation, at the start of the turn that fits best; sigma infinite where no window was registered.
         worse_by: by how many standard deviations each hypothesis fits worse than the best.
-        start_told: whether the scans show where a turn begins; else the start lies where no points are.
-        speed_mps: fastest mean speed of the stretches looked at.
-        frames: numbers of the scans looked at, in the order of the drive.
+        start_known: whether the scans determine where a turn begins; else the start lies where no points are.
+        speed_mps: fastest mean speed of the windows.
+        frames: positions of the scans used, in the order of the drive.
         others: times of the points under the hypotheses that are not excluded, beside ``timing``.
     """
 
@@ -89,15 +89,15 @@ class SweepDecision:
     fraction: float = 0.0
     sigma: float = np.inf
     worse_by: Mapping[str, float] = field(default_factory=dict)
-    start_told: bool = False
+    start_known: bool = False
     speed_mps: float = 0.0
     frames: tuple[int, ...] = ()
     others: tuple[SweepTiming, ...] = ()
 
     @property
     def shares(self) -> dict[float, float]:
-        """Probability of each hypothesis, by its fraction; sigmas are taken as twice as large as claimed, for
-        a hypothesis that the scans leave open is one that their error model does not settle.
+        """Probability of each hypothesis, by its fraction, with sigmas twice as large as claimed: where the
+        decision is open, the error model is not certain either.
         """
         weights = {
             fraction: float(np.exp(-0.5 * (0.5 * self.worse_by.get(name, 0.0)) ** 2))
@@ -112,13 +112,13 @@ class SweepDecision:
         share = f"share of the sweep in the points {self.fraction:+.2f} +- {self.sigma:.2f}"
         if self.kind == "given":
             return "as given"
-        if self.kind == "standing":
-            return "taken as compensated: the vehicle stands, so that it does not matter"
+        if self.kind == "standstill":
+            return "assumed compensated: at standstill it does not matter"
         if self.kind == "undecided":
-            return f"not told by the scans ({share}); taken as compensated"
+            return f"not determined by the scans ({share}); assumed compensated"
         if self.kind == "compensated":
             return f"compensated ({share}, 0 expected)"
-        where = f"a turn begins at {np.degrees(self.timing.start_rad):.0f} deg" if self.start_told else ""
+        where = f"a turn begins at {np.degrees(self.timing.start_rad):.0f} deg" if self.start_known else ""
         expected = FRACTIONS[self.kind]
         return f"as measured, {self.kind} ({share}, {expected:+.0f} expected){'; ' * bool(where)}{where}"
 
@@ -131,168 +131,153 @@ class SweepDecision:
             "sigma": self.sigma,
             "worse_by_sigmas": dict(self.worse_by),
             "timing": self.timing.to_dict(),
-            "start_told": self.start_told,
+            "start_known": self.start_known,
             "speed_mps": self.speed_mps,
             "scans": list(self.frames),
         }
 
 
 @dataclass(frozen=True)
-class _Place:
-    """A pair of consecutive scans: position of the first, and motion of the LiDAR from one to the other."""
+class _PairMotion:
+    """Motion of the LiDAR between two consecutive scans, and the position of the first."""
 
     position: int
     seconds: float
     speed_mps: float
     turn_radps: float
 
+    @property
+    def speed_ratio(self) -> float:
+        """Speed, or rate of turn, as a multiple of what counts as standstill."""
+        return max(self.speed_mps / _STANDSTILL_MPS, self.turn_radps / _STANDSTILL_RADPS)
+
+    def priority(self, period_s: float) -> float:
+        """Sorts the fastest first, and last, slowest first, those too fast for matches of a wrong
+        hypothesis."""
+        return self.speed_ratio if self.speed_mps * period_s > _LONG_SWEEP_M else -self.speed_ratio
+
 
 def decide_sweep(
-    scan_at: Callable[[int], Scan | None],
-    count: int,
-    config: SweepConfig | None = None,
-    stamp: SweepStamp = "forward",
+    scan_at: Callable[[int], Scan | None], count: int, stamp: SweepStamp = "forward"
 ) -> SweepDecision:
     """Decide it from the scans of a drive that have no times of their points.
 
     Args:
         scan_at: scan at a position, or None where the frame has none.
         count: number of positions.
-        config: settings.
         stamp: the instant that a scan's stamp names, in case the points are as measured.
     """
-    config = config or SweepConfig()
-    places = _places(scan_at, count, config)
-    if not places:
+    pairs = _pair_motions(scan_at, count)
+    if not pairs:
         return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
-    period_s = float(np.median([place.seconds for place in places]))
-    # Stamps in another unit: what is wrong with them is said elsewhere.
+    period_s = float(np.median([pair.seconds for pair in pairs]))
+    # Stamps in another unit are reported elsewhere.
     if not 0.0 < period_s < LONGEST_TURN_S:
         return SweepDecision("undecided", SweepTiming(0.0, -np.pi, 0.1, stamp))
     timing = SweepTiming(0.0, -np.pi, period_s, stamp)
-    if max(_worth(place, config) for place in places) < 1.0:
-        return SweepDecision("standing", timing, speed_mps=max(place.speed_mps for place in places))
-    places = sorted(places, key=lambda place: _rank(place, period_s, config))
+    if max(pair.speed_ratio for pair in pairs) < 1.0:
+        return SweepDecision("standstill", timing, speed_mps=max(pair.speed_mps for pair in pairs))
     both = tuple(replace(timing, fraction=f) for f in (-1.0, 1.0))
     decision = SweepDecision("undecided", timing, others=both)
     windows: list[Window] = []
     used: list[int] = []
-    for place in places:
-        if _worth(place, config) < 1.0 or any(abs(place.position - k) < config.scans // 2 for k in used):
+    for pair in sorted(pairs, key=lambda pair: pair.priority(period_s)):
+        if pair.speed_ratio < 1.0 or any(abs(pair.position - k) < _WINDOW_SCANS // 2 for k in used):
             continue
-        positions = _stretch(place, count, config)
+        positions = _window_positions(pair, count)
         scans = [(k, scan) for k in positions if (scan := scan_at(k)) is not None]
         if len(scans) < 3:
             continue
-        window = Window([scan for _, scan in scans], period_s, config.window)
-        if window.travel[0] < config.travel_m and window.travel[1] < config.travel_rad:
+        window = Window([scan for _, scan in scans], period_s)
+        if window.travel[0] < _MIN_TRAVEL_M and window.travel[1] < _MIN_TRAVEL_RAD:
             continue
         windows.append(window)
         used += [k for k, _ in scans]
-        decision = replace(_decided(windows, timing, config), frames=tuple(sorted(set(used))))
+        decision = replace(_decide(windows, timing), frames=tuple(sorted(set(used))))
         _LOG.info("sweep: %s", decision.sentence)
-        if decision.kind != "undecided" or len(windows) == config.windows:
+        if decision.kind != "undecided" or len(windows) == _MAX_WINDOWS:
             break
-        # As many windows again as are left would tell so much if they were all like these.
-        expected = 0.5 / decision.sigma**2 * config.windows / len(windows)
-        if expected < _HOPE * -np.log(config.error_rate):
+        # Evidence of as many windows as may be registered, were they all like these.
+        expected = 0.5 / decision.sigma**2 * _MAX_WINDOWS / len(windows)
+        if expected < _MIN_EXPECTED * -np.log(_ERROR_RATE):
             break
     return decision
 
 
-def _places(scan_at: Callable[[int], Scan | None], count: int, config: SweepConfig) -> list[_Place]:
-    """Speeds at pairs of scans spread over the drive."""
+def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_PairMotion]:
+    """Motions at pairs of scans spread over the drive."""
     found = []
-    for k in np.unique(np.linspace(0, max(count - 2, 0), config.places).round().astype(int)).tolist():
+    for k in np.unique(np.linspace(0, max(count - 2, 0), _SAMPLED_PAIRS).round().astype(int)).tolist():
         a, b = scan_at(k), scan_at(k + 1) if k + 1 < count else None
         if a is None or b is None or b.stamp_ns <= a.stamp_ns:
             continue
-        odometry = LidarOdometry(LidarOdometryConfig())
+        odometry = LidarOdometry()
         odometry.add(a)
         motion = odometry.add(b)
         if motion is not None and motion.ok:
             turn, speed = (float(np.linalg.norm(part)) for part in np.split(motion.mean_twist, 2))
-            found.append(_Place(k, motion.seconds, speed, turn))
+            found.append(_PairMotion(k, motion.seconds, speed, turn))
     return found
 
 
-def _worth(place: _Place, config: SweepConfig) -> float:
-    return max(place.speed_mps / config.rest_mps, place.turn_radps / config.rest_radps)
-
-
-def _rank(place: _Place, period_s: float, config: SweepConfig) -> float:
-    """The fastest first; last, slowest first, those too fast for matches under a wrong hypothesis."""
-    worth = _worth(place, config)
-    return worth if place.speed_mps * period_s > config.long_sweep_m else -worth
-
-
-def _stretch(place: _Place, count: int, config: SweepConfig) -> list[int]:
-    """Positions of the scans around a place, so far apart that the vehicle moves from one to the next."""
+def _window_positions(pair: _PairMotion, count: int) -> list[int]:
+    """Positions of the scans around a pair, so far apart that the vehicle moves from one to the next."""
     step = min(
-        config.step_m / max(place.speed_mps * place.seconds, 1e-3),
-        config.step_rad / max(place.turn_radps * place.seconds, 1e-3),
+        _STEP_M / max(pair.speed_mps * pair.seconds, 1e-3),
+        _STEP_RAD / max(pair.turn_radps * pair.seconds, 1e-3),
     )
-    every = int(
-        np.clip(round(step), 1, min(config.most_skipped + 1, max(1, (count - 1) // (config.scans - 1))))
-    )
-    length = (config.scans - 1) * every
-    first = int(np.clip(place.position - length // 2, 0, max(0, count - 1 - length)))
+    most = min(_MAX_SKIPPED + 1, max(1, (count - 1) // (_WINDOW_SCANS - 1)))
+    every = int(np.clip(round(step), 1, most))
+    length = (_WINDOW_SCANS - 1) * every
+    first = int(np.clip(pair.position - length // 2, 0, max(0, count - 1 - length)))
     return list(range(first, min(count, first + length + 1), every))
 
 
-def _decided(windows: Sequence[Window], timing: SweepTiming, config: SweepConfig) -> SweepDecision:
-    """The decision that some stretches allow."""
+def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
+    """The decision from some windows."""
     speed = max(float(np.linalg.norm(window.twists[:, 3:], axis=1).mean()) for window in windows)
     fraction, sector = 0.0, 0
-    far = speed * timing.period_s > config.long_sweep_m
-    if far:
+    if speed * timing.period_s > _LONG_SWEEP_M:
         fraction, sector = _best_start(windows[0].thinned(_FEW_SCANS, _FEW_POINTS))
     found = estimate(windows, fraction, sector)
-    return replace(_judged(windows, found, timing, config), speed_mps=speed)
+    return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
 
 
-def _judged(
-    windows: Sequence[Window], found: Estimate, timing: SweepTiming, config: SweepConfig
-) -> SweepDecision:
+def _compare_hypotheses(windows: Sequence[Window], found: Estimate, timing: SweepTiming) -> SweepDecision:
     """The three hypotheses by their evidence, that of compensated points being 1."""
-    told = found.evidence(windows)
-    ratios: dict[str, FloatArray] = {name: told.log_ratio(f) for name, f in FRACTIONS.items()}
-    evidence = {name: _log_mean(ratio) for name, ratio in ratios.items()}
-    best = max(evidence, key=lambda name: evidence[name])
-    behind = {name: evidence[best] - evidence[name] for name in evidence}
-    needed = -np.log(config.error_rate)
+    evidence = found.evidence(windows)
+    ratios: dict[str, FloatArray] = {name: evidence.log_ratio(f) for name, f in FRACTIONS.items()}
+    means = {name: _log_mean(ratio) for name, ratio in ratios.items()}
+    best = max(means, key=lambda name: means[name])
+    behind = {name: means[best] - means[name] for name in means}
+    needed = -np.log(_ERROR_RATE)
     excluded = {name for name in behind if behind[name] > needed}
     starts = {name: _start(-ratio) for name, ratio in ratios.items()}
-    # Against compensated points stands the turn that comes nearest to them.
+    # Compensated points are compared with the turn that fits best.
     raw = best if best != "compensated" else min(_RAW, key=lambda name: behind[name])
-    sector, start_told = starts[raw]
-    share, sigma = float(found.quadratic.free()[sector]), float(told.sigma[sector])
-    agrees = abs(share - FRACTIONS[best]) < config.tolerance + 3.0 * sigma
+    sector, start_known = starts[raw]
+    share, sigma = float(found.quadratic.free()[sector]), float(evidence.sigma[sector])
+    agrees = abs(share - FRACTIONS[best]) < _TOLERANCE + 3.0 * sigma
     # Where only a step at the start of the turn shows, one side of the scene against the other, whatever else
-    # sets the sides apart looks like it: every start must be told, also one where no points are.
-    informed = 0.5 / float(told.sigma.max()) ** 2 > needed
+    # differs between the sides looks like it: every start has to be informed, also one where no points are.
+    informed = 0.5 / float(evidence.sigma.max()) ** 2 > needed
     decided = len(excluded) == 2 and agrees and informed
     timings = {
-        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0]))
-        for name in evidence
+        name: replace(timing, fraction=FRACTIONS[name], start_rad=start_of(starts[name][0])) for name in means
     }
-    kind = cast(SweepKind, best if decided else "undecided")
-    settled = agrees and informed
-    others = [timings[name] for name in evidence if name not in excluded or not settled]
+    others = [timings[name] for name in means if name not in excluded or not (agrees and informed)]
     return SweepDecision(
-        kind,
+        cast(SweepKind, best if decided else "undecided"),
         timings[best] if decided and best != "compensated" else timing,
         share,
         sigma,
         {name: float(np.sqrt(2.0 * value)) for name, value in behind.items()},
-        start_told and best != "compensated",
+        start_known and best != "compensated",
         others=() if decided else tuple(other for other in others if not other.instant),
     )
 
 
 _RAW = ("clockwise", "counterclockwise")
-_HOPE = 0.5
-"""Share of the evidence needed below which no more stretches are looked at."""
 
 
 def _log_mean(values: FloatArray) -> float:
@@ -302,7 +287,7 @@ def _log_mean(values: FloatArray) -> float:
 
 
 def _start(costs: FloatArray) -> tuple[int, bool]:
-    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [1/2 sigma^2] tell it.
+    """Sector at whose border a turn begins, and whether the costs (SECTORS,) [1/2 sigma^2] determine it.
 
     Of starts that fit equally well (no points between them) the one in the middle of the widest run.
     """
@@ -323,12 +308,13 @@ def _start(costs: FloatArray) -> tuple[int, bool]:
 def _best_start(window: Window) -> tuple[float, int]:
     """The share of the sweep, and the sector at whose border a turn begins, under which scans meet best.
 
-    Points between the right start and another are off by a whole turn and meet nothing, so that no derivative
-    shows the way: starts are tried, coarsely all around and then ever nearer to the best.
+    Points between the right start and another are off by a whole turn and match nothing, so that the cost has
+    no
+    gradient there: starts are tried in a grid, which is refined around the best.
     """
 
     def misfit(fraction: float, sector: int) -> float:
-        return at_hypothesis([window.copy()], fraction, sector % SECTORS, _TRIED_PASSES).misfit
+        return at_hypothesis([window.copy()], fraction, sector % SECTORS, _TRIED_ITERATIONS).misfit
 
     coarse = [(f, sector) for f in _TRIED for sector in (range(0, SECTORS, _COARSE) if f else (0,))]
     least, (fraction, sector) = min((misfit(*tried), tried) for tried in coarse)
@@ -344,5 +330,5 @@ def _best_start(window: Window) -> tuple[float, int]:
 _COARSE = 8
 """Sectors between the starts that are tried first."""
 _TRIED = (0.0, -1.0, 1.0)
-_FEW_SCANS, _FEW_POINTS, _TRIED_PASSES = 6, 60, 4
-__all__ = ["CANDIDATES", "SweepConfig", "SweepDecision", "decide_sweep"]
+_FEW_SCANS, _FEW_POINTS, _TRIED_ITERATIONS = 6, 60, 4
+"""Scans, points of each direction of normals, and iterations for each start that is tried."""

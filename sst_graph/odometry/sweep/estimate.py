@@ -8,14 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.odometry.sweep.window import SECTORS, Normal, SurfaceSums, Window
+from sst_graph.odometry.sweep.window import ANNEALING, SECTORS, Normal, SurfaceSums, Window
 
 FloatArray = NDArray[np.float64]
 
-FARTHEST = 1.3
-"""Largest share of a turn that is believed on the way to an estimate."""
-SETTLED = 0.005
-"""Change of the share of a turn at which matches need not be made anew."""
+_MAX_FRACTION = 1.3
+"""Bound of the share on the way to an estimate: the truth is at most 1."""
+_CONVERGED = 0.005
+"""Change of the share below which the iterations end."""
+_MAX_ITERATIONS = 12
+"""Most times that points are matched again."""
 
 
 def _candidates() -> FloatArray:
@@ -55,12 +57,12 @@ class Quadratic:
     def free(self) -> FloatArray:
         """(SECTORS,) the share of least cost."""
         best = self.slope / np.maximum(self.curvature, 1e-12)
-        return np.asarray(np.clip(best, -FARTHEST, FARTHEST))
+        return np.asarray(np.clip(best, -_MAX_FRACTION, _MAX_FRACTION))
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What the registration says.
+    """Result of the registration.
 
     Attributes:
         fraction, sector: least cost of all.
@@ -78,7 +80,7 @@ class Estimate:
     misfit: float
 
     def evidence(self, windows: Sequence[Window]) -> Evidence:
-        """What the windows say of every start of a turn, at the last matches."""
+        """Evidence for every start of a turn, at the last matches."""
         present = self.linearized_at[0] * CANDIDATES[self.linearized_at[1]]
         groupings: tuple[list[SurfaceSums], list[SurfaceSums]] = ([], [])
         modelled = np.zeros(SECTORS)
@@ -90,10 +92,10 @@ class Estimate:
             groupings[0].append(by_cell)
             groupings[1].append(by_direction)
         # A cluster-robust variance by each grouping (Cameron, Gelbach and Miller, 2011), the larger one.
-        seen = [sum((one.score**2).sum(axis=0) for one in sums) for sums in groupings]
+        clustered = [sum((one.score**2).sum(axis=0) for one in sums) for sums in groupings]
         curvature = np.maximum(self.quadratic.curvature, 1e-12)
         return Evidence(
-            np.maximum.reduce([*seen, modelled]) / curvature,
+            np.maximum.reduce([*clustered, modelled]) / curvature,
             curvature,
             tuple(
                 (
@@ -105,18 +107,18 @@ class Estimate:
         )
 
 
-_SURFACE_SAYS = 3.0
-"""Most that one group of matches adds to the logarithm of a likelihood ratio: one in twenty is not what it
-seems (a thing that moves, wrong matches), whatever its residuals say."""
+_MAX_LOG_RATIO = 3.0
+"""Most that one group of matches adds to the logarithm of a likelihood ratio: one in twenty is wrong (a
+moving object, wrong matches), whatever its residuals."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What registration says of turns, by the sector at whose border they begin.
+    """Evidence of the registration on turns, by the sector at whose border they begin.
 
     Attributes:
-        unit: (SECTORS,) variance of a residual as far as its errors reach a share [m^2]: what the groups'
-            scores say (cluster-robust), at least what the errors of matches and surfaces make.
+        unit: (SECTORS,) variance of a residual as far as its errors reach a share [m^2]: cluster-robust from
+            the groups' scores, at least that of the errors of matches and surfaces.
         curvature: (SECTORS,) of the cost [m^2].
         groupings: of the matches, each (slopes, curvatures), both (groups, SECTORS): derivatives of each
             group's cost, for points that share one instant [m^2].
@@ -133,20 +135,19 @@ class Evidence:
 
     def log_ratio(self, fraction: float) -> FloatArray:
         """(SECTORS,) log likelihood of a share of the sweep against that of points that share one instant: by
-        the grouping that says less, nothing where they contradict each other.
+        the grouping with the smaller one, 0 where they contradict each other.
         """
         sums = []
         for slopes, curvatures in self.groupings:
             gain = -(fraction * slopes + 0.5 * fraction**2 * curvatures) / self.unit
-            sums.append(np.clip(gain, -_SURFACE_SAYS, _SURFACE_SAYS).sum(axis=0))
+            sums.append(np.clip(gain, -_MAX_LOG_RATIO, _MAX_LOG_RATIO).sum(axis=0))
         least, most = np.min(sums, axis=0), np.max(sums, axis=0)
         return np.asarray(np.maximum(least, 0.0) + np.minimum(most, 0.0))
 
 
 def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> Estimate:
-    """Share and start of least cost, from those given, with the poses of the windows; matches made anew."""
-    config = windows[0].config
-    for number in range(config.passes):
+    """Share and start of least cost, iterated from those given, with the poses of the windows."""
+    for number in range(_MAX_ITERATIONS):
         present = fraction, sector
         quadratic, normals = _matched(windows, fraction, sector, number)
         shares = quadratic.free()
@@ -154,16 +155,16 @@ def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) 
         last, fraction = fraction, float(shares[best])
         step = fraction * CANDIDATES[best] - last * CANDIDATES[sector]
         _move(windows, normals, step)
-        done = best == sector and abs(fraction - last) < SETTLED and number >= len(config.gates_m)
+        done = best == sector and abs(fraction - last) < _CONVERGED and number >= ANNEALING
         sector = best
         if done:
             break
     return Estimate(fraction, sector, quadratic, normals, present, _misfit(windows))
 
 
-def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, passes: int) -> Estimate:
+def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, iterations: int) -> Estimate:
     """The cost around a given share and start, with the poses that go with it."""
-    for number in range(passes):
+    for number in range(iterations):
         quadratic, normals = _matched(windows, fraction, sector, number)
         _move(windows, normals, np.zeros(1 + SECTORS))
     shares = quadratic.free()
@@ -176,7 +177,7 @@ def _matched(
 ) -> tuple[Quadratic, tuple[Normal, ...]]:
     normals = tuple(window.linearized(fraction, start_of(sector), number) for window in windows)
     H = np.sum([normal.H for normal in normals], axis=0)
-    # About u = 0, so that all hypotheses are told by one quadratic.
+    # About u = 0, so that one quadratic holds for all hypotheses.
     g = np.sum([normal.g for normal in normals], axis=0) + H @ (fraction * CANDIDATES[sector])
     return Quadratic(np.einsum("ij,ij->i", CANDIDATES @ H, CANDIDATES), CANDIDATES @ g), normals
 
@@ -187,5 +188,4 @@ def _move(windows: Sequence[Window], normals: Sequence[Normal], step: FloatArray
 
 
 def _misfit(windows: Sequence[Window]) -> float:
-    scale = windows[0].config.scales_m[-1]
-    return float(np.mean([window.misfit(scale) for window in windows]))
+    return float(np.mean([window.misfit() for window in windows]))

@@ -11,7 +11,7 @@ import gtsam
 from sst_graph.data.frame_parts import AheadReader, image_at, number_at, scan_at
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.odometry.sweep.decision import SweepConfig, SweepDecision, decide_sweep
+from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
 
@@ -26,7 +26,7 @@ class SweptSource:
     """
 
     def __init__(self, source: Source, decision: SweepDecision, ahead: AheadReader | None = None) -> None:
-        """ahead: the source, of which some scans have been looked at."""
+        """ahead: reader of the source that has read some scans already."""
         self.source, self.sweep_decision = source, decision
         self._ahead = AheadReader(source) if ahead is None else ahead
 
@@ -90,20 +90,22 @@ def timed(scan: Scan, timing: SweepTiming) -> Scan:
     return replace(scan, offsets_s=timing.offsets_s(scan.points))
 
 
-def with_sweep(source: Source, config: SweepConfig | None = None) -> SweptSource:
-    """The source with times for its points, as its scans tell them; those read for that are not read again.
+def with_sweep(source: Source, decide: bool = True) -> SweptSource:
+    """The source with times for its points, decided from its scans; scans read for that are not read again.
 
-    Nothing is decided, and the source stays as it is, where its scans bring times, or where it was opened
-    with a word on its sweep (its attribute ``sweep`` is other than "auto").
+    Nothing is decided, and the source stays as it is, where its scans have times, or where it was opened
+    with a given sweep (its attribute ``sweep`` is other than "auto").
+
+    Args:
+        decide: False leaves scans without times as they are.
 
     Raises:
         DataError: a frame cannot be read.
     """
     if isinstance(source, SweptSource):
         return source
-    config = config or SweepConfig()
     given = SweepDecision("given", SweepTiming(0.0, 0.0, 0.1))
-    if not config.decide or getattr(source, "sweep", "auto") != "auto":
+    if not decide or getattr(source, "sweep", "auto") != "auto":
         return SweptSource(source, given)
     ahead = AheadReader(source)
     for position in range(len(source)):
@@ -112,11 +114,11 @@ def with_sweep(source: Source, config: SweepConfig | None = None) -> SweptSource
                 return SweptSource(source, given, ahead)
             break
     stamp: SweepStamp = getattr(source, "sweep_stamp", "forward")
-    return SweptSource(source, decide_sweep(ahead.look, len(source), config, stamp), ahead)
+    return SweptSource(source, decide_sweep(ahead.look, len(source), stamp), ahead)
 
 
 def with_sweep_of(source: Source, diagnostics: Mapping[str, Any]) -> SweptSource:
-    """The source with the times that a result's diagnostics tell of the drive of its name; else as it is."""
+    """The source with the times in a result's diagnostics for a drive of its name; without any, as it is."""
     entry = diagnostics.get(SWEEP_KEY, {})
     entry = entry.get(source.name, {}) if isinstance(entry, Mapping) else {}
     given = getattr(source, "sweep", "auto") != "auto"

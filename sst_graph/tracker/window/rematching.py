@@ -57,12 +57,12 @@ def scans_to_match(
 def _judged_anew(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
     """Scans with a pair in which other objects are to be left out than were; the others are forgotten."""
     window, found = matcher.window, []
-    for number in sorted(window.judged_anew & set(smoother.entries)):
+    for number in sorted(window.dynamics.changed_scans & set(smoother.entries)):
         entry = smoother.entries[number]
         if matcher.left_out(entry.pair, number, smoother.point.offset_s) != entry.left_out:
             found.append(number)
         else:
-            window.judged_anew.discard(number)
+            window.dynamics.changed_scans.discard(number)
     return found
 
 

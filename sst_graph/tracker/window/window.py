@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -14,49 +13,15 @@ from numpy.typing import NDArray
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.objects.persistence import ObjectName, Persistence
-from sst_graph.objects.tracks import (
-    Mover,
-    MovingConfig,
-    ObjectId,
-    ObjectTracker,
-    higher_speeds,
-    speed_of,
-    standing_share,
-)
-from sst_graph.objects.velocity import Velocities
+from sst_graph.objects.dynamic_objects import DynamicObject, DynamicObjectTest, dynamic_object_weights
+from sst_graph.objects.occupancy import ObjectName
+from sst_graph.objects.tracks import ObjectId, ObjectTracker
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
-_SPEED_CHANGE = 0.2
-"""Speeds of an object that differ by more than this fraction are a new judgement."""
-
-_RESTLESS_MPS = 0.6
-"""Objects that pass for slower than this have not moved: half of their points are where they were."""
-
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
-MOVING = MovingConfig()
-"""What counts as an object that moves by itself, as in the batch."""
-_REACH_NS = round(MOVING.window_s * 1e9)
-
-
-@dataclass(frozen=True)
-class Sighting:
-    """An object in a scan.
-
-    Attributes:
-        scan: number of the scan.
-        name: class and number of the object within it.
-        stamp_ns: of the scan.
-        centre: (2,) in the world, seen from above [m].
-    """
-
-    scan: int
-    name: ObjectName
-    stamp_ns: int
-    centre: FloatArray
 
 
 class Window:
@@ -67,12 +32,7 @@ class Window:
         sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
         held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
-        sightings: the latest ones of each track, in the order of time.
-        moving: speed of the objects of a scan whose sightings say that they move by themselves, by the scan's
-            number [m/s].
-        persistence: which objects stay where they are, whatever their sightings say.
-        velocities: of those that do not.
-        judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
+        dynamics: which objects are dynamic.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
         origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
@@ -95,11 +55,7 @@ class Window:
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
         self.tracks: dict[int, dict[ObjectName, int]] = {}
-        self.sightings: dict[int, list[Sighting]] = {}
-        self.moving: dict[int, dict[ObjectName, float]] = {}
-        self.persistence = Persistence()
-        self.velocities = Velocities()
-        self.judged_anew: set[int] = set()
+        self.dynamics = DynamicObjectTest()
         self.wTl = gtsam.Pose3()
 
     @property
@@ -149,15 +105,9 @@ class Window:
         self.scans.append((number, lean))
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
-        self._judge(number, features.stamp_ns)
-        self.persistence.forget(self.first_scan)
-        self.judged_anew |= self.persistence.add(number, lean, self.wTl)
-        self.velocities.forget(self.first_scan)
-        self.judged_anew |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
-        for by_scan in (self.tracks, self.moving):
-            for old in [k for k in by_scan if k < self.first_scan]:
-                del by_scan[old]
-        self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
+        self.dynamics.add(number, lean, self.tracks[number], self.wTl, self.first_scan)
+        for old in [k for k in self.tracks if k < self.first_scan]:
+            del self.tracks[old]
         return number
 
     def _thin_out(self) -> None:
@@ -173,102 +123,25 @@ class Window:
             )
             self.scans[-1 - self.sampled] = (number, thin)
 
-    def _judge(self, number: int, stamp_ns: int) -> None:
-        """Which objects of the latest scans move: as the batch judges, from the sightings so far."""
-        for name, track in self.tracks[number].items():
-            centre = self.objects.live[track][1][:2]
-            self.sightings.setdefault(track, []).append(Sighting(number, name, stamp_ns, centre))
-        for track, seen in list(self.sightings.items()):
-            seen = [sighting for sighting in seen if stamp_ns - sighting.stamp_ns <= 2 * _REACH_NS]
-            self.sightings[track] = seen
-            if not seen:
-                del self.sightings[track]
-            elif seen[-1].scan >= number - 1:
-                self._judge_track(seen, stamp_ns - _REACH_NS, whole=seen[-1].scan < number)
-
-    def judge_all(self) -> None:
-        """Judge all latest sightings by what is around them, as at the end of a drive."""
-        self.velocities.judge_all()
-        for seen in self.sightings.values():
-            self._judge_track(seen, self.scans[-1][1].stamp_ns - _REACH_NS, whole=True)
-
-    def _judge_track(self, seen: Sequence[Sighting], since_ns: int, whole: bool) -> None:
-        """Speeds of one object in its sightings since a stamp, each from those around it.
-
-        A sighting is judged when it is new, when all that is around it has been seen, and when the newest
-        one is judged otherwise than the one before; with ``whole``, now.
-        """
-        recent = [i for i, sighting in enumerate(seen) if sighting.stamp_ns >= since_ns]
-        if not recent:
-            return
-        centres = np.stack([sighting.centre for sighting in seen])
-        stamps = np.array([sighting.stamp_ns for sighting in seen], dtype=np.int64)
-        # A line fitted to n places rises by less than 1.5 times their spread.
-        never = 1.5 * float(np.linalg.norm(np.ptp(centres, axis=0))) < MOVING.min_travel_m
-        before = self._speed(seen[recent[-2]]) if len(recent) > 1 else 0.0
-        for i in (recent[-1], recent[0], *recent[1:-1]):
-            near = np.abs(stamps - stamps[i]) <= _REACH_NS
-            times = np.asarray((stamps[near] - stamps[i]) * 1e-9, np.float64)
-            self._decide(seen[i], 0.0 if never else speed_of(times, centres[near], MOVING))
-            if not whole and i == recent[0] and (before > 0.0) == (self._speed(seen[-1]) > 0.0):
-                break
-
-    def _speed(self, sighting: Sighting) -> float:
-        return self.moving.get(sighting.scan, {}).get(sighting.name, 0.0)
-
-    def _decide(self, sighting: Sighting, speed: float) -> None:
-        before = self._speed(sighting)
-        speeds = self.moving.setdefault(sighting.scan, {})
-        speeds.pop(sighting.name, None)
-        if speed > 0.0:
-            speeds[sighting.name] = speed
-        if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
-            self.judged_anew.add(sighting.scan)
-
     def left_out(
         self, number: int, tau_s: float, reach_m: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
         """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
-        lost = [
-            (c, name, round(10.0 * (1.0 - standing_share(mover.unknown_mps, tau_s, reach_m))))
-            for (c, name), mover in self.movers(number).items()
-        ]
+        found = self.dynamics.dynamic_objects(number)
+        speeds = np.array([one.unknown_mps for one in found.values()])
+        weights = dynamic_object_weights(speeds, np.array([tau_s]), reach_m).tolist()
+        lost = [(c, name, round(10.0 * (1.0 - w))) for (c, name), w in zip(found, weights, strict=True)]
         return frozenset(entry for entry in lost if entry[2] > 0)
 
-    def speeds(self, number: int) -> dict[ObjectName, float]:
-        """Speed of the objects of a scan that move by themselves [m/s]."""
-        others = higher_speeds(self.persistence.speeds(number), self.velocities.speeds(number))
-        return higher_speeds(self.moving.get(number, {}), others)
-
-    def movers(self, number: int) -> dict[ObjectName, Mover]:
-        """The objects of a scan that move by themselves."""
-        return {
-            name: Mover(speed, self.velocities.of(number, name))
-            for name, speed in self.speeds(number).items()
-        }
-
-    def restless(self) -> set[int]:
-        """Tracks of the objects that were judged to move in any of their latest sightings, how is not known.
-
-        While an object starts or stops, no line fits its places, and it may pass for one that stands.
-        """
-        numbers = {sighting.scan for seen in self.sightings.values() for sighting in seen}
-        speeds = {number: self.speeds(number) for number in numbers}
-        return {
-            track
-            for track, seen in self.sightings.items()
-            if any(speeds[sighting.scan].get(sighting.name, 0.0) > _RESTLESS_MPS for sighting in seen)
-            and self.velocities.of(seen[-1].scan, seen[-1].name) is None
-        }
-
-    def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, Mover]]:
+    def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, DynamicObject]]:
         """Tracks of the objects of some scans, and the moving ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}
-        movers: dict[ObjectId, Mover] = {}
+        dynamic: dict[ObjectId, DynamicObject] = {}
         for position, number in enumerate(numbers):
             tracks.update({(position, c, n): track for (c, n), track in self.tracks[number].items()})
-            movers.update({(position, c, n): mover for (c, n), mover in self.movers(number).items()})
-        return tracks, movers
+            found = self.dynamics.dynamic_objects(number)
+            dynamic.update({(position, c, n): one for (c, n), one in found.items()})
+        return tracks, dynamic
 
     def add_image(self, features: ImageFeatures) -> None:
         """Keep an image, with a number of its own, in the order of stamps.
@@ -314,7 +187,7 @@ class Window:
         """Forget all scans but the last few."""
         while len(self.scans) > last:
             self.scans.popleft()
-        self.persistence.forget(self.first_scan)
+        self.dynamics.occupancy.forget(self.first_scan)
 
     def stamps_ns(self) -> dict[int, int]:
         """Stamp of each scan by its number."""

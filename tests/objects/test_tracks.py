@@ -1,4 +1,4 @@
-"""Objects followed from scan to scan; those that move by themselves."""
+"""Objects tracked from scan to scan; dynamic ones."""
 
 from __future__ import annotations
 
@@ -11,13 +11,9 @@ import pytest
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import PinholeCamera
 from sst_graph.features.lidar_edges import Boundaries
-from sst_graph.objects.tracks import (
-    MovingConfig,
-    ObjectTracker,
-    moving_objects,
-    object_tracks,
-    standing_share,
-)
+from sst_graph.objects.dynamic_objects import dynamic_object_weights, find_dynamic_objects
+from sst_graph.objects.tracks import ObjectTracker, object_tracks, scan_poses
+from sst_graph.objects.velocity import ObjectVelocities
 from sst_graph.types import RelativeMotion, SemanticClass
 
 VEHICLE, POLE = SemanticClass.VEHICLE, SemanticClass.POLE
@@ -77,45 +73,52 @@ def slow(seconds: float) -> np.ndarray:
     return np.array([60.0 + SLOW_MPS * seconds, 8.0, 0.0])
 
 
-def mover(seconds: float) -> np.ndarray:
+def moving(seconds: float) -> np.ndarray:
     return np.array([20.0, 0.0, 0.0]) + seconds * np.array([6.0, -2.0, 0.0])
 
 
 def test_one_track_for_each_object() -> None:
-    made = drive(parked, wandering, mover)
+    made = drive(parked, wandering, moving)
     tracks = object_tracks(made)
     assert len(tracks) == 3 * SCANS
     numbers = [{tracks[k, VEHICLE, n] for k in range(SCANS)} for n in range(3)]
     assert all(len(found) == 1 for found in numbers) and len(set.union(*numbers)) == 3
 
 
-def test_a_mover_is_found_and_parked_vehicles_are_not() -> None:
-    made = drive(parked, wandering, mover)
-    found = moving_objects(made, object_tracks(made))
+def test_a_dynamic_object_is_found_and_parked_vehicles_are_not() -> None:
+    made = drive(parked, wandering, moving)
+    found = find_dynamic_objects(made, object_tracks(made))
     assert set(found) == {(k, VEHICLE, 2) for k in range(SCANS)}
-    assert min(mover.speed_mps for mover in found.values()) > np.hypot(6.0, 2.0) - 1e-6
+    assert min(one.speed_mps for one in found.values()) > np.hypot(6.0, 2.0) - 1e-6
     velocity = found[6, VEHICLE, 2].velocity
     assert velocity is not None and found[6, VEHICLE, 2].unknown_mps == velocity.sigma_mps < 0.2
     turned = gtsam.Rot3.Yaw(-6 * 0.02).rotate(np.array([6.0, -2.0, 0.0]))
     np.testing.assert_allclose(velocity.l_velocity, turned, atol=0.1)  # its outline turns with the LiDAR
 
 
-def test_a_mover_is_found_without_a_track() -> None:
+def test_a_dynamic_object_is_found_without_a_track() -> None:
     """Its points are not where they were, nor where they will be."""
-    made = drive(parked, mover)
+    made = drive(parked, moving)
     tracks = object_tracks(made)
-    assert {n for _, _, n in moving_objects(made, {key: tracks[key] for key in list(tracks)[:3]})} == {1}
-    assert {n for _, _, n in moving_objects(made, {})} == {1}
+    assert {n for _, _, n in find_dynamic_objects(made, {key: tracks[key] for key in list(tracks)[:3]})} == {
+        1
+    }
+    assert {n for _, _, n in find_dynamic_objects(made, {})} == {1}
 
 
 def test_a_slow_vehicle_is_found_by_its_track_alone() -> None:
-    """It overlaps with itself 0.3 s later; twelve centres in a line tell, or its near end."""
+    """Its place is still occupied 0.3 s later; twelve centres in a line show its motion, and so does its near
+    end."""
     made = drive(slow)
     tracks = object_tracks(made)
-    found = moving_objects(made, tracks)
-    assert [mover.speed_mps for mover in found.values()] == pytest.approx([SLOW_MPS] * SCANS, rel=0.02)
-    assert set(moving_objects(made, tracks, MovingConfig(min_sightings=SCANS + 1))) == set(found)
-    assert not moving_objects(made, {})
+    found = find_dynamic_objects(made, tracks)
+    assert [one.speed_mps for one in found.values()] == pytest.approx([SLOW_MPS] * SCANS, rel=0.02)
+    velocities = ObjectVelocities()
+    for k, (scan, wTl) in enumerate(zip(made.scans, scan_poses(made), strict=True)):
+        velocities.insert(k, scan, {(VEHICLE, 0): tracks[k, VEHICLE, 0]}, wTl)
+    velocities.update_all()
+    assert all(velocities.speeds(k) for k in range(SCANS))
+    assert not find_dynamic_objects(made, {})
 
 
 def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
@@ -132,18 +135,19 @@ def test_a_tracker_forgets_and_keeps_classes_apart() -> None:
     assert len(set(both.values())) == 2 and 2 in both.values()
 
 
-def test_a_mover_loses_its_weight_bit_by_bit() -> None:
+def test_the_weight_of_a_dynamic_object_falls_with_its_speed() -> None:
     """3 mm within the pair's interval halve it; a parked object keeps all of it, a fast one nothing."""
     speeds = np.linspace(0.0, 2.0, 201)
-    shares = np.array([standing_share(float(speed), 0.012, 0.003) for speed in speeds])
+    shares = dynamic_object_weights(speeds, np.full(201, 0.012), 0.003)
     # sqrt(12^2 + 5^2) ms = 13 ms.
-    assert shares[0] == 1.0 and standing_share(0.003 / 0.013, 0.012, 0.003) == pytest.approx(0.5)
+    assert shares[0] == 1.0
+    assert dynamic_object_weights(np.array([0.003 / 0.013]), np.array([0.012]), 0.003) == pytest.approx(0.5)
     assert (np.diff(shares) <= 0.0).all() and shares[-1] == 0.0
     # The one jump, where an object is left out, is small beside the whole.
     assert np.abs(np.diff(shares)).max() < 0.11
 
 
-def test_a_fast_mover_is_left_out_even_where_scan_and_image_meet() -> None:
+def test_a_fast_object_is_left_out_even_where_scan_and_image_meet() -> None:
     """How its outline follows the time offset is not known."""
-    assert standing_share(8.0, 0.0, 0.003) == 0.0
-    assert standing_share(0.0, 0.05, 0.003) == 1.0
+    weights = dynamic_object_weights(np.array([8.0, 0.0]), np.array([0.0, 0.05]), 0.003)
+    assert weights.tolist() == [0.0, 1.0]

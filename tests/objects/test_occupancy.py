@@ -10,7 +10,7 @@ import pytest
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries
-from sst_graph.objects.persistence import Persistence, PersistenceConfig
+from sst_graph.objects.occupancy import OccupancyTest
 from sst_graph.types import SemanticClass
 
 VEHICLE, BUILDING = SemanticClass.VEHICLE, SemanticClass.BUILDING
@@ -40,12 +40,12 @@ def pose(k: int, period_s: float) -> gtsam.Pose3:
 def seen(
     scans: int, *velocities: float, period_s: float = 0.1, c: SemanticClass = VEHICLE
 ) -> list[dict[int, float]]:
-    """Speeds that roofs of these velocities along x pass for [m/s], scan by scan."""
-    persistence = Persistence()
+    """Speeds that roofs of these velocities along x are assumed to have [m/s], scan by scan."""
+    test = OccupancyTest()
     for k in range(scans):
         corners = [np.array([15.0 + v * k * period_s, 6.0 * i - 9.0, 0.5]) for i, v in enumerate(velocities)]
-        persistence.add(k, scan(k, period_s, corners, c), pose(k, period_s))
-    return [{n: speed for (_, n), speed in persistence.speeds(k).items()} for k in range(scans)]
+        test.add(k, scan(k, period_s, corners, c), pose(k, period_s))
+    return [{n: speed for (_, n), speed in test.speeds(k).items()} for k in range(scans)]
 
 
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.15])
@@ -62,42 +62,42 @@ def test_slower_objects_overlap_with_themselves() -> None:
 
 
 def test_coming_into_view_and_leaving_is_not_motion() -> None:
-    persistence = Persistence()
+    test = OccupancyTest()
     for k in range(14):
         corner = [np.array([15.0, -4.0, 0.5])] if 4 <= k <= 8 else []
-        persistence.add(k, scan(k, 0.1, corner), pose(k, 0.1))
+        test.add(k, scan(k, 0.1, corner), pose(k, 0.1))
     # Each is found again on the side on which it was seen; the middle one nowhere 0.3 s away.
-    assert [bool(persistence.speeds(k)) for k in range(4, 9)] == [False, False, True, False, False]
+    assert [bool(test.speeds(k)) for k in range(4, 9)] == [False, False, True, False, False]
 
 
-@pytest.mark.parametrize(("speed", "told"), [(0.0, {4}), (12.0, set())])
-def test_later_scans_tell_what_was_not_known(speed: float, told: set[int]) -> None:
-    """What is new in scan 4 passes for moving; 0.3 s later the scans say otherwise of what stays."""
-    persistence = Persistence()
+@pytest.mark.parametrize(("speed", "changed"), [(0.0, {4}), (12.0, set())])
+def test_later_scans_change_the_decision(speed: float, changed: set[int]) -> None:
+    """What is new in scan 4 is found dynamic; 0.3 s later not, if it is static."""
+    test = OccupancyTest()
     for k in range(7):
         corners = [np.array([15.0 + 0.1 * k * speed, -4.0, 0.5])] if k >= 4 else []
-        assert persistence.add(k, scan(k, 0.1, corners), pose(k, 0.1)) == set()
-    assert persistence.speeds(4)
+        assert test.add(k, scan(k, 0.1, corners), pose(k, 0.1)) == set()
+    assert test.speeds(4)
     after = scan(7, 0.1, [np.array([15.0 + 0.7 * speed, -4.0, 0.5])])
-    assert persistence.add(7, after, pose(7, 0.1)) == told
-    assert bool(persistence.speeds(4)) == (speed > 0.0)
+    assert test.add(7, after, pose(7, 0.1)) == changed
+    assert bool(test.speeds(4)) == (speed > 0.0)
 
 
-def test_a_short_burst_tells_nothing() -> None:
+def test_a_few_scans_are_not_enough() -> None:
     assert seen(3, 12.0) == [{}] * 3
 
 
 def test_labels_that_go_do_not_take_the_object_along() -> None:
     """The roof is there still, as a building; the ground below a vehicle that left does not count."""
     for c, found in ((BUILDING, False), (SemanticClass.GROUND, True)):
-        persistence = Persistence()
+        test = OccupancyTest()
         for k in range(8):
             whole = scan(k, 0.1, [np.array([15.0, -4.0, 0.5])])
             if k % 2:
                 lPs = whole.boundaries[VEHICLE].lPs
                 whole = replace(whole, boundaries={}, lPs=lPs, classes=np.full(len(lPs), c, np.uint8))
-            persistence.add(k, whole, pose(k, 0.1))
-        assert bool(persistence.speeds(4)) == found
+            test.add(k, whole, pose(k, 0.1))
+        assert bool(test.speeds(4)) == found
 
 
 def test_what_cannot_move_is_left_alone() -> None:
@@ -107,20 +107,20 @@ def test_what_cannot_move_is_left_alone() -> None:
 
 
 def test_speeds_rise_as_less_is_found() -> None:
-    persistence = Persistence(PersistenceConfig())
+    test = OccupancyTest()
     shares = np.linspace(0.0, 1.0, 101)
     speeds = []
     for k, share in enumerate(shares):
-        persistence.shares[k] = {(VEHICLE, 0): np.array([1.0, share])}
-        speeds.append(persistence.speeds(k).get((VEHICLE, 0), 0.0))
+        test.shares[k] = {(VEHICLE, 0): np.array([1.0, share])}
+        speeds.append(test.speeds(k).get((VEHICLE, 0), 0.0))
     assert (np.diff(speeds) <= 0.0).all()
     assert speeds[20] == 30.0 and speeds[45] == pytest.approx(0.6) and speeds[60] == 0.0
 
 
 def test_nothing_is_kept_of_scans_long_gone() -> None:
-    persistence = Persistence()
+    test = OccupancyTest()
     for k in range(40):
-        persistence.forget(k - 10)
-        persistence.add(k, scan(k, 0.1, [np.array([15.0, -4.0, 0.5])]), pose(k, 0.1))
-    assert sorted(persistence.shares) == list(range(29, 40))
-    assert len(persistence._places) <= 6
+        test.forget(k - 10)
+        test.add(k, scan(k, 0.1, [np.array([15.0, -4.0, 0.5])]), pose(k, 0.1))
+    assert sorted(test.shares) == list(range(29, 40))
+    assert len(test._places) <= 6

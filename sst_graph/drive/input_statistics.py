@@ -1,4 +1,4 @@
-"""What the raw frames of a drive show before anything is assumed about them: sizes, the ground, repeats.
+"""Statistics of a drive's raw frames, before anything is assumed about them: sizes, the ground, repeats.
 
 Everything here is in the data's own units and axes, so that wrong units and wrong axes can be seen.
 """
@@ -20,7 +20,7 @@ from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 FloatArray = NDArray[np.float64]
 
 _SCANS, _IMAGES = 12, 12
-"""Scans whose geometry, and images whose contours are looked at, spread over the drive."""
+"""Scans and images with the expensive statistics (geometry, contours), spread over the drive."""
 _LEAST_POINTS = 200
 """Labelled points of the ground from which a plane is fitted."""
 _GROUND_TOLERANCE = 0.02
@@ -48,7 +48,7 @@ class Ground:
 
 
 @dataclass(frozen=True)
-class ScanFacts:
+class ScanStatistics:
     """Of a scan.
 
     Attributes:
@@ -57,7 +57,7 @@ class ScanFacts:
         sweep_s: between its first and last point [s]; 0 where the points carry no times.
         labelled: number of points by class.
         median_range: of all points.
-        ground: None where too few points are labelled so, or the scan is not one of the few looked at.
+        ground: None where too few points are labelled so, or the scan is not one of the chosen ones.
         vehicle_heights: (k,) from the ground to the top of its vehicles.
     """
 
@@ -71,7 +71,7 @@ class ScanFacts:
 
 
 @dataclass(frozen=True)
-class ImageFacts:
+class ImageStatistics:
     """Of an image.
 
     Attributes:
@@ -92,40 +92,40 @@ class ImageFacts:
 
 
 @dataclass(frozen=True)
-class Survey:
+class InputStatistics:
     """Of a whole drive, in the order of its scans and images."""
 
-    scans: tuple[ScanFacts, ...]
-    images: tuple[ImageFacts, ...]
+    scans: tuple[ScanStatistics, ...]
+    images: tuple[ImageStatistics, ...]
 
 
-class Surveyor:
-    """Looks at every frame once and keeps a few numbers of it.
+class StatisticsCollector:
+    """Input statistics, collected frame by frame.
 
     Args:
-        total: number of frames to come; the dearer looks are spread over them.
+        total: number of frames; the expensive statistics are computed of some, spread over the drive.
     """
 
     def __init__(self, total: int) -> None:
-        self._scans: list[ScanFacts] = []
-        self._images: list[ImageFacts] = []
+        self._scans: list[ScanStatistics] = []
+        self._images: list[ImageStatistics] = []
         self._every_scan, self._every_image = -(-total // _SCANS), -(-total // _IMAGES)
 
     def add(self, frame: Frame) -> None:
-        """Look at one frame, checked by :mod:`sst_graph.validation`."""
+        """Add one frame, checked by :mod:`sst_graph.validation`."""
         if frame.scan is not None:
             closely = len(self._scans) % self._every_scan == 0
-            self._scans.append(scan_facts(frame.index, frame.scan, closely))
+            self._scans.append(scan_statistics(frame.index, frame.scan, closely))
         if frame.image is not None:
             closely = len(self._images) % self._every_image == 0
-            self._images.append(image_facts(frame.index, frame.image, closely))
+            self._images.append(image_statistics(frame.index, frame.image, closely))
 
-    def survey(self) -> Survey:
-        return Survey(tuple(self._scans), tuple(self._images))
+    def statistics(self) -> InputStatistics:
+        return InputStatistics(tuple(self._scans), tuple(self._images))
 
 
-def scan_facts(index: int, scan: Scan, closely: bool = True) -> ScanFacts:
-    """Facts of a scan; the ground and the vehicles only where it is looked at closely."""
+def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatistics:
+    """Of a scan; the ground and the vehicles only with ``closely``."""
     points = np.asarray(scan.points, np.float64)
     ranges = np.linalg.norm(points, axis=1)
     median_range = float(np.median(ranges)) if len(ranges) else 0.0
@@ -140,11 +140,11 @@ def scan_facts(index: int, scan: Scan, closely: bool = True) -> ScanFacts:
         heights = _heights(points[member], instances, ground)
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
-    return ScanFacts(index, digest, sweep, labelled, median_range, ground, heights)
+    return ScanStatistics(index, digest, sweep, labelled, median_range, ground, heights)
 
 
-def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFacts:
-    """Facts of an image; the picture along the contours only where it is looked at closely."""
+def image_statistics(index: int, image: CameraImage, closely: bool = True) -> ImageStatistics:
+    """Of an image; the picture along the contours only with ``closely``."""
     labelled = _counts(image.mask)
     height, width = image.mask.shape
     # Sums of the places of each class's pixels: whole numbers below 2^53, which are exact.
@@ -152,7 +152,7 @@ def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFa
     rows = {c: float(places[c] / count // width) for c, count in labelled.items()}
     shows = image.has_picture and (_varies(image.pixels[::_FEW, ::_FEW]) or _varies(image.pixels))
     mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
-    return ImageFacts(
+    return ImageStatistics(
         index,
         zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
         mask_digest,
@@ -163,7 +163,7 @@ def image_facts(index: int, image: CameraImage, closely: bool = True) -> ImageFa
 
 
 _FEW = 16
-"""One of so many rows and columns tells of nearly every picture that it shows something."""
+"""One of so many rows and columns shows of nearly every picture that it is not of one colour."""
 
 
 def _varies(pixels: NDArray[np.uint8]) -> bool:
