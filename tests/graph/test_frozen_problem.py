@@ -14,7 +14,7 @@ from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph, state_from
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
-from sst_graph.graph.matching import DriveMatches, match_all, outlines_of
+from sst_graph.graph.matching import DriveMatches, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.objects.tracks import Mover, ObjectId, object_tracks
 from sst_graph.objects.velocity import ObjectVelocity
@@ -50,7 +50,7 @@ def moving(rolling: bool) -> Drive:
 
 def matched(drives: list[Drive], state: State, config: GraphConfig, by_object: bool) -> list[DriveMatches]:
     tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
-    return match_all(outlines_of(drives, tracks, config), state, KERNEL)
+    return match_all(edges_of(drives, tracks, config), state, KERNEL)
 
 
 def whole(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
@@ -186,7 +186,7 @@ def test_moving_objects_are_matched_where_they_are() -> None:
     fast = {name: Mover(8.0, ObjectVelocity(np.array([4.0, 1.0, 0.0]), 0.03)) for name in list(tracks)[::2]}
     slow: dict[ObjectId, Mover] = {name: Mover(0.06) for name in list(tracks)[1::2]}
     found = Tracks([drive]).seeing(tracks, fast | slow)
-    matches = match_all(outlines_of([drive], found, PLAIN), state, KERNEL)
+    matches = match_all(edges_of([drive], found, PLAIN), state, KERNEL)
     pairs = [pair for own in matches for pair in own.by_pair()]
     assert any(m.alignment.l_velocities is not None for pair in pairs for m in pair.matches.values())
     graph, values = joint_graph(pairs, state, PLAIN)
