@@ -133,11 +133,10 @@ def test_each_pose_has_the_matches_that_it_has_alone(scale_px: float) -> None:
 
 @pytest.mark.parametrize("scale_px", [15.0, 4.0])
 def test_normal_equations_are_the_graphs(scale_px: float) -> None:
-    """Of poses, offset and mask bias, where nothing moves: up to the contours' normals."""
-    drive, truth = prepared_street(), standing_street().truth.cTl
-    graph = GraphConfig(object_bias_sigma_px=0.0)
-    for degrees in ((0.0, 0.0, 0.0), (0.1, -0.2, 0.15)):
-        cTl = truth.compose(gtsam.Pose3(gtsam.Rot3.Expmap(np.radians(degrees)), np.zeros(3)))
+    """Of extrinsic and mask bias, on a straight contour, where all ways to its normal agree."""
+    drive, graph = left_edge(197.0)
+    for step in (np.zeros(6), np.array([0.01, -0.02, 0.015, 0.02, 0.03, -0.1])):
+        cTl = gtsam.Pose3.Expmap(step)
         found = equations(drive, graph, poses(cTl), scale_px)
         state = State(cTl)
         matches = match_all(edges_of([drive], Tracks([drive]), graph), state, kernel(scale_px))
@@ -153,15 +152,10 @@ def test_normal_equations_are_the_graphs(scale_px: float) -> None:
         # Without the weak priors: their means are the state.
         prior = [1.0, 1.0, 1.0, *[PRIOR_TRANSLATION_SIGMA_M**-2.0] * 3]
         expected = system.H - np.diag([*prior, graph.time_offset_sigma_s**-2.0, graph.bias_sigma_px**-2.0])
-        poses_and_bias = [*range(6), 7]
-        sigmas = 1.0 / np.sqrt(np.diag(expected)[poses_and_bias])
-        scale = np.outer(sigmas, sigmas)
-        some = np.ix_(poses_and_bias, poses_and_bias)
-        np.testing.assert_allclose(H[some] * scale, expected[some] * scale, atol=0.05)
-        size = np.abs(system.g[poses_and_bias] * sigmas).max()
-        np.testing.assert_allclose(
-            g[poses_and_bias] * sigmas / size, system.g[poses_and_bias] * sigmas / size, atol=0.1
-        )
+        some = np.ix_([*range(6), 7], [*range(6), 7])
+        assert np.abs(expected[some]).max() > 1.0
+        np.testing.assert_allclose(H[some], expected[some], atol=2e-3 * np.abs(expected[some]).max())
+        np.testing.assert_allclose(g, system.g, atol=2e-3 * np.abs(system.g).max())
 
 
 def _distances(alignment, cTl: gtsam.Pose3):  # type: ignore[no-untyped-def]
