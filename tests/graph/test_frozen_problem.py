@@ -171,11 +171,11 @@ def test_the_optimum_is_the_graphs() -> None:
     assert problem.step_sigmas(point, system) == pytest.approx(length, rel=1e-4)
 
 
-def test_a_belief_holds_the_extrinsic() -> None:
+def test_a_prior_holds_the_extrinsic() -> None:
     drive, state = moving(False), State(standing_street().truth.cTl, (0.0,))
     there = state.cTl.retract(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
-    belief = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
-    point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, belief=belief).optimum(20)
+    prior = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+    point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, prior=prior).optimum(20)
     np.testing.assert_allclose(point.cTl.matrix(), there.matrix(), atol=1e-4)
 
 
