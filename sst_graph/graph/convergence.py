@@ -1,7 +1,7 @@
 """When an outer loop of matching and solving ends.
 
-Matches that come and go in turn lead the estimate round in a circle, whose middle is the answer. So after
-some whole steps the steps are shortened, which leads there, and a short step ends the loop.
+Each outer iteration matches anew. Where matches come and go in turn the estimate goes round in a circle, and
+the answer is its middle. So after some whole steps the steps are shortened, and a short step ends the loop.
 """
 
 from __future__ import annotations

@@ -102,12 +102,12 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class _Images:
-    """The twists of all images that have matches, and what odometry says of them.
+    """The twists of all images that have matches, and their measurements by odometry.
 
     Attributes:
         keys: of the twists.
         twists: (f, 6) of the camera where the matches were made [rad/s, m/s].
-        l_twists, l_accelerations: (f, 6) of the LiDAR; 0 where no odometry tells them.
+        l_twists, l_accelerations: (f, 6) of the LiDAR; 0 without odometry.
         information: (f, 6, 6) inverse covariance of the camera's.
         clocks: (f,) column of the time offset.
         offsets_s: (f,) under which they were looked up [s].
@@ -188,7 +188,7 @@ class FrozenProblem:
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of all unknowns, as they stand in the normal equations, the twists last."""
+        """Of all unknowns, as in the normal equations, the twists last."""
         return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
 
     def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:

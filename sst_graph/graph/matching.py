@@ -1,6 +1,6 @@
 """From a state to matches: a drive's scans and images paired in true time, and matched all at once.
 
-What a scan shows stays the same from one association to the next: :class:`DriveEdges` gathers it once for
+What a scan shows stays the same from one outer iteration to the next: :class:`DriveEdges` gathers it once for
 a whole solution. What a state changes (the pairs, the motion between them, the pixels) is worked out for all
 pairs in the same arrays, for with the few hundred points of one pair a call costs more than what it does.
 """
@@ -51,8 +51,8 @@ from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-Movers = dict[tuple[SemanticClass, int], Mover]
-"""The moving objects of one scan, by class and number within the scan."""
+DynamicObjects = dict[tuple[SemanticClass, int], Mover]
+"""The dynamic objects of one scan, by class and number within the scan."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class PairMatches:
     Attributes:
         drive: number of the drive.
         pair: positions of scan and image.
-        l_twist: the LiDAR's twist at the image's instant, or None where no odometry tells it.
+        l_twist: the LiDAR's twist at the image's instant, or None without odometry.
         motion: the camera's, under the state that the matches were made at.
         matches: by class.
         tracks: for each class, the track (n,) of the object that each match lies on; empty where objects
@@ -147,12 +147,12 @@ class Tracks:
         self._tracks: list[TwistTrack | None] = [drive.lidar_track(growing) for drive in drives]
         self.objects: Sequence[Mapping[ObjectId, int]] | None = objects
         found = zip(drives, objects, strict=True) if objects is not None else ()
-        self._movers = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
+        self._dynamic = [_by_scan(moving_objects(drive, tracks)) for drive, tracks in found]
 
-    def seeing(self, objects: Mapping[ObjectId, int], movers: Mapping[ObjectId, Mover]) -> Tracks:
-        """The same twists of one drive, with other object tracks and moving objects."""
+    def with_objects(self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, Mover]) -> Tracks:
+        """The same twists of one drive, with other object tracks and dynamic objects."""
         other = Tracks([])
-        other._tracks, other.objects, other._movers = self._tracks, [objects], [_by_scan(movers)]
+        other._tracks, other.objects, other._dynamic = self._tracks, [objects], [_by_scan(dynamic)]
         return other
 
     def part(self, drive: int, scans: Sequence[int]) -> Tracks:
@@ -161,21 +161,21 @@ class Tracks:
         other._tracks = [self._tracks[drive]]
         if self.objects is not None:
             other.objects = [tracks_of_scans(self.objects[drive], scans)]
-            moving = self._movers[drive]
-            other._movers = [{place[scan]: own for scan, own in moving.items() if scan in place}]
+            moving = self._dynamic[drive]
+            other._dynamic = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
-    def movers(self, drive: int, scan: int) -> Movers:
-        """The moving objects of a scan."""
-        return self._movers[drive].get(scan, {}) if self._movers else {}
+    def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
+        """The dynamic objects of a scan."""
+        return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
-        """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
+        """The LiDAR's twist at a stamp of its clock, or None without odometry."""
         track = self._tracks[drive]
         return None if track is None else track.at(stamp_ns)
 
     def at_all(self, drive: int, stamps_ns: Sequence[int]) -> TwistSamples | None:
-        """The LiDAR's twists at stamps of its clock, or None where no odometry tells them."""
+        """The LiDAR's twists at stamps of its clock, or None without odometry."""
         track = self._tracks[drive]
         return None if track is None else track.at_all(stamps_ns)
 
@@ -191,7 +191,7 @@ class DriveEdges:
         scans, classes: scan and class of each group, the scans rising.
         points, owners, bounds: as in :class:`~sst_graph.association.edge_matching.PairedEdges`.
         own_tracks: (n,) track of the object of each point, or None where objects have no biases.
-        unknown_mps: (n,) how much of the motion of each point's object is not known, or None where all stand.
+        unknown_mps: (n,) speed of each point's object that is not known, or None where all are static.
         velocities: (n, 3) of each point's object over ground, in the LiDAR frame, or None where none is known
             to move [m/s].
     """
@@ -230,7 +230,9 @@ class DriveEdges:
                     for k, c, points in groups
                 ]
             )
-        unknown_mps, velocities = _own_motion([(tracks.movers(number, k), c, b) for k, c, b in groups])
+        unknown_mps, velocities = _own_motion(
+            [(tracks.dynamic_objects(number, k), c, b) for k, c, b in groups]
+        )
         return cls(
             number,
             drive,
@@ -350,8 +352,8 @@ class _Motions:
 
     Attributes:
         of_images: the camera's.
-        l_twists: the LiDAR's, or None where no odometry tells them.
-        measured: (p, 6) the LiDAR's as measured; zeros where no odometry tells it [rad/s, m/s].
+        l_twists: the LiDAR's, or None without odometry.
+        measured: (p, 6) the LiDAR's as measured; zeros without odometry [rad/s, m/s].
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
@@ -530,14 +532,14 @@ class DriveMatches:
 
 
 def _own_motion(
-    groups: Sequence[tuple[Movers, SemanticClass, Boundaries]],
+    groups: Sequence[tuple[DynamicObjects, SemanticClass, Boundaries]],
 ) -> tuple[FloatArray | None, FloatArray | None]:
     """How much of the motion of each point's object is not known (n,), and its velocity (n, 3); None where no
     object moves."""
     unknown = [np.zeros(len(points)) for _, _, points in groups]
     velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
-    for (movers, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
-        for (other, n), mover in movers.items():
+    for (dynamic, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
+        for (other, n), mover in dynamic.items():
             if other == c:
                 own = points.objects == n
                 slow[own] = mover.unknown_mps
@@ -567,8 +569,8 @@ def associate(
     return [pair for matches in found for pair in matches.by_pair()]
 
 
-def _by_scan(movers: Mapping[ObjectId, Mover]) -> dict[int, Movers]:
-    found: dict[int, Movers] = {}
-    for (scan, c, n), mover in movers.items():
+def _by_scan(dynamic: Mapping[ObjectId, Mover]) -> dict[int, DynamicObjects]:
+    found: dict[int, DynamicObjects] = {}
+    for (scan, c, n), mover in dynamic.items():
         found.setdefault(scan, {})[c, n] = mover
     return found

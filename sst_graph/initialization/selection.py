@@ -91,7 +91,7 @@ def select_start_steps(
         most_candidates: that are refined; by default more without a guess.
 
     Raises:
-        EstimationError: no candidate leads anywhere.
+        EstimationError: no candidate leads to a solution near the guess.
     """
     candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
@@ -112,7 +112,7 @@ def select_among_steps(
     """Refine candidates; the solution that the labels agree with most is the first of the selection.
 
     Raises:
-        EstimationError: no candidate leads anywhere.
+        EstimationError: no candidate leads to a solution near the guess.
     """
     # 1. All candidates under wide kernels, on some of the points.
     few = [_thinned(drive, most_scans) for drive in problem.drives]

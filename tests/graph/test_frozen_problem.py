@@ -185,7 +185,7 @@ def test_moving_objects_are_matched_where_they_are() -> None:
     tracks = object_tracks(drive)
     fast = {name: Mover(8.0, ObjectVelocity(np.array([4.0, 1.0, 0.0]), 0.03)) for name in list(tracks)[::2]}
     slow: dict[ObjectId, Mover] = {name: Mover(0.06) for name in list(tracks)[1::2]}
-    found = Tracks([drive]).seeing(tracks, fast | slow)
+    found = Tracks([drive]).with_objects(tracks, fast | slow)
     matches = match_all(edges_of([drive], found, PLAIN), state, KERNEL)
     pairs = [pair for own in matches for pair in own.by_pair()]
     assert any(m.alignment.l_velocities is not None for pair in pairs for m in pair.matches.values())

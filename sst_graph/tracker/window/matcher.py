@@ -230,7 +230,7 @@ class WindowMatcher:
             self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
         twists = self._twists[1]
         return (
-            twists.seeing(*self.window.objects_of(numbers))
+            twists.with_objects(*self.window.objects_of(numbers))
             if self.graph.object_bias_sigma_px > 0.0
             else twists
         )
