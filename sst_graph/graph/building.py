@@ -126,7 +126,7 @@ def silhouettes_factor(
 def motion_factor(
     pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, offset_s: float
 ) -> gtsam.NonlinearFactor:
-    """The LiDAR odometry's measurement of the twist at a pair's image; a wide prior around 0 without odometry.
+    """The LiDAR odometry's measurement of the twist at a pair's image; without odometry a wide prior.
 
     Args:
         cTl, offset_s: that the matches were made at.
