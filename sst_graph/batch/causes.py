@@ -73,10 +73,9 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
         tracks = Tracks([drive])
         few = [replace(drive, scans=drive.scans[::step])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
-        most = None if guess is None else _CANDIDATES
         search = StartProblem(few, tracks, config.classes, guess, offset_s)
         try:
-            selection = whole(select_start_steps(search, joint.graph, config.start, _SCANS, most))
+            selection = whole(select_start_steps(search, joint.graph, config.start, _SCANS, _CANDIDATES))
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
             problem = JointProblem(few, tracks, joint, search.centre(start))

@@ -31,6 +31,7 @@ from sst_graph.stepwise import Stepwise
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+_Start = tuple[gtsam.Pose3, float]
 
 SELECTION_SCANS = 10
 """Most scans of each drive that candidates are compared on."""
@@ -57,6 +58,10 @@ _STILL_ALIKE = 3.0
 """While kernels are wide, candidates count as one at this many times the distance."""
 _SAME_RAD = float(np.radians(2.0))
 """Solutions closer than this are one [rad]."""
+_FAR_RAD = float(np.radians(20.0))
+"""A search around one pose finds those that are closer than this [rad]."""
+_DISTANT = 3
+"""Most poses that the second search looks around."""
 REACH = 1.25
 """Solutions may lie this many times as far from the guess as was searched, along each axis; without a guess,
 in all."""
@@ -69,10 +74,12 @@ class Selection:
     Attributes:
         starts: (cTl, offset [s]) of the best supported solutions, no two alike; the best first, then one
             that is nearly as good and not near it, where there is one.
+        distant: the best, and those nearly as good that are far from it and from each other.
         score: of the search's best candidate.
     """
 
-    starts: tuple[tuple[gtsam.Pose3, float], ...]
+    starts: tuple[_Start, ...]
+    distant: tuple[_Start, ...]
     score: float
 
 
@@ -81,25 +88,33 @@ def select_start_steps(
     graph: GraphConfig,
     config: StartConfig,
     most_scans: int = SELECTION_SCANS,
-    most_candidates: int | None = None,
+    most_candidates: int = _CANDIDATES,
 ) -> Stepwise[Selection]:
     """Search candidates for a start, refine them and select the best.
+
+    Without a guess a second search looks more closely around the best that are far from each other.
 
     Args:
         graph: noise and priors of the matches.
         most_scans: scans of each drive that candidates are compared on.
-        most_candidates: that are refined; by default more without a guess.
+        most_candidates: that are refined of a search around a guess.
 
     Raises:
         EstimationError: no candidate leads to a solution near the guess.
     """
     candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
-        return Selection(((candidates[0].cTl, candidates[0].offset_s),), candidates[0].score)
-    if most_candidates is None:
-        most_candidates = _CANDIDATES if problem.guess is not None else _CANDIDATES_WITHOUT_GUESS
-    candidates = candidates[:most_candidates]
-    return (yield from select_among_steps(problem, candidates, graph, config.search, most_scans))
+        start = ((candidates[0].cTl, candidates[0].offset_s),)
+        return Selection(start, start, candidates[0].score)
+    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
+    selection = yield from select_among_steps(problem, candidates, graph, config.search, most_scans)
+    if problem.guess is not None:
+        return selection
+    closer = []
+    for cTl, offset_s in selection.distant:
+        around = yield from candidate_steps(replace(problem, guess=cTl), config)
+        closer += [Candidate(cTl, offset_s, selection.score), *around[:most_candidates]]
+    return (yield from select_among_steps(problem, closer, graph, config.search, most_scans))
 
 
 def select_among_steps(
@@ -136,7 +151,10 @@ def select_among_steps(
     order = _different(poses, scores)
     if scores[order[0]] <= 0.0:
         raise EstimationError("no candidate of the search leads to a solution near the guess")
-    return Selection(_selected(poses.take(order), scores[order]), candidates[0].score)
+    poses, scores = poses.take(order), scores[order]
+    good = scores > _SELECTED_RATIO * scores[0]
+    starts = list(zip(_cTls(poses.take(np.flatnonzero(good))), poses.offsets[good].tolist(), strict=True))
+    return Selection(_with_alternative(starts, scores[good]), _far_apart(starts), candidates[0].score)
 
 
 def alternatives(solutions: Sequence[JointSolution]) -> list[JointSolution]:
@@ -150,15 +168,22 @@ def alternatives(solutions: Sequence[JointSolution]) -> list[JointSolution]:
     return [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
 
 
-def _selected(poses: Poses, scores: FloatArray) -> tuple[tuple[gtsam.Pose3, float], ...]:
-    """The first of some poses, best first, that are nearly as good, with an alternative to the best."""
-    good = poses.take(np.flatnonzero(scores > _SELECTED_RATIO * scores[0]))
-    starts = list(zip(_cTls(good), good.offsets.tolist(), strict=True))
+def _with_alternative(starts: Sequence[_Start], scores: FloatArray) -> tuple[_Start, ...]:
+    """The first of some starts, best first, after the best one an alternative to it, where there is one."""
     for number, (cTl, _) in enumerate(starts):
         if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(starts[0][0], cTl) > _SAME_RAD:
-            starts.insert(1, starts.pop(number))
-            return tuple(starts[: _SELECTED + 1])
+            others = [start for other, start in enumerate(starts) if other not in (0, number)]
+            return (starts[0], starts[number], *others[: _SELECTED - 1])
     return tuple(starts[:_SELECTED])
+
+
+def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
+    """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
+    chosen: list[_Start] = []
+    for cTl, offset_s in starts:
+        if all(_turn_rad(cTl, other) > _FAR_RAD for other, _ in chosen):
+            chosen.append((cTl, offset_s))
+    return tuple(chosen[:_DISTANT])
 
 
 def _alike(one: State, other: State) -> bool:

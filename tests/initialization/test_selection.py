@@ -34,7 +34,8 @@ from sst_graph.initialization.selection import (
     _WIDE_STAGES,
     Selection,
     _different,
-    _selected,
+    _far_apart,
+    _with_alternative,
     select_among_steps,
     select_start_steps,
 )
@@ -101,13 +102,19 @@ def test_the_truth_agrees_best() -> None:
 
 def test_the_best_start_comes_first_then_its_alternative() -> None:
     """An alternative is turned by more than 2 degrees and has 90 % of the score."""
-    poses = poses_of([turned(0.0, 0.0, a) for a in (0.0, 1.0, 5.0, 9.0)], [0.0, 0.1, 0.2, 0.3])
+    starts = [(turned(0.0, 0.0, a), 0.1 * k) for k, a in enumerate((0.0, 1.0, 5.0, 9.0))]
     for scores, chosen in (
-        ([10.0, 9.8, 9.5, 9.3], [0.0, 0.2, 0.1]),
-        ([10.0, 9.8, 8.0, 7.5], [0.0, 0.1]),
-        ([10.0, 6.0, 5.0, 1.0], [0.0]),
+        ([10.0, 9.8, 9.5, 9.3], [0, 2, 1]),
+        ([10.0, 9.8, 8.0, 7.5], [0, 1]),
+        ([10.0], [0]),
     ):
-        assert [offset_s for _, offset_s in _selected(poses, np.array(scores))] == chosen
+        some = starts[: len(scores)]
+        assert _with_alternative(some, np.array(scores)) == tuple(starts[k] for k in chosen)
+
+
+def test_distant_starts_are_far_apart_and_the_best_comes_first() -> None:
+    starts = [(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0, 170.0)]
+    assert [round(off_deg(cTl)) for cTl, _ in _far_apart(starts)] == [0, 60, 120]
 
 
 def test_the_right_one_of_three_is_selected() -> None:
