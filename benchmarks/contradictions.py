@@ -22,9 +22,8 @@ from sst_graph.batch.contradictions import Contradictions, find_contradictions
 from sst_graph.batch.parts import Parts
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, JointProblem, solve_joint
 from sst_graph.graph.state import State
-from sst_graph.initialization.selection import narrowed
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Frame, Source
@@ -100,13 +99,11 @@ def clock_set(frames: Sequence[Frame], first: int, milliseconds: float) -> list[
 def contradictions_of(source: Source, start: State) -> Contradictions:
     """What the default settings find in a drive, its joint solution sought from ``start``."""
     config = CalibrationConfig()
-    joint = replace(
-        narrowed(config.joint), graph=replace(config.joint.graph, undersides=tuple(config.classes))
-    )
+    joint = replace(config.joint, graph=replace(config.joint.graph, undersides=tuple(config.classes)))
     drives = prepare_drives([source], config)
     objects = [object_tracks(drive) for drive in drives]
     tracks = Tracks(drives, objects)
-    solution = solve_joint(drives, start, joint, tracks=tracks)
+    solution = solve_joint(JointProblem(drives, tracks, joint), start, NARROW_KERNELS_PX)
     parts = Parts(drives, tracks, objects, solution.state, joint, config.assumptions)
     return find_contradictions(parts, config.contradictions)
 

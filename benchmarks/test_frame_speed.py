@@ -35,7 +35,7 @@ def view() -> ClassView:
     depths = rng.uniform(8.0, 40.0, POINTS)
     cPs = np.column_stack([(pixels - [CAMERA.cx, CAMERA.cy]) / [CAMERA.fx, CAMERA.fy], np.ones(POINTS)])
     found = ClassView.of(
-        CAMERA, cPs * depths[:, None], 0.0, mask, VEHICLE, PIXELS / int((mask > 0).sum()), rng
+        CAMERA, cPs * depths[:, None], 0.0, mask == VEHICLE, PIXELS / int((mask > 0).sum()), rng
     )
     assert found is not None and len(found.pixels) == PIXELS
     return found

@@ -1,4 +1,10 @@
-"""Matches between a scan's boundary points and an image's mask contours."""
+"""Matches between boundary points of scans and mask contours of images.
+
+:func:`match_edges` matches the points of many scans under one pose, as the graph needs them: exact motion,
+objects that move, deviations from assumptions. :mod:`~sst_graph.initialization.pose_batch` matches a few
+points of the same scans under hundreds of poses. The two project differently, for there the projection is
+what costs; what makes a match, its sigma and its weight are the functions at the end of this file for both.
+"""
 
 from __future__ import annotations
 
@@ -24,6 +30,7 @@ from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 _OUTWARD, _LEAST_STRETCH = 0.01, 0.1
 """A pixel this share farther from the principal point must come to lie farther out by this part of it."""
@@ -45,19 +52,23 @@ class MatchConfig(Settings):
         side_sigma_px: error that all matches on one side of one object in one image share [px]; it
             bounds what a side may claim, however many points it has.
         underside_sigma_px: the same of an object's edge towards the ground [px].
-        gate: farthest match, in units of the kernel's scale.
-        min_cosine: least agreement between the contour's normal and the way out of the object.
-        min_object_share: an object of whose boundary in view less than this share finds a match is left out.
         top_edges: use boundaries towards the ring above.
     """
 
     mask_sigma_px: float = setting(1.0, at_least=0.01, at_most=100.0)
     side_sigma_px: float = setting(0.7, at_least=0.0, at_most=100.0)
     underside_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
-    gate: float = setting(3.0, at_least=0.1, at_most=100.0)
-    min_cosine: float = setting(0.5, at_least=0.0, less_than=1.0)
-    min_object_share: float = setting(0.1, at_least=0.0, at_most=1.0)
     top_edges: bool = True
+
+
+GATE = 3.0
+"""Farthest match, in units of the kernel's scale: there the Geman-McClure weight is 1 %."""
+_MIN_COSINE = 0.5
+"""Least cosine between the contour's normal and the way out of the object: 60 degrees apart, an edge is
+another one."""
+MIN_OBJECT_SHARE = 0.1
+"""An object of whose boundary in view less than this share finds a match is left out: one that the image's
+labels miss crosses the contours of others here and there."""
 
 
 @dataclass(frozen=True)
@@ -106,8 +117,8 @@ class SilhouetteMatches:
 
 
 @dataclass(frozen=True)
-class Facing:
-    """Boundary points of one camera's scans and the contours that they are matched to, group by group.
+class PairedEdges:
+    """Boundary points of scans and the contours that they are matched to, all of one camera, by groups.
 
     A group is what one scan shows of one class, and the image that it is compared with.
 
@@ -121,7 +132,7 @@ class Facing:
         base_taus_s: (n,) stamp of the image minus the time of the point [s].
         biases_px: (g,) mask bias of each group's class [px].
         velocities: (n, 3) velocity over ground of each point's object, in the LiDAR frame, or None where all
-            stand [m/s].
+            are static [m/s].
     """
 
     camera: PinholeCamera
@@ -134,9 +145,9 @@ class Facing:
     biases_px: FloatArray
     velocities: FloatArray | None = None
 
-    def take(self, index: IntArray) -> Facing:
+    def take(self, index: IntArray) -> PairedEdges:
         """Some of the points, by position, rising; no group is lost."""
-        return Facing(
+        return PairedEdges(
             self.camera,
             self.points.take(index),
             self.owners[index],
@@ -192,8 +203,8 @@ class Facing:
 
 
 @dataclass(frozen=True)
-class FacingMatches:
-    """What :func:`match_facing` found.
+class EdgeMatches:
+    """Matches of some :class:`PairedEdges`.
 
     Attributes:
         index: (m,) which of the points, rising.
@@ -210,52 +221,64 @@ class FacingMatches:
     seen: IntArray
 
 
+@dataclass(frozen=True)
+class ScanWithImage:
+    """One scan's boundary points and the image that they are compared with.
+
+    Attributes:
+        boundaries, contours: by class.
+        camera: of the image.
+        base_tau_s: stamp of the image minus that of the scan [s].
+        motion: the camera's around the image.
+        velocities: (n, 3) velocity over ground of each boundary point's object, in the LiDAR frame [m/s], of
+            the classes in which some move.
+    """
+
+    boundaries: Mapping[SemanticClass, Boundaries]
+    contours: Mapping[SemanticClass, ContourMap]
+    camera: PinholeCamera
+    base_tau_s: float
+    motion: Motion
+    velocities: Mapping[SemanticClass, FloatArray] | None = None
+
+
 def match_silhouettes(
-    boundaries: Mapping[SemanticClass, Boundaries],
-    contours: Mapping[SemanticClass, ContourMap],
-    camera: PinholeCamera,
+    pair: ScanWithImage,
     cTl: gtsam.Pose3,
     offset_s: float,
-    base_tau_s: float,
-    motion: Motion,
     biases_px: Mapping[SemanticClass, float],
     kernel: RobustKernel,
     config: MatchConfig,
-    velocities: Mapping[SemanticClass, FloatArray] | None = None,
-    deviation: PointDeviation | None = None,
 ) -> dict[SemanticClass, SilhouetteMatches]:
-    """:func:`match_facing` of one scan and one image, by class.
+    """:func:`match_edges` of one scan and one image, by class.
 
     Args:
-        velocities: (n, 3) velocity over ground of each boundary point's object, in the LiDAR frame [m/s], of
-            the classes in which some move.
-        deviation: of the points and pixels from what is assumed of them; the matched pixels are then those
-            of the ideal camera.
+        biases_px: mask biases; 0 where one is missing.
     """
-    classes = [c for c in boundaries if c in contours]
+    classes = [c for c in pair.boundaries if c in pair.contours]
     if not classes:
         return {}
-    parts = [boundaries[c] for c in classes]
+    parts = [pair.boundaries[c] for c in classes]
     points, counts = joined(parts), [len(part) for part in parts]
     bounds = np.cumsum([0, *counts])
     moving = None
-    if velocities:
-        still = np.zeros((len(points), 3))
+    if pair.velocities:
+        static, known = np.zeros((len(points), 3)), pair.velocities
         moving = np.concatenate(
-            [velocities.get(c, still[a:b]) for c, (a, b) in zip(classes, pairwise(bounds), strict=True)]
+            [known.get(c, static[a:b]) for c, (a, b) in zip(classes, pairwise(bounds), strict=True)]
         )
-    facing = Facing(
-        camera,
+    paired = PairedEdges(
+        pair.camera,
         points,
         numbered_through([part.objects for part in parts]),
         bounds,
-        [contours[c] for c in classes],
-        [motion] * len(classes),
-        base_tau_s - points.offsets_s,
+        [pair.contours[c] for c in classes],
+        [pair.motion] * len(classes),
+        pair.base_tau_s - points.offsets_s,
         np.array([biases_px.get(c, 0.0) for c in classes]),
         moving,
     )
-    found = match_facing(facing, cTl, offset_s, kernel, config, deviation)
+    found = match_edges(paired, cTl, offset_s, kernel, config)
     return {
         c: SilhouetteMatches(
             found.alignment if b - a == len(found.index) else found.alignment.take(np.arange(a, b)),
@@ -279,87 +302,86 @@ def numbered_through(objects: Sequence[IntArray]) -> IntArray:
     )
 
 
-def match_facing(
-    facing: Facing,
+def match_edges(
+    paired: PairedEdges,
     cTl: gtsam.Pose3,
     offset_s: float,
     kernel: RobustKernel,
     config: MatchConfig,
     deviation: PointDeviation | None = None,
-) -> FacingMatches:
+) -> EdgeMatches:
     """Each boundary point's nearest contour at the current estimate, where the two face the same way.
 
-    The kernel's scale is in pixels here; matches farther than ``gate`` times it are left out.
+    Args:
+        kernel: its scale is in pixels here; matches farther than :data:`GATE` times it are left out.
+        deviation: of the points and pixels from what is assumed of them; the matched pixels are then those
+            of the ideal camera.
     """
     # 1. The points in their images.
-    uvs, shift = facing.projected(facing.points.lPs, cTl, offset_s), None
+    uvs, shift = paired.projected(paired.points.lPs, cTl, offset_s), None
     if deviation is not None:
-        facing = _deviated(facing, deviation, uvs)
-        ideal = facing.projected(facing.points.lPs, cTl, offset_s)
-        shift = _pixel_shift(deviation, facing, ideal)
+        paired = _deviated(paired, deviation, uvs)
+        ideal = paired.projected(paired.points.lPs, cTl, offset_s)
+        shift = _pixel_shift(deviation, paired, ideal)
         uvs = ideal + shift
-    used = facing.camera.in_image(uvs) & (config.top_edges | (facing.points.edges != Edge.TOP))
+    used = paired.camera.in_image(uvs) & (config.top_edges | (paired.points.edges != Edge.TOP))
     index = np.flatnonzero(used)
-    facing, uvs = facing.take(index), uvs[index]
-    seen = np.diff(facing.bounds)
+    paired, uvs = paired.take(index), uvs[index]
+    seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
     # 2. The nearest contours that are near.
-    feet = nearest_contours(facing.contours, facing.spans, uvs)
-    residuals = feet.distances + facing.repeated(facing.biases_px)
-    near = np.flatnonzero(feet.valid & (np.abs(residuals) < config.gate * kernel.scale))
-    owners_seen = np.bincount(facing.owners)
-    facing, uvs, index = facing.take(near), uvs[near], index[near]
+    feet = nearest_contours(paired.contours, paired.spans, uvs)
+    residuals = feet.distances + paired.repeated(paired.biases_px)
+    near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
+    paired, uvs, index = paired.take(near), uvs[near], index[near]
     normals, pixels = feet.normals[near], feet.feet[near]
     # 3. Those that face the way out of the object.
-    beyond = facing.projected(facing.points.outward, cTl, offset_s)
+    beyond = paired.projected(paired.points.outward, cTl, offset_s)
     if shift is not None and deviation is not None:
         shift = shift[index]
-        beyond = beyond + _pixel_shift(deviation.take(index), facing, beyond)
+        beyond = beyond + _pixel_shift(deviation.take(index), paired, beyond)
         pixels = pixels - shift
     way = beyond - uvs
     length = np.linalg.norm(way, axis=1)
     way = way / np.maximum(length, 1e-9)[:, None]
     cosine = (way * normals).sum(axis=1)
-    ok = cosine > config.min_cosine
-    # 4. Enough of the boundary of the object meets a contour: one that the image's labels miss crosses the
-    # contours of others here and there.
-    meets = np.bincount(facing.owners, ok, len(owners_seen))
-    on = np.flatnonzero(ok & (meets >= config.min_object_share * owners_seen)[facing.owners])
-    facing, index = facing.take(on), index[on]
-    sigmas = np.hypot(config.mask_sigma_px, 0.5 * length[on] * cosine[on] / np.sqrt(3.0))
-    sides = SIDE_OF[facing.points.edges, (way[on, 0] > 0).astype(np.intp)]
+    # 4. Of objects of which enough meets a contour.
+    on = np.flatnonzero(of_matched_objects(faces(cosine), paired.owners, objects_seen, MIN_OBJECT_SHARE))
+    paired, index = paired.take(on), index[on]
+    sigmas = match_sigmas(length[on], cosine[on], config)
+    sides = sides_of(paired.points.edges, way[on, 0])
     alignment = Alignment(
-        camera=facing.camera,
-        lPs=facing.points.lPs,
-        base_taus_s=facing.base_taus_s,
+        camera=paired.camera,
+        lPs=paired.points.lPs,
+        base_taus_s=paired.base_taus_s,
         pixels=pixels[on],
         sigmas_px=sigmas,
         normals=normals[on],
         kernel=kernel,
-        c_acceleration=facing.accelerations(),
-        weights=_shared_weights(facing.owners, sides, sigmas, config),
-        l_velocities=facing.velocities,
+        c_acceleration=paired.accelerations(),
+        weights=side_weights(paired.owners, sides, sigmas, config),
+        l_velocities=paired.velocities,
     )
-    return FacingMatches(index, sides, alignment, facing.bounds, seen)
+    return EdgeMatches(index, sides, alignment, paired.bounds, seen)
 
 
-def _deviated(facing: Facing, deviation: PointDeviation, uvs: FloatArray) -> Facing:
+def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -> PairedEdges:
     """The points where they are, and their intervals."""
-    points, base_taus_s = facing.points, facing.base_taus_s
+    points, base_taus_s = paired.points, paired.base_taus_s
     effect = deviation.effect(points.lPs, points.offsets_s, uvs)
     if effect.l_shift is not None:
         points = replace(points, lPs=points.lPs + effect.l_shift, outward=points.outward + effect.l_shift)
     if effect.time_s is not None:
         base_taus_s = base_taus_s + effect.time_s
-    return replace(facing, points=points, base_taus_s=base_taus_s)
+    return replace(paired, points=points, base_taus_s=base_taus_s)
 
 
-def _pixel_shift(deviation: PointDeviation, facing: Facing, uvs: FloatArray) -> FloatArray:
+def _pixel_shift(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> FloatArray:
     """(n, 2) by how much the pixels of points lie beside the ideal ones ``uvs`` [px].
 
     NaN where the picture would fold over: beyond the radius at which a polynomial lens turns back, points
     far outside the view come to lie inside the image.
     """
-    points = facing.points
+    points = paired.points
     shift = deviation.effect(points.lPs, points.offsets_s, uvs).pixel_shift
     if shift is None:
         return np.zeros_like(uvs)
@@ -371,9 +393,37 @@ def _pixel_shift(deviation: PointDeviation, facing: Facing, uvs: FloatArray) -> 
     return np.where(folded[:, None], np.nan, shift)
 
 
-def _shared_weights(
-    owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig
-) -> FloatArray:
+def faces(cosines: FloatArray) -> BoolArray:
+    """Whether contours face the way out of the objects, from the cosines of the angles between the two."""
+    return cosines > _MIN_COSINE
+
+
+def of_matched_objects(
+    matched: BoolArray, owners: IntArray, objects_seen: IntArray, min_share: float
+) -> BoolArray:
+    """(n,) the matches of the objects of which at least a share meets a contour.
+
+    Args:
+        matched: (n,) whether a point meets one.
+        owners: (n,) number of its object.
+        objects_seen: by object, its points in the image.
+    """
+    meets = np.bincount(owners, matched, len(objects_seen))
+    return np.asarray(matched & (meets >= min_share * objects_seen)[owners])
+
+
+def match_sigmas(lengths_px: FloatArray, cosines: FloatArray, config: MatchConfig) -> FloatArray:
+    """(n,) deviation of matches [px]: the mask's, and uniform over half the step to the beam beyond the edge,
+    across the contour."""
+    return np.asarray(np.hypot(config.mask_sigma_px, 0.5 * lengths_px * cosines / np.sqrt(3.0)))
+
+
+def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
+    """(n,) 0 left, 1 right, 2 top, 3 bottom, by kind of edge and horizontal part of the way out."""
+    return np.asarray(SIDE_OF[edges, (to_the_right > 0.0).astype(np.intp)])
+
+
+def side_weights(owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
     sigma^2 / n."""
     shared_px = np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px)

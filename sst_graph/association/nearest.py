@@ -14,9 +14,11 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
 from sst_graph.factors import Alignment, MotionModel, PinholeCamera, move_points
-from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
+
+_MOTION_MODEL: MotionModel = "translation"
+"""The paper's: points move by v times the interval (:mod:`sst_graph.factors.motion`)."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,13 @@ class NearestPixels:
     index: NDArray[np.int32]
 
     @classmethod
-    def of(cls, mask: NDArray[np.uint8], semantic_class: SemanticClass) -> NearestPixels | None:
-        """The map of a class in a mask (h, w), or None where the mask shows none of it."""
-        outside = mask != semantic_class
+    def of(cls, shown: NDArray[np.bool_]) -> NearestPixels | None:
+        """The map of the pixels (h, w) that show a class, or None where there is none."""
+        outside = ~shown
         if outside.all():
             return None
         rows, columns = distance_transform_edt(outside, return_distances=False, return_indices=True)
-        return cls(np.asarray(rows * np.int32(mask.shape[1]) + columns, dtype=np.int32))
+        return cls(np.asarray(rows * np.int32(shown.shape[1]) + columns, dtype=np.int32))
 
     def at(self, uvs: FloatArray) -> FloatArray:
         """(n, 2) centre of the class's pixel nearest to the pixel that each of uvs (n, 2) lies in [px].
@@ -56,11 +58,9 @@ def nearest_points(uvs: FloatArray, pixels: FloatArray) -> NDArray[np.intp]:
     return np.asarray(tree.query(pixels)[1], dtype=np.intp)
 
 
-def sample_pixels(
-    mask: NDArray[np.uint8], semantic_class: SemanticClass, share: float, rng: np.random.Generator
-) -> FloatArray:
-    """(m, 2) a random share of a class's pixels in a mask (h, w), at least one if it has any [px]."""
-    rows, columns = np.nonzero(mask == semantic_class)
+def sample_pixels(shown: NDArray[np.bool_], share: float, rng: np.random.Generator) -> FloatArray:
+    """(m, 2) a random share of the pixels (h, w) that show a class, at least one if there is any [px]."""
+    rows, columns = np.nonzero(shown)
     count = min(len(rows), max(1, round(share * len(rows))))
     chosen = rng.choice(len(rows), count, replace=False) if len(rows) else np.zeros(0, dtype=np.intp)
     return np.stack([columns[chosen], rows[chosen]], axis=1).astype(np.float64)
@@ -90,16 +90,20 @@ class ClassView:
         camera: PinholeCamera,
         lPs: FloatArray,
         base_tau_s: float,
-        mask: NDArray[np.uint8],
-        semantic_class: SemanticClass,
+        shown: NDArray[np.bool_],
         share: float,
         rng: np.random.Generator,
     ) -> ClassView | None:
-        """A view, or None where the scan or the mask shows none of the class."""
-        nearest = NearestPixels.of(mask, semantic_class)
+        """A view, or None where the scan or the mask shows none of the class.
+
+        Args:
+            shown: (h, w) pixels of the mask that show it.
+            share: of these pixels that is sampled.
+        """
+        nearest = NearestPixels.of(shown)
         if nearest is None or len(lPs) == 0:
             return None
-        return cls(camera, lPs, base_tau_s, nearest, sample_pixels(mask, semantic_class, share, rng))
+        return cls(camera, lPs, base_tau_s, nearest, sample_pixels(shown, share, rng))
 
 
 @dataclass(frozen=True)
@@ -126,7 +130,6 @@ def match_nearest(
     offset_s: float,
     c_twist: FloatArray,
     pixel_weight: float,
-    motion_model: MotionModel = "translation",
     max_px: float = np.inf,
 ) -> NearestMatches | None:
     """Matches at a pose and offset; None where there are none. SST-Calib, eq. 2 to 4.
@@ -137,11 +140,10 @@ def match_nearest(
     Args:
         c_twist: (6,) camera twist at the image's instant [rad/s, m/s].
         pixel_weight: w_l; 0 leaves the pixels out.
-        motion_model: see :mod:`sst_graph.factors.motion`; the paper's is "translation".
         max_px: points farther than this from their pixel are left out [px].
     """
     tau_s = offset_s + view.base_tau_s
-    cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), motion_model).cPs.T
+    cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), _MOTION_MODEL).cPs.T
     uvs = view.camera.project(cPs)
     on_image = np.flatnonzero(view.camera.in_front(cPs) & view.camera.in_image(uvs))
     if len(on_image) == 0:
@@ -161,7 +163,7 @@ def match_nearest(
             np.asarray(view.base_tau_s),
             pixels,
             np.asarray(1.0),
-            motion_model=motion_model,
+            motion_model=_MOTION_MODEL,
             weights=np.asarray(weight),
         )
 

@@ -121,7 +121,7 @@ def match_frames(
         drive, views = drives[pair.drive], []
         for c in classes:
             lPs = pair.scan.lPs[pair.scan.classes == c]
-            view = ClassView.of(drive.camera, lPs, pair.base_tau_s, pair.image.mask, c, pixel_share, rng)
+            view = ClassView.of(drive.camera, lPs, pair.base_tau_s, pair.image.mask == c, pixel_share, rng)
             if view is not None:
                 views.append(view)
         if views:

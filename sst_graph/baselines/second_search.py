@@ -10,8 +10,9 @@ import numpy as np
 from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, spread
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
-from sst_graph.initialization.global_search import SearchConfig, search_start
-from sst_graph.initialization.label_agreement import CELLS, SearchFrame, States, Votes
+from sst_graph.initialization.global_search import FINE, SearchConfig, SearchProblem, search_steps
+from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
+from sst_graph.stepwise import whole
 from sst_graph.types import SemanticClass
 
 
@@ -72,10 +73,12 @@ def challenge(
     own = spread([frame for frame in frames if frame.pair.drive == richest], config.frames)
     looked_at = [_search_frame(frame, answer) for frame in own]
     camera = drives[richest].camera
-    best = search_start(looked_at, camera, classes, answer.cTl, answer.offset_s, config)[0]
+    problem = SearchProblem(looked_at, camera, classes, answer.cTl, answer.offset_s, config)
+    best = whole(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
-    votes = Votes.gather(looked_at, camera, classes, config.points_per_class, rng)
-    scores = votes.level(config.blurs_px[-1], config.shares[-1]).score(_states([start, answer]))
+    points = LabelledPoints.sampled(looked_at, camera, classes, config.points_per_class, rng)
+    agreement = points.agreement_map(FINE[-1].blur_px, FINE[-1].share)
+    scores = whole(agreement.score_steps(_states([start, answer])))
     cells = len(looked_at) * CELLS[0] * CELLS[1]
     return Challenge(float(scores[0]) / cells, float(scores[1]) / cells, best.score)
 

@@ -35,7 +35,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import Tracks, state_from
 from sst_graph.graph.elimination import Unknowns, marginal_covariance, scaled_inverse
-from sst_graph.graph.outer_loop import JointConfig, JointSolution, solve_joint
+from sst_graph.graph.outer_loop import JointConfig, JointProblem, JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
 
@@ -116,8 +116,8 @@ class SolvedProblem:
             EstimationError: too few matches at any step.
         """
         graph = replace(self.config.graph, estimate=(*self.config.graph.estimate, *names))
-        free = replace(self.config, kernel_px=kernel_px, max_outer=most_outer, graph=graph)
-        return solve_joint(self.drives, start, free, None, self.guess, self.tracks)
+        free = replace(self.config, max_outer=most_outer, graph=graph)
+        return solve_joint(JointProblem(self.drives, self.tracks, free, self.guess), start, kernel_px)
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
@@ -189,9 +189,7 @@ class LinearProblem:
             self.state,
             cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
             offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
-            nuisances={
-                name: value for name, value in self.state.nuisances.items() if name not in self.values
-            }
+            nuisances={name: value for name, value in self.state.nuisances.items() if name not in self.values}
             | {finding.assumption.name: finding.value},
         )
 

@@ -38,17 +38,26 @@ from sst_graph.covariance.unknown_motion import unknown_motion_covariance
 from sst_graph.drive.preparation import Drive, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.graph.building import PairMatches, Tracks
-from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained
+from sst_graph.graph.outer_loop import (
+    KERNELS_PX,
+    NARROW_KERNELS_PX,
+    JointProblem,
+    JointSolution,
+    agreement,
+    concentration,
+    explained,
+    poor_fit,
+    solve_all,
+)
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
+from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import (
+    ALTERNATIVE_RATIO,
     REACH,
-    Contest,
-    choose_start,
-    narrowed,
-    prior_centre,
-    rivals,
-    solve_all,
+    Selection,
+    alternatives,
+    select_start_steps,
 )
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
@@ -56,6 +65,7 @@ from sst_graph.inspect.frame_information import to_document
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
+from sst_graph.stepwise import whole
 from sst_graph.types import Source
 
 FloatArray = NDArray[np.float64]
@@ -163,21 +173,21 @@ def answer_joint(
 ) -> Answer:
     """The default: a global start, then silhouettes over the whole drive."""
     config = config.estimating
-    # 1. A start that needs no luck.
+    # 1. A start, searched around the guess or without one.
     tracks = Tracks(drives)
-    contest = choose_start(
-        drives, tracks, config.classes, guess.cTl, guess.offset_s, config.joint, config.start
-    )
-    # 2. Silhouettes over all frames, from the winner and from a runner-up that differs from it.
+    search = StartProblem(drives, tracks, config.classes, guess.cTl, guess.offset_s)
+    selection = whole(select_start_steps(search, config.joint.graph, config.start))
+    # 2. Silhouettes over all frames, from the best start and from different ones that are nearly as good.
     objects = [object_tracks(drive) for drive in drives]
     by_object = config.joint.graph.object_bias_sigma_px > 0.0
     tracks = Tracks(drives, objects) if by_object else tracks
-    finals = _finals(drives, tracks, contest, guess, config, progress)
+    joint_problem = JointProblem(drives, tracks, config.joint)
+    finals = _finals(joint_problem, selection, search, config, progress)
     evidence = {"explained": explained(finals[0])}
-    evidence["concentration"] = concentration(finals[0], drives, tracks, config.joint)
+    evidence["concentration"] = concentration(finals[0], joint_problem)
     # 3. Edges towards the ground, where the labels agree about them.
-    best = rivals(finals, guess.cTl, guess.offset_s, config.start)
-    below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
+    best = [(solution, search.centre(solution.state)) for solution in alternatives(finals)]
+    below = with_undersides(joint_problem, best, config.undersides, progress)
     config, finals = replace(config, joint=below.joint), below.solutions
     solution = finals[0]
     # 4. Do the drives agree, and the stretches of each?
@@ -187,7 +197,7 @@ def answer_joint(
     robust = robust_covariance(*_frozen(solution), objects)
     covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
     labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
-    heard = _hear_motion(drives, tracks, labels, guess, config, progress)
+    heard = _hear_motion(search, tracks, labels, config, progress)
     if heard.solution is not solution:
         solution = heard.solution
         robust = robust_covariance(*_frozen(solution), objects)
@@ -196,7 +206,7 @@ def answer_joint(
             by_standing = standing_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
-    centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+    centre = search.centre(solution.state)
     problem = SolvedProblem(drives, tracks, objects, solution, config.joint, centre)
     findings = check_assumptions(problem, config.assumptions)
     considered = told_by(consider(robust, *frozen, config.assumptions), findings)
@@ -224,7 +234,7 @@ def answer_joint(
         by_drive=_by_drive(drives, solution, covariance, by_standing, config),
         diagnostics={
             **evidence,
-            "start_score": contest.score,
+            "start_score": selection.score,
             "motion": heard.diagnostics,
             "assumptions": assumption_report(considered, findings),
             BUDGET: parts_of_sigma,
@@ -262,15 +272,14 @@ def _frozen(
 
 
 def _hear_motion(
-    drives: Sequence[Drive],
+    search: StartProblem,
     tracks: Tracks,
     labels: Labels,
-    guess: Guess,
     config: CalibrationConfig,
     progress: Progress | None,
 ) -> WithMotion:
     """The solution with the motion in its graph, where it is asked for and there is any."""
-    solution = labels.solution
+    solution, drives = labels.solution, search.drives
     if not _may_hear_motion(config):
         return WithMotion(solution)
     if config.use_motion == "auto":
@@ -279,28 +288,27 @@ def _hear_motion(
         if weak or rolling:
             why = "the labels alone leave directions open" if weak else "the scans take their time"
             return WithMotion(solution, diagnostics={"left_out": why})
-    centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
+    centre = search.centre(solution.state)
     return with_motion(drives, tracks, labels, centre, config, progress)
 
 
 def _finals(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    contest: Contest,
-    guess: Guess,
+    problem: JointProblem,
+    selection: Selection,
+    search: StartProblem,
     config: CalibrationConfig,
     progress: Progress | None,
 ) -> Sequence[JointSolution]:
-    """Solutions of the whole problem from every finalist, the one that agrees best with the labels first.
+    """Solutions of the whole problem from every selected start, the one that agrees best with the labels
+    first.
 
     Raises:
         EstimationError: none of them leads anywhere.
     """
-    clocks = len(drives) if config.delay_per_drive else 1
-    joint = narrowed(config.joint) if config.start.enabled else config.joint
-    starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in contest.finalists]
-    centred = [(start, prior_centre(start, guess.cTl, guess.offset_s)) for start in starts]
-    return solve_all(drives, centred, joint, tracks, progress)
+    clocks = len(problem.drives) if config.delay_per_drive else 1
+    kernels_px = NARROW_KERNELS_PX if config.start.enabled else KERNELS_PX
+    starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in selection.starts]
+    return solve_all(problem, [(start, search.centre(start)) for start in starts], kernels_px, progress)
 
 
 def _doubts(
@@ -317,17 +325,8 @@ def _doubts(
         doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
     limit = np.radians(config.observability.rotation_deg)
     vague = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > limit**2
-    least_explained = max(config.start.min_explained, config.start.min_explained_vague if vague else 0.0)
-    for share, least, what in (
-        (evidence["explained"], least_explained, "of the boundary points in view meet a contour"),
-        (evidence["concentration"], config.start.min_concentration, "of the matches are close ones"),
-    ):
-        if config.start.enabled and share < least:
-            doubts.append(
-                f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
-                "the pose may be wrong altogether"
-            )
     if config.start.enabled:
+        doubts += poor_fit(evidence["explained"], evidence["concentration"], not vague)
         search, around = config.start.search, np.zeros(3) if guess.cTl is None else guess.cTl.translation()
         far = float(np.linalg.norm(solution.state.cTl.translation() - around))
         if far > (REACH * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
@@ -337,7 +336,7 @@ def _doubts(
     for other in others:
         step = difference(solution.state, other.state)
         sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
-        if sigmas > _FAR_SIGMAS and agreement(other) > config.start.rival_ratio * agreement(best):
+        if sigmas > _FAR_SIGMAS and agreement(other) > ALTERNATIVE_RATIO * agreement(best):
             doubts.append(
                 f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "

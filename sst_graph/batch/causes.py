@@ -13,15 +13,23 @@ from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, oth
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import concentration, explained, solve_joint
+from sst_graph.graph.outer_loop import (
+    NARROW_KERNELS_PX,
+    JointProblem,
+    concentration,
+    explained,
+    solve_joint,
+)
 from sst_graph.graph.state import State
-from sst_graph.initialization.selection import choose_start, narrowed, prior_centre
+from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import CalibrationResult
+from sst_graph.stepwise import whole
 
 _AGREED = 0.3
 """Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
 streets have 0.1 to 0.2."""
-_SCANS, _CONTENDERS = 6, 160
+_SCANS, _CANDIDATES = 6, 160
 """Scans and candidates of the search in a comparison: one that agrees need not be exact."""
 
 
@@ -62,23 +70,23 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
 
     def fit(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit | None:
         step = -(-len(drive.scans) // _SCANS)
-        search = replace(config.start, contest_scans=_SCANS, contenders=_CONTENDERS)
         tracks = Tracks([drive])
         few = [replace(drive, scans=drive.scans[::step])]
-        joint = narrowed(config.joint)
-        joint = replace(joint, max_outer=len(joint.kernel_px))
+        joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
+        search = StartProblem(few, tracks, config.classes, guess, offset_s)
         try:
-            contest = choose_start(few, tracks, config.classes, guess, offset_s, joint, search)
-            cTl, found_s = contest.finalists[0]
+            selection = whole(select_start_steps(search, joint.graph, config.start, _SCANS, _CANDIDATES))
+            cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
-            solution = solve_joint(few, start, joint, None, prior_centre(start, guess, offset_s), tracks)
+            problem = JointProblem(few, tracks, joint, search.centre(start))
+            solution = solve_joint(problem, start, NARROW_KERNELS_PX)
         except EstimationError:
             return None
         return Fit(
             solution.state.cTl,
             solution.state.offsets_s[0],
             explained(solution),
-            concentration(solution, few, tracks, joint),
+            concentration(solution, problem),
         )
 
     return fit

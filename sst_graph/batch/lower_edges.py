@@ -17,15 +17,17 @@ from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import match_all, outlines_of
+from sst_graph.graph.matching import edges_of, match_all
 from sst_graph.graph.outer_loop import (
     CONCENTRATION_SCALES,
+    KERNELS_PX,
     JointConfig,
+    JointProblem,
     JointSolution,
+    solve_all,
     support_of,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.selection import solve_all
 from sst_graph.types import SemanticClass
 
 
@@ -63,10 +65,8 @@ class WithUndersides:
 
 
 def with_undersides(
-    drives: Sequence[Drive],
-    tracks: Tracks,
+    problem: JointProblem,
     finals: Sequence[tuple[JointSolution, State]],
-    joint: JointConfig,
     config: UndersideConfig,
     progress: Progress | None = None,
 ) -> WithUndersides:
@@ -78,13 +78,15 @@ def with_undersides(
     Raises:
         EstimationError: too few matches at any step.
     """
-    solutions = [solution for solution, _ in finals]
-    chosen, concentration = agreed_undersides(drives, tracks, solutions[0].state, joint, config)
+    solutions, joint = [solution for solution, _ in finals], problem.config
+    chosen, concentration = agreed_undersides(
+        problem.drives, problem.tracks, solutions[0].state, joint, config
+    )
     if not chosen:
         return WithUndersides(solutions, joint, concentration)
     joint = replace(joint, graph=replace(joint.graph, undersides=chosen))
-    last = replace(joint, kernel_px=config.kernel_px)
-    fuller = solve_all(drives, [(one.state, centre) for one, centre in finals], last, tracks, progress)
+    starts = [(one.state, centre) for one, centre in finals]
+    fuller = solve_all(replace(problem, config=joint), starts, config.kernel_px, progress)
     return WithUndersides(fuller, joint, concentration)
 
 
@@ -136,10 +138,10 @@ def underside_support(
     """Support of the undersides of some scans at a state."""
     classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
     graph = replace(joint.graph, undersides=tuple(sorted(classes)))
-    outlines = outlines_of(drives, tracks, graph)
+    edges = edges_of(drives, tracks, graph)
     narrow, wide = (
         support_of(
-            match_all(outlines, state, RobustKernel("geman_mcclure", scale * joint.kernel_px[-1])),
+            match_all(edges, state, RobustKernel("geman_mcclure", scale * KERNELS_PX[-1])),
             state,
             BOTTOM,
         )

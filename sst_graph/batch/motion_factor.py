@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
@@ -16,7 +16,7 @@ from sst_graph.covariance.contradiction import Difference, PartAnswer, name_step
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import JointSolution, solve_joint
+from sst_graph.graph.outer_loop import KERNELS_PX, JointProblem, JointSolution, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.solution import difference, solve_motion
 
@@ -100,8 +100,8 @@ def with_motion(
             return WithMotion(solution, diagnostics={"left_out": said, **facts}, remarks=(said,))
     # 3. Silhouettes once more, the motion among the factors.
     belief = belief_factor(motion.state, motion.covariance)
-    last_scale = replace(config.joint, kernel_px=config.joint.kernel_px[-1:])
-    fused = solve_joint(drives, state, last_scale, progress, guess, tracks, belief)
+    problem = JointProblem(drives, tracks, config.joint, guess, belief)
+    fused = solve_joint(problem, state, KERNELS_PX[-1:], progress)
     inflation = apart / len(step) if apart > _UNLIKELY_CHI2 else 1.0
     return WithMotion(fused, inflation=inflation, diagnostics={"fused": True, **facts})
 

@@ -16,8 +16,14 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.matching import match_all, outlines_of
-from sst_graph.graph.outer_loop import JointConfig, JointSolution, robust_weights, solve_joint
+from sst_graph.graph.matching import edges_of, match_all
+from sst_graph.graph.outer_loop import (
+    JointConfig,
+    JointProblem,
+    JointSolution,
+    robust_weights,
+    solve_joint,
+)
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.objects.tracks import ObjectId, tracks_of_scans
@@ -64,7 +70,7 @@ class Parts:
             centred on.
         joint: settings of the joint method.
         assumptions: what each part's covariance has beside its matches.
-        kernel_px: scales of the robust kernel of a part's solution, as in :class:`JointConfig` [px].
+        kernel_px: scales of the robust kernel of a part's solution, as in :func:`solve_joint` [px].
     """
 
     drives: Sequence[Drive]
@@ -89,10 +95,11 @@ class Parts:
         return max(candidates, key=lambda start: float(self.support(part, start).sum()))
 
     def _solved(self, part: Part, start: State, kernel_px: tuple[float, ...]) -> SolvedPart | None:
-        joint = replace(self.joint, kernel_px=kernel_px, max_outer=len(kernel_px) + _SETTLING)
+        joint = replace(self.joint, max_outer=len(kernel_px) + _SETTLING)
         drive, tracks = self.drives[part.drive].part(part.scans), self.tracks.part(part.drive, part.scans)
         try:
-            solution = solve_joint([drive], start, joint, guess=self.reference_of(part), tracks=tracks)
+            problem = JointProblem([drive], tracks, joint, self.reference_of(part))
+            solution = solve_joint(problem, start, kernel_px)
             return SolvedPart(part, solution.state, self._answer(part, solution))
         except (EstimationError, np.linalg.LinAlgError):
             return None
@@ -117,7 +124,7 @@ class Parts:
         drive, tracks = self.drives[part.drive].part(part.scans), self.tracks.part(part.drive, part.scans)
         kernel = RobustKernel("geman_mcclure", self.kernel_px[-1])
         found = np.zeros(len(part.scans))
-        for own in match_all(outlines_of([drive], tracks, self.joint.graph), state, kernel):
+        for own in match_all(edges_of([drive], tracks, self.joint.graph), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]
             found += np.bincount(scans, robust_weights(own, state), len(found))
         return found

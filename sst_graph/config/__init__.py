@@ -15,7 +15,7 @@ Unknown names are refused with the nearest known one.
 
 from __future__ import annotations
 
-from sst_graph.config.ranges import Bounds, Range, setting
+from sst_graph.config.ranges import Bounds, Range, internal, setting
 from sst_graph.config.reading import from_dict, read_config, with_overrides
 from sst_graph.config.settings import Settings, settings_fields, to_dict, walk_settings
 
@@ -24,6 +24,7 @@ __all__ = [
     "Range",
     "Settings",
     "from_dict",
+    "internal",
     "read_config",
     "setting",
     "settings_fields",

@@ -54,6 +54,19 @@ def setting(default: T, *, doc: str = "", unit: str | None = None, **bounds: Unp
     return dataclasses.field(default=default, metadata={**bounds, "doc": doc, "unit": unit})
 
 
+def internal(default: T) -> T:
+    """A field of a settings dataclass that the program sets itself: no setting, and not written out."""
+    return dataclasses.field(default=default, metadata={_INTERNAL: True})
+
+
+def is_internal(field: dataclasses.Field[Any]) -> bool:
+    """Whether a field is :func:`internal`."""
+    return bool(field.metadata.get(_INTERNAL))
+
+
+_INTERNAL = "internal"
+
+
 @dataclasses.dataclass(frozen=True)
 class Range:
     """The declared range of a field; a bound that is None does not limit.

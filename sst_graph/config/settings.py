@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from sst_graph.config.ranges import Range, unit_of
+from sst_graph.config.ranges import Range, is_internal, unit_of
 from sst_graph.config.values import checked
 from sst_graph.errors import ConfigError, SstGraphError
 
@@ -77,7 +77,11 @@ def settings_fields(cls: Any) -> tuple[tuple[dataclasses.Field[Any], Any], ...]:
 @functools.cache
 def _fields(cls: Any) -> tuple[tuple[dataclasses.Field[Any], Any], ...]:
     hints = get_type_hints(cls)
-    return tuple((field, hints[field.name]) for field in dataclasses.fields(cls) if field.init)
+    return tuple(
+        (field, hints[field.name])
+        for field in dataclasses.fields(cls)
+        if field.init and not is_internal(field)
+    )
 
 
 def walk_settings(cls: Any, where: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
@@ -92,7 +96,11 @@ def walk_settings(cls: Any, where: str = "") -> Iterator[tuple[str, dataclasses.
 
 def to_dict(config: Any) -> dict[str, Any]:
     """The dataclass as a JSON-able dictionary: enums by lower-case name, tuples as lists, paths as text."""
-    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
+    return {
+        field.name: _plain(getattr(config, field.name))
+        for field in dataclasses.fields(config)
+        if not is_internal(field)
+    }
 
 
 def _plain(value: Any) -> Any:

@@ -47,6 +47,17 @@ __all__ = [
 ]
 
 
+LOWER_EDGE_BIAS_SIGMA_PX = 2.0
+"""Deviation of the mask bias that the lower edges of a class share from the class's, where objects have
+biases of their own [px]: labels end an object at its body, its wheels or its shadow."""
+PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M = 1.0, 0.5
+"""Prior deviations of the extrinsic from the guess: so wide that they matter only where the data say
+nothing."""
+UNKNOWN_TWIST_SIGMAS = np.repeat([0.05, 0.5], 3)
+"""(6,) deviations of the camera's twist from 0 where no odometry measures it [rad/s, m/s]: a vehicle that
+stands, or moves so slowly that the scan's motion is small beside other errors."""
+
+
 def joint_graph(
     pairs: Sequence[PairMatches], state: State, config: GraphConfig, guess: State | None = None
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -57,7 +68,7 @@ def joint_graph(
         E, D, V = EXTRINSIC, time_offset_key(state.clock(pair.drive)), twist_key(pair.drive, pair.pair.image)
         if not values.exists(V):
             values.insert(V, pair.motion.c_twist)
-            graph.add(motion_factor(pair, E, D, V, state.cTl, state.offset_s(pair.drive), config))
+            graph.add(motion_factor(pair, E, D, V, state.cTl, state.offset_s(pair.drive)))
         graph.add(silhouettes_factor(pair, E, D, V, partial(bias_key, pair.drive), state.nuisances))
     return graph, values
 
@@ -113,16 +124,15 @@ def silhouettes_factor(
 
 
 def motion_factor(
-    pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, offset_s: float, config: GraphConfig
+    pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, offset_s: float
 ) -> gtsam.NonlinearFactor:
-    """What the LiDAR's odometry, where there is one, says of the twist of a pair's image.
+    """The LiDAR odometry's measurement of the twist at a pair's image; without odometry a wide prior.
 
     Args:
         cTl, offset_s: that the matches were made at.
     """
     if pair.l_twist is None:
-        sigmas = np.repeat(config.still_sigma, 3)
-        return velocity_factor(V, np.zeros(6), np.diag(sigmas**2))
+        return velocity_factor(V, np.zeros(6), np.diag(UNKNOWN_TWIST_SIGMAS**2))
     covariance = camera_twist(pair.l_twist, cTl).covariance
     twist, acceleration = pair.l_twist.twist, pair.l_twist.acceleration
     return twist_transfer_factor(V, E, D, twist, acceleration, offset_s, covariance)
@@ -141,11 +151,13 @@ def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[
 def _add_calibration(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, guess: State, config: GraphConfig
 ) -> None:
-    sigmas = np.repeat([config.rest_sigma_rad, config.rest_sigma_m], 3)
+    sigmas = np.repeat([PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M], 3)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, guess.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     values.insert(EXTRINSIC, state.cTl)
     for clock, offset_s in enumerate(state.offsets_s):
-        graph.add(time_offset_prior(time_offset_key(clock), guess.offset_s(clock), config.delay_sigma_s))
+        graph.add(
+            time_offset_prior(time_offset_key(clock), guess.offset_s(clock), config.time_offset_sigma_s)
+        )
         values.insert(time_offset_key(clock), np.array([offset_s]))
 
 
@@ -173,9 +185,7 @@ def _add_biases(
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))
     for drive, c, track in objects:
         key = object_bias_key(drive, track)
-        sigma_px = (
-            config.underside_bias_sigma_px if track == underside_track(c) else config.object_bias_sigma_px
-        )
+        sigma_px = LOWER_EDGE_BIAS_SIGMA_PX if track == underside_track(c) else config.object_bias_sigma_px
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_px)
         graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))
         values.insert(key, np.array([state.object_bias_px(drive, track, c)]))

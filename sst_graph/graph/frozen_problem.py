@@ -22,7 +22,8 @@ from sst_graph.drive.trajectory import camera_covariances
 from sst_graph.factors.matches import Alignment
 from sst_graph.factors.reprojection import evaluate, weigh
 from sst_graph.factors.velocity import transferred
-from sst_graph.graph.building import prior_graph
+from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
+from sst_graph.graph.elimination import scaled_inverse
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (
     EXTRINSIC,
@@ -85,10 +86,7 @@ class NormalEquations:
 
     def covariance(self) -> FloatArray:
         """(n, n) of all unknowns but the twists."""
-        _, H, _ = self._reduced(0.0)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-        scaled = np.linalg.inv(H * np.outer(scale, scale) + 1e-14 * np.eye(len(H)))
-        return np.asarray(scaled * np.outer(scale, scale))
+        return scaled_inverse(self._reduced(0.0)[1])
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Inverse of the twists' blocks, and H and g with the twists eliminated."""
@@ -102,12 +100,12 @@ class NormalEquations:
 
 @dataclass(frozen=True)
 class _Images:
-    """The twists of all images that have matches, and what odometry says of them.
+    """The twists of all images that have matches, and their measurements by odometry.
 
     Attributes:
         keys: of the twists.
         twists: (f, 6) of the camera where the matches were made [rad/s, m/s].
-        l_twists, l_accelerations: (f, 6) of the LiDAR; 0 where no odometry tells them.
+        l_twists, l_accelerations: (f, 6) of the LiDAR; 0 without odometry.
         information: (f, 6, 6) inverse covariance of the camera's.
         clocks: (f,) column of the time offset.
         offsets_s: (f,) under which they were looked up [s].
@@ -156,20 +154,20 @@ class FrozenProblem:
         state: State,
         config: GraphConfig,
         guess: State | None = None,
-        belief: gtsam.NonlinearFactor | None = None,
+        prior: gtsam.NonlinearFactor | None = None,
     ) -> None:
         """
         Args:
             matches: by drive, made at ``state``.
             guess: what the weak priors are centred on; by default the state.
-            belief: what else is known of the extrinsic and the first clock's offset.
+            prior: a further factor on the extrinsic and the first clock's offset.
         """
         self.state = state
         self._classes = sorted({(own.number, c) for own in matches for c in own.classes})
         self._objects = sorted({each for own in matches for each in own.tracked})
         self._priors, values = prior_graph(self._classes, self._objects, state, config, guess)
-        if belief is not None:
-            self._priors.add(belief)
+        if prior is not None:
+            self._priors.add(prior)
         # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
         self._names = [name for name, _ in named_sigmas(config.estimate)]
         delays = [time_offset_key(clock) for clock in range(len(state.offsets_s))]
@@ -180,7 +178,7 @@ class FrozenProblem:
         self._terms = [self._columns[nuisance_key(name)] for name in self._names]
         self._shared = _ordered((EXTRINSIC, *self._keys))
         # 2. Images and matches.
-        self._images = _images(matches, state, self._columns, config)
+        self._images = _images(matches, state, self._columns)
         places = {key: number for number, key in enumerate(self._images.keys)}
         self._frames = [self._frames_of(own, places) for own in matches]
         scalars = [float(values.atVector(key)[0]) for key in self._keys]
@@ -188,7 +186,7 @@ class FrozenProblem:
 
     @property
     def ordering(self) -> gtsam.Ordering:
-        """Of all unknowns, as they stand in the normal equations, the twists last."""
+        """Of all unknowns, as in the normal equations, the twists last."""
         return _ordered((EXTRINSIC, *self._keys, *self._images.keys))
 
     def optimum(self, iterations: int) -> tuple[FrozenPoint, NormalEquations]:
@@ -368,9 +366,7 @@ def _bias_columns(matches: DriveMatches, columns: dict[int, int]) -> IntArray:
     return np.array([columns[object_bias_key(number, track)] for track in tracks.tolist()])[which.reshape(-1)]
 
 
-def _images(
-    matches: Sequence[DriveMatches], state: State, columns: dict[int, int], config: GraphConfig
-) -> _Images:
+def _images(matches: Sequence[DriveMatches], state: State, columns: dict[int, int]) -> _Images:
     """The images that have matches, drive by drive."""
     parts = []
     for own in matches:
@@ -382,7 +378,7 @@ def _images(
         samples, clock = own.motions.l_twists, columns[time_offset_key(state.clock(own.number))]
         if samples is None:
             l_twists = l_accelerations = np.zeros((k, 6))
-            information = np.tile(np.diag(np.repeat(config.still_sigma, 3) ** -2.0), (k, 1, 1))
+            information = np.tile(np.diag(UNKNOWN_TWIST_SIGMAS**-2.0), (k, 1, 1))
         else:
             l_twists, l_accelerations = samples.twists[pairs], samples.accelerations[pairs]
             covariances = camera_covariances(samples.covariances[pairs], state.cTl)

@@ -1,6 +1,6 @@
 """From a state to matches: a drive's scans and images paired in true time, and matched all at once.
 
-What a scan shows stays the same from one association to the next: :class:`DriveOutlines` gathers it once for
+What a scan shows stays the same from one outer iteration to the next: :class:`DriveEdges` gathers it once for
 a whole solution. What a state changes (the pairs, the motion between them, the pixels) is worked out for all
 pairs in the same arrays, for with the few hundred points of one pair a call costs more than what it does.
 """
@@ -18,18 +18,18 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import (
     BOTTOM,
-    Facing,
-    FacingMatches,
+    EdgeMatches,
     MatchConfig,
     Motion,
+    PairedEdges,
     SilhouetteMatches,
-    match_facing,
+    match_edges,
     numbered_through,
 )
 from sst_graph.association.time_pairing import Pair, pair_by_time
 from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal, setting
 from sst_graph.drive.preparation import Drive, outlines
 from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
 from sst_graph.errors import ConfigError
@@ -54,45 +54,38 @@ DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
 
 @dataclass(frozen=True)
 class GraphConfig(Settings):
-    """Priors and limits of the joint graph.
+    """Noise of the joint graph.
 
     Attributes:
         match: how boundary points meet contours.
-        undersides: classes whose edges towards the ground are matched too. They sharpen roll and height where
-            both sides label the underside alike; hand-drawn outlines often cover the gap above the ground.
-        max_interval_periods: farthest pair in true time, in image periods.
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
             of a class the same bias.
-        underside_bias_sigma_px: deviation of the mask bias that the undersides of a class share from the
-            class's, where objects have biases of their own [px].
-        delay_sigma_s: prior deviation of the time offset from the guess [s].
-        rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
-        rest_sigma_m: of its translation [m]; both so wide that they matter only where the data say nothing.
-        mover_reach_m: an object that moves so far by itself between its scan and its image, in a way that is
-            not known, keeps half of its weight, one that moves a little farther none [m].
-        still_sigma: sigmas of the twist where nothing measures it [rad/s, m/s].
-        estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0.
+        time_offset_sigma_s: prior deviation of the time offset from the guess [s].
+        undersides: classes whose edges towards the ground are matched too; chosen by
+            :mod:`sst_graph.batch.lower_edges`.
+        estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
+            the settings of the assumptions.
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
-    undersides: tuple[SemanticClass, ...] = ()
-    max_interval_periods: float = setting(1.0, at_least=0.01, at_most=20.0)
     bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
     object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
-    underside_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
-    delay_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
-    rest_sigma_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
-    rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
-    mover_reach_m: float = setting(0.003, at_least=1e-6, at_most=100.0)
-    still_sigma: tuple[float, float] = setting((0.05, 0.5), at_least=1e-6, at_most=100.0)
-    estimate: tuple[str, ...] = ()
+    time_offset_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
+    undersides: tuple[SemanticClass, ...] = internal(())
+    estimate: tuple[str, ...] = internal(())
 
     def __post_init__(self) -> None:
         if 0.0 < self.object_bias_sigma_px < 0.001:
             raise ConfigError(
                 f"object_bias_sigma_px: found {self.object_bias_sigma_px:g}, expected 0 or at least 0.001 px"
             )
+
+
+DYNAMIC_REACH_M = 0.003
+"""A dynamic object that moves so far by itself between its scan and its image, in a way that is not known,
+keeps half of its weight, one that moves a little farther none [m]: a quarter of a pixel at 10 m with KITTI's
+camera."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +95,7 @@ class PairMatches:
     Attributes:
         drive: number of the drive.
         pair: positions of scan and image.
-        l_twist: the LiDAR's twist at the image's instant, or None where no odometry tells it.
+        l_twist: the LiDAR's twist at the image's instant, or None without odometry.
         motion: the camera's, under the state that the matches were made at.
         matches: by class.
         tracks: for each class, the track (n,) of the object that each match lies on; empty where objects
@@ -153,8 +146,8 @@ class Tracks:
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
 
-    def seeing(self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]) -> Tracks:
-        """The same twists of one drive, with other object tracks and moving objects."""
+    def with_objects(self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]) -> Tracks:
+        """The same twists of one drive, with other object tracks and dynamic objects."""
         other = Tracks([])
         other._tracks, other.objects, other._dynamic = self._tracks, [objects], [_by_scan(dynamic)]
         return other
@@ -170,22 +163,22 @@ class Tracks:
         return other
 
     def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
-        """The moving objects of a scan."""
+        """The dynamic objects of a scan."""
         return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
 
     def at(self, drive: int, stamp_ns: int) -> TwistSample | None:
-        """The LiDAR's twist at a stamp of its clock, or None where no odometry tells it."""
+        """The LiDAR's twist at a stamp of its clock, or None without odometry."""
         track = self._tracks[drive]
         return None if track is None else track.at(stamp_ns)
 
     def at_all(self, drive: int, stamps_ns: Sequence[int]) -> TwistSamples | None:
-        """The LiDAR's twists at stamps of its clock, or None where no odometry tells them."""
+        """The LiDAR's twists at stamps of its clock, or None without odometry."""
         track = self._tracks[drive]
         return None if track is None else track.at_all(stamps_ns)
 
 
 @dataclass(frozen=True)
-class DriveOutlines:
+class DriveEdges:
     """The boundary points of a drive, group by group: what one scan shows of one class.
 
     Attributes:
@@ -193,9 +186,9 @@ class DriveOutlines:
         drive, tracks: where they come from.
         config: which of them, and how they are matched.
         scans, classes: scan and class of each group, the scans rising.
-        points, owners, bounds: as in :class:`~sst_graph.association.edge_matching.Facing`.
+        points, owners, bounds: as in :class:`~sst_graph.association.edge_matching.PairedEdges`.
         own_tracks: (n,) track of the object of each point, or None where objects have no biases.
-        unknown_mps: (n,) how much of the motion of each point's object is not known, or None where all stand.
+        unknown_mps: (n,) speed of each point's object that is not known, or None where all are static.
         velocities: (n, 3) of each point's object over ground, in the LiDAR frame, or None where none is known
             to move [m/s].
     """
@@ -214,7 +207,7 @@ class DriveOutlines:
     velocities: FloatArray | None
 
     @classmethod
-    def of(cls, number: int, drive: Drive, tracks: Tracks, config: GraphConfig) -> DriveOutlines | None:
+    def of(cls, number: int, drive: Drive, tracks: Tracks, config: GraphConfig) -> DriveEdges | None:
         """All of a drive; None where it has no boundary point."""
         groups = [
             (k, c, points)
@@ -252,11 +245,31 @@ class DriveOutlines:
             velocities,
         )
 
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def group_of(self) -> IntArray:
+        """(n,) group of each point."""
+        return np.repeat(np.arange(len(self.scans)), np.diff(self.bounds))
+
+    def thinned(self, most: int) -> DriveEdges:
+        """Evenly spread points, at most so many."""
+        index = np.arange(0, len(self), max(1, -(-len(self) // most)))
+        return replace(
+            self,
+            points=self.points.take(index),
+            owners=self.owners[index],
+            bounds=np.searchsorted(index, self.bounds),
+            own_tracks=None if self.own_tracks is None else self.own_tracks[index],
+            unknown_mps=None if self.unknown_mps is None else self.unknown_mps[index],
+            velocities=None if self.velocities is None else self.velocities[index],
+        )
+
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
         drive, offset_s = self.drive, state.offset_s(self.number)
-        limit = self.config.max_interval_periods * drive.image_period_s
-        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, limit)
+        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, drive.image_period_s)
         # 1. The groups that have an image, and in it a contour of their class.
         numbers = {pair.scan: number for number, pair in enumerate(pairs)}
         groups = [
@@ -270,24 +283,24 @@ class DriveOutlines:
         # 2. The motion around the images.
         motions = _Motions.of(self, pairs, state)
         # 3. The points, without the objects that would keep nothing of their weight.
-        facing, index = self._facing(groups, pairs, motions, state)
+        paired, index = self._paired(groups, pairs, motions, state)
         shares = None
         if self.unknown_mps is not None:
-            taus_s = offset_s + facing.repeated([pairs[p].base_tau_s for _, p in groups])
-            shares = dynamic_object_weights(self.unknown_mps[index], taus_s, self.config.mover_reach_m)
+            taus_s = offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
+            shares = dynamic_object_weights(self.unknown_mps[index], taus_s, DYNAMIC_REACH_M)
             if not shares.all():
                 kept = np.flatnonzero(shares)
-                facing, index, shares = facing.take(kept), index[kept], shares[kept]
+                paired, index, shares = paired.take(kept), index[kept], shares[kept]
         # 4. Their matches.
-        scene = motions.scene(drive, facing.repeated([p for _, p in groups]))
+        scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
         deviation = deviation_of(state.nuisances, scene)
-        found = match_facing(facing, state.cTl, offset_s, kernel, self.config.match, deviation)
+        found = match_edges(paired, state.cTl, offset_s, kernel, self.config.match, deviation)
         if len(found.index) == 0:
             return None
         if shares is not None and not (shares == 1.0).all():
             weights = shares[found.index] * found.alignment.weights
             found = replace(found, alignment=replace(found.alignment, weights=weights))
-        firsts = facing.bounds[:-1]
+        firsts = paired.bounds[:-1]
         return DriveMatches(
             self,
             pairs,
@@ -301,9 +314,9 @@ class DriveOutlines:
             offset_s,
         )
 
-    def _facing(
+    def _paired(
         self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
-    ) -> tuple[Facing, IntArray]:
+    ) -> tuple[PairedEdges, IntArray]:
         """The points of groups with their pairs' images, and which of all points they are."""
         drive, biases = self.drive, state.biases_of(self.number)
         spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
@@ -316,7 +329,7 @@ class DriveOutlines:
             velocities = None
         classes = [self.classes[g] for g, _ in groups]
         base_taus_s = np.array([pairs[p].base_tau_s for _, p in groups])
-        facing = Facing(
+        paired = PairedEdges(
             drive.camera,
             points,
             self.owners if whole else self.owners[index],
@@ -327,7 +340,7 @@ class DriveOutlines:
             np.array([biases.get(c, 0.0) for c in classes]),
             velocities,
         )
-        return facing, index
+        return paired, index
 
 
 @dataclass(frozen=True)
@@ -336,8 +349,8 @@ class _Motions:
 
     Attributes:
         of_images: the camera's.
-        l_twists: the LiDAR's, or None where no odometry tells them.
-        measured: (p, 6) the LiDAR's as measured; zeros where no odometry tells it [rad/s, m/s].
+        l_twists: the LiDAR's, or None without odometry.
+        measured: (p, 6) the LiDAR's as measured; zeros without odometry [rad/s, m/s].
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
@@ -347,7 +360,7 @@ class _Motions:
     since_s: FloatArray
 
     @classmethod
-    def of(cls, outlines: DriveOutlines, pairs: Sequence[Pair], state: State) -> _Motions:
+    def of(cls, outlines: DriveEdges, pairs: Sequence[Pair], state: State) -> _Motions:
         """Under a state."""
         drive, number = outlines.drive, outlines.number
         stamps = [drive.images[pair.image].stamp_ns for pair in pairs]
@@ -387,10 +400,10 @@ class DriveMatches:
         cTl, offset_s: where they were made.
     """
 
-    outlines: DriveOutlines
+    outlines: DriveEdges
     pairs: Sequence[Pair]
     motions: _Motions
-    found: FacingMatches
+    found: EdgeMatches
     group_pairs: IntArray
     group_classes: Sequence[SemanticClass]
     points: IntArray
@@ -533,13 +546,13 @@ def _own_motion(
     return slow if slow.any() else None, known if known.any() else None
 
 
-def outlines_of(drives: Sequence[Drive], tracks: Tracks, config: GraphConfig) -> list[DriveOutlines]:
+def edges_of(drives: Sequence[Drive], tracks: Tracks, config: GraphConfig) -> list[DriveEdges]:
     """The outlines of drives, to be matched again and again; drives without any are left out."""
-    found = [DriveOutlines.of(number, drive, tracks, config) for number, drive in enumerate(drives)]
+    found = [DriveEdges.of(number, drive, tracks, config) for number, drive in enumerate(drives)]
     return [outlines for outlines in found if outlines is not None]
 
 
-def match_all(outlines: Sequence[DriveOutlines], state: State, kernel: RobustKernel) -> list[DriveMatches]:
+def match_all(outlines: Sequence[DriveEdges], state: State, kernel: RobustKernel) -> list[DriveMatches]:
     """The matches of each drive under a state; drives without any are left out."""
     found = [own.match(state, kernel) for own in outlines]
     return [matches for matches in found if matches is not None]
@@ -549,7 +562,7 @@ def associate(
     drives: Sequence[Drive], tracks: Tracks, state: State, kernel: RobustKernel, config: GraphConfig
 ) -> list[PairMatches]:
     """Pair scans with images in true time under a state, and match their silhouettes."""
-    found = match_all(outlines_of(drives, tracks, config), state, kernel)
+    found = match_all(edges_of(drives, tracks, config), state, kernel)
     return [pair for matches in found for pair in matches.by_pair()]
 
 

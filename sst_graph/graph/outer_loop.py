@@ -1,10 +1,15 @@
-"""The default method: a global start, then silhouettes over the whole drive in one factor graph."""
+"""The outer loop of the joint method: pair, match, optimise with the matches frozen, and again.
+
+:mod:`~sst_graph.graph.matching` matches, :mod:`~sst_graph.graph.frozen_problem` optimises. The robust kernel
+narrows from one outer iteration to the next. The functions at the end say how well a solution explains the
+labels: a solution may be precise and wrong.
+"""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import gtsam
@@ -17,8 +22,9 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, joint_graph
+from sst_graph.graph.convergence import CIRCLE_SIGMAS, STEP_SIGMAS, step_share
 from sst_graph.graph.frozen_problem import FrozenProblem
-from sst_graph.graph.matching import DriveMatches, match_all, outlines_of
+from sst_graph.graph.matching import DriveMatches, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.stepwise import Stepwise, whole
@@ -27,40 +33,62 @@ from sst_graph.types import SemanticClass
 FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
+KERNELS_PX = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
+"""Scales of the robust kernel, outer iteration by outer iteration; the last one stays [px]. 20 px are 1.6
+degrees with KITTI's camera, what a start may be off; 3 px are beyond most of the masks' errors."""
+NARROW_KERNELS_PX = KERNELS_PX[6:]
+"""From a start that is nearly right: wide kernels would only lead away from it [px]."""
+INNER_ITERATIONS = 2
+"""Most Levenberg-Marquardt iterations on frozen matches: the next matches are worth more than a third."""
 CONCENTRATION_SCALES = (1.0, 5.0)
 """Kernels, in units of the last one, whose supports are compared to see how close matches are."""
+MIN_EXPLAINED = 0.2
+"""Least share of the boundary points in view that must meet a contour, :func:`explained` ..."""
+MIN_EXPLAINED_VAGUE = 0.45
+"""... and where the rotation is not observable: with so little in view, a pose that leaves more of it
+unexplained may be a wrong one."""
+MIN_CONCENTRATION = 0.6
+"""Least :func:`concentration` of a solution that is not wrong altogether."""
 
 
 @dataclass(frozen=True)
 class JointConfig(Settings):
-    """Outer and inner loop of the joint method.
+    """The joint method.
 
     Attributes:
         graph: matches, priors.
-        kernel_px: scales of the robust kernel, outer iteration by outer iteration; the last one stays [px].
         max_outer: most outer iterations.
-        step_sigmas: an outer step, at the last kernel scale, shorter than this many standard deviations of
-            the frozen problem ends the outer loop.
-        full_steps: outer steps at the last kernel scale before they are shortened: matches that come and
-            go in turn would lead round in a circle, and the middle of it is the answer ...
-        circle_sigmas: ... if a full step there is shorter than this many standard deviations.
-        inner_iterations: most Levenberg-Marquardt iterations on frozen matches.
         min_matches: fewest matches in all for an answer.
     """
 
     graph: GraphConfig = field(default_factory=GraphConfig)
-    kernel_px: tuple[float, ...] = setting(
-        (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0),
-        at_least=0.1,
-        at_most=1000.0,
-        length=(1, 100),
-    )
     max_outer: int = setting(40, at_least=1, at_most=1000)
-    step_sigmas: float = setting(0.1, at_least=0.0, at_most=10.0)
-    full_steps: int = setting(6, at_least=0, at_most=1000)
-    circle_sigmas: float = setting(1.5, at_least=0.0, at_most=100.0)
-    inner_iterations: int = setting(2, at_least=1, at_most=100)
     min_matches: int = setting(30, at_least=1, at_most=1_000_000)
+
+
+@dataclass(frozen=True)
+class JointProblem:
+    """What is solved.
+
+    Attributes:
+        drives: all of them.
+        tracks: their twists, and their objects where those have mask biases.
+        config: matches, priors, limits.
+        centre: what the weak priors are centred on; the start where it is None.
+        prior: a further factor on the extrinsic and the first clock's offset.
+    """
+
+    drives: Sequence[Drive]
+    tracks: Tracks
+    config: JointConfig
+    centre: State | None = None
+    prior: gtsam.NonlinearFactor | None = None
+
+    @classmethod
+    def of(cls, drives: Sequence[Drive], config: JointConfig) -> JointProblem:
+        """With the tracks that the configuration needs."""
+        by_object = config.graph.object_bias_sigma_px > 0.0
+        return cls(drives, Tracks(drives, [object_tracks(d) for d in drives] if by_object else None), config)
 
 
 @dataclass(frozen=True)
@@ -88,73 +116,87 @@ class JointSolution:
 
 
 def solve_joint(
-    drives: Sequence[Drive],
+    problem: JointProblem,
     start: State,
-    config: JointConfig,
+    kernels_px: Sequence[float] = KERNELS_PX,
     progress: Progress | None = None,
-    guess: State | None = None,
-    tracks: Tracks | None = None,
-    belief: gtsam.NonlinearFactor | None = None,
+    step_sigmas: float = STEP_SIGMAS,
 ) -> JointSolution:
-    """All steps of :func:`solving_joint`."""
-    return whole(solving_joint(drives, start, config, progress, guess, tracks, belief))
+    """All steps of :func:`solve_joint_steps`."""
+    return whole(solve_joint_steps(problem, start, kernels_px, progress, step_sigmas))
 
 
-def solving_joint(
-    drives: Sequence[Drive],
+def solve_joint_steps(
+    problem: JointProblem,
     start: State,
-    config: JointConfig,
+    kernels_px: Sequence[float] = KERNELS_PX,
     progress: Progress | None = None,
-    guess: State | None = None,
-    tracks: Tracks | None = None,
-    belief: gtsam.NonlinearFactor | None = None,
+    step_sigmas: float = STEP_SIGMAS,
 ) -> Stepwise[JointSolution]:
     """Re-pair, re-match, optimise, until nothing moves: an outer iteration a step.
 
     Args:
-        guess: what the weak priors are centred on; the start where it is None.
-        tracks: twist and object tracks of the drives; made here where it is None.
-        belief: what else is known of the extrinsic and the first clock's offset.
+        kernels_px: scales of the robust kernel, outer iteration by outer iteration; the last one stays [px].
+        step_sigmas: a step, at the last scale, shorter than this many standard deviations is the last one.
 
     Raises:
         EstimationError: too few matches at any step.
     """
-    if tracks is None:
-        by_object = config.graph.object_bias_sigma_px > 0.0
-        tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
-    state, converged, outer = start, False, 0
-    guess = start if guess is None else guess
-    outlines = outlines_of(drives, tracks, config.graph)
+    config, state, converged, outer = problem.config, start, False, 0
+    centre = start if problem.centre is None else problem.centre
+    edges = edges_of(problem.drives, problem.tracks, config.graph)
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
-        scale = config.kernel_px[min(outer, len(config.kernel_px) - 1)]
-        matches = match_all(outlines, state, RobustKernel("geman_mcclure", scale))
+        scale = kernels_px[min(outer, len(kernels_px) - 1)]
+        matches = match_all(edges, state, RobustKernel("geman_mcclure", scale))
         pairs = sum(len(own.paired) for own in matches)
         _check_matches(sum(map(len, matches)), pairs, config)
         # 2. Inner optimisation with the matches frozen.
-        problem = FrozenProblem(matches, state, config.graph, guess, belief)
-        optimum, system = problem.optimum(config.inner_iterations)
+        frozen = FrozenProblem(matches, state, config.graph, centre, problem.prior)
+        optimum, system = frozen.optimum(INNER_ITERATIONS)
         # 3. Move, by less and less of the step when matches come and go in turn.
-        rested = outer + 1 - len(config.kernel_px)
-        share = 1.0 / (1.0 + max(0, rested - config.full_steps))
-        state = state.towards(problem.state_at(optimum), share)
+        at_last = outer + 1 - len(kernels_px)
+        share = step_share(at_last)
+        state = state.towards(frozen.state_at(optimum), share)
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
         yield pairs
         # 4. Stop when the step is small at the last scale.
-        if rested >= 0:
-            step = problem.step_sigmas(optimum, system)
-            if share * step < config.step_sigmas:
-                converged = step < config.circle_sigmas
+        if at_last >= 0:
+            step = frozen.step_sigmas(optimum, system)
+            if share * step < step_sigmas:
+                converged = step < CIRCLE_SIGMAS
                 break
     # 5. The last frozen problem as a graph.
     found = [pair for own in matches for pair in own.by_pair()]
-    graph, _ = joint_graph(found, problem.state, config.graph, guess)
-    if belief is not None:
-        graph.add(belief)
+    graph, _ = joint_graph(found, frozen.state, config.graph, centre)
+    if problem.prior is not None:
+        graph.add(problem.prior)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
-    values = problem.values_at(optimum)
-    return JointSolution(state, matches, found, graph, values, outer + 1, converged, problem.state)
+    values = frozen.values_at(optimum)
+    return JointSolution(state, matches, found, graph, values, outer + 1, converged, frozen.state)
+
+
+def solve_all(
+    problem: JointProblem,
+    starts: Sequence[tuple[State, State]],
+    kernels_px: Sequence[float],
+    progress: Progress | None = None,
+) -> list[JointSolution]:
+    """Solutions from (start, what the weak priors are centred on), the one that agrees best first.
+
+    Raises:
+        EstimationError: none leads anywhere.
+    """
+    solutions, failures = [], []
+    for start, centre in starts:
+        try:
+            solutions.append(solve_joint(replace(problem, centre=centre), start, kernels_px, progress))
+        except EstimationError as error:
+            failures.append(error)
+    if not solutions:
+        raise failures[0]
+    return sorted(solutions, key=agreement, reverse=True)
 
 
 def support(solution: JointSolution) -> float:
@@ -191,16 +233,16 @@ def support_of(
     return total
 
 
-def concentration(
-    solution: JointSolution, drives: Sequence[Drive], tracks: Tracks, config: JointConfig
-) -> float:
+def concentration(solution: JointSolution, problem: JointProblem) -> float:
     """Support under the last kernel as a share of that under one five times as wide.
 
     A true pose leaves the masks' own errors, whatever share of the points has a mask; a wrong pose that
     was fitted to some contours leaves all distances.
     """
-    kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * config.kernel_px[-1])
-    matches = match_all(outlines_of(drives, tracks, config.graph), solution.state, kernel)
+    kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * KERNELS_PX[-1])
+    matches = match_all(
+        edges_of(problem.drives, problem.tracks, problem.config.graph), solution.state, kernel
+    )
     return support(solution) / max(_support(matches, solution.state), 1e-9)
 
 
@@ -215,6 +257,24 @@ def agreement(solution: JointSolution) -> float:
     The support alone prefers poses that bring many objects into view.
     """
     return support(solution) ** 2 / _seen(solution)
+
+
+def poor_fit(explained: float, concentration: float, rotation_observable: bool) -> list[str]:
+    """Why a solution may be wrong altogether, in sentences; none for one that explains the labels.
+
+    Args:
+        explained, concentration: as the functions of these names give them.
+    """
+    least_explained = MIN_EXPLAINED if rotation_observable else MIN_EXPLAINED_VAGUE
+    return [
+        f"only {100.0 * share:.0f} % {what} (expected {100.0 * least:.0f} % or more): "
+        "the pose may be wrong altogether"
+        for share, least, what in (
+            (explained, least_explained, "of the boundary points in view meet a contour"),
+            (concentration, MIN_CONCENTRATION, "of the matches are close ones"),
+        )
+        if share < least
+    ]
 
 
 def _seen(solution: JointSolution) -> int:

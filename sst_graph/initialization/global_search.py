@@ -1,9 +1,9 @@
-"""Global search for the extrinsic: no local step before a start that sees the whole problem.
+"""Global search for the extrinsic: candidates by label agreement over a grid of rotations.
 
 Labelled points are scored on blurred masks (:mod:`~sst_graph.initialization.label_agreement`); they are
 spread evenly over the sphere (a scan's own angular grid), so the score is a cross-correlation of two labelled
-panoramas. A grid of rotations is scored on strongly blurred, coarse masks; the best are refined in pose and
-time offset by the cross-entropy method on ever sharper ones.
+panoramas. A grid of rotations is scored on strongly blurred, coarse masks; the best are improved in pose and
+time offset by the cross-entropy method (Rubinstein), stage by stage on ever sharper masks.
 """
 
 from __future__ import annotations
@@ -17,71 +17,90 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
-from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.initialization.label_agreement import CELLS, Judge, Level, SearchFrame, States, Votes
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.initialization.label_agreement import (
+    CELLS,
+    AgreementMap,
+    LabelledPoints,
+    LabelScore,
+    SearchFrame,
+    States,
+)
+from sst_graph.stepwise import Stepwise
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-_MOST_STEPS = 40
-"""Widest box in steps to either side: (2 * 40 + 1)^3 rotations take a second a score, and 100 MB."""
+_GRID_STEP = np.radians(7.5)
+"""Spacing of the rotation grid over all of SO(3), about half the widest blur's reach [rad]; the cost grows
+with its inverse cube."""
+_BOX_STEP = np.radians(5.0)
+"""Spacing within the box around a guess [rad]."""
+_REACH = 1.4
+"""Largest angle from a guess to a candidate, in half widths of the box: its corners, at 1.7, are cut off."""
+_APART = np.radians(3.0)
+"""Candidates closer than this count as one [rad]."""
+_NEAR_TRANSLATION_M = 0.1
+"""Half width of the translations of the first family of candidates [m]: with less to give way, they are hard
+to mislead."""
+_WITHOUT_GUESS = 4
+"""Without a guess so many times more candidates are kept."""
+_SCORES: tuple[LabelScore, ...] = ("votes", "dependence")
+"""Scores that candidates are found by, each on its own. With one of them a search takes half the time; of 29
+drives with bad labels or few objects, votes alone lose one more start without a guess."""
 
 
 @dataclass(frozen=True)
 class SearchConfig(Settings):
-    """How the start is searched.
+    """Where a start is searched.
 
     Attributes:
-        frames: most frames that take part.
+        frames: most frames that are looked at.
         points_per_class: most points of a class in one frame.
-        grid_step_deg: spacing of the rotation grid over all of SO(3) [deg].
         box_deg: half width of the box of rotation vectors around a guess [deg].
-        box_step_deg: spacing within the box [deg].
-        reach_deg: largest angle from a guess to an answer [deg].
-        apart_deg: candidates closer than this count as one [deg].
-        held_translation_m: half width of the translations while they are held near the guess [m].
         translation_m: half width of the translations around a guess [m].
         free_translation_m: half width of the translations without a guess [m].
-        delay_s: half width of the time offsets [s].
-        blurs_px: widths of the mask's blur, coarse to fine, at an image width of 1242 [px].
-        judges: scores that candidates are found by, each on its own.
-        candidates: poses refined at the first, second, ... blur.
-        free_breadth: so many times more of them where nothing is known.
-        shares: share of the points that votes at the first, second, ... blur.
-        population, rounds: samples and rounds of the cross-entropy method at each blur.
+        time_offset_s: half width of the time offsets [s].
         seed: of the sampler.
     """
 
     frames: int = setting(6, at_least=1, at_most=50)
     points_per_class: int = setting(250, at_least=1, at_most=5000)
-    grid_step_deg: float = setting(7.5, at_least=3.0, at_most=60.0)
     box_deg: float = setting(30.0, at_least=0.0, at_most=180.0)
-    box_step_deg: float = setting(5.0, at_least=0.5, at_most=60.0)
-    reach_deg: float = setting(42.0, at_least=0.0, at_most=180.0)
-    apart_deg: float = setting(3.0, at_least=0.1, at_most=180.0)
-    held_translation_m: float = setting(0.1, at_least=0.0, at_most=20.0)
     translation_m: float = setting(0.6, at_least=0.001, at_most=20.0)
     free_translation_m: float = setting(2.0, at_least=0.001, at_most=20.0)
-    delay_s: float = setting(0.5, at_least=0.0, at_most=5.0)
-    blurs_px: tuple[float, ...] = setting(
-        (45.0, 22.0, 10.0, 4.0), at_least=0.5, at_most=500.0, length=(1, 10)
-    )
-    judges: tuple[Judge, ...] = setting(("votes", "dependence"), length=(1, 2))
-    candidates: tuple[int, ...] = setting((80, 40, 20, 12), at_least=1, at_most=2000, length=(1, 10))
-    free_breadth: int = setting(4, at_least=1, at_most=20)
-    shares: tuple[float, ...] = setting((0.25, 0.5, 1.0, 1.0), at_least=0.001, at_most=1.0, length=(1, 10))
-    population: int = setting(64, at_least=1, at_most=1000)
-    rounds: int = setting(4, at_least=0, at_most=50)
+    time_offset_s: float = setting(0.5, at_least=0.0, at_most=5.0)
     seed: int = setting(0, at_least=0, at_most=10**15)
 
-    def __post_init__(self) -> None:
-        blurs, shares = len(self.blurs_px), len(self.shares)
-        if blurs != shares:
-            raise ConfigError(f"blurs_px: found {blurs} of them, expected {shares}, as many as shares")
-        self.expect_at_most("box_deg", _MOST_STEPS * self.box_step_deg, f"{_MOST_STEPS} box_step_deg")
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the search.
+
+    Attributes:
+        blur_px: width of the masks' blur, at an image width of 1242 [px].
+        share: of the points that are used.
+        candidates: most that are kept.
+        samples, rounds: of the cross-entropy method, for each candidate.
+    """
+
+    blur_px: float
+    share: float
+    candidates: int
+    samples: int
+    rounds: int
+
+
+COARSE = (Stage(45.0, 0.25, 80, samples=16, rounds=1),)
+"""For candidates that are refined by silhouettes: those reach farther than what this leaves undone."""
+FINE = (
+    Stage(45.0, 0.25, 80, samples=64, rounds=4),
+    Stage(22.0, 0.5, 40, samples=64, rounds=4),
+    Stage(10.0, 1.0, 20, samples=64, rounds=4),
+    Stage(4.0, 1.0, 12, samples=64, rounds=4),
+)
+"""To the label agreement's own optimum."""
 
 
 @dataclass(frozen=True)
@@ -93,115 +112,115 @@ class Candidate:
     score: float
 
 
-def search_start(
-    frames: Sequence[SearchFrame],
-    camera: PinholeCamera,
-    classes: Sequence[SemanticClass],
-    guess: gtsam.Pose3 | None,
-    offset_s: float = 0.0,
-    config: SearchConfig | None = None,
-) -> list[Candidate]:
-    """All steps of :func:`searching_start`."""
-    return whole(searching_start(frames, camera, classes, guess, offset_s, config))
+@dataclass(frozen=True)
+class SearchProblem:
+    """What is searched.
 
-
-def searching_start(
-    frames: Sequence[SearchFrame],
-    camera: PinholeCamera,
-    classes: Sequence[SemanticClass],
-    guess: gtsam.Pose3 | None,
-    offset_s: float = 0.0,
-    config: SearchConfig | None = None,
-) -> Stepwise[list[Candidate]]:
-    """Refined candidates of several families in turn, best first in each.
-
-    A family is one score with the translation held or free.
-
-    Args:
+    Attributes:
+        frames: that are looked at.
+        camera: of all of them.
+        classes: that are compared.
         guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
+        offset_s: rough time offset [s].
+        config: where to search.
+    """
+
+    frames: Sequence[SearchFrame]
+    camera: PinholeCamera
+    classes: Sequence[SemanticClass]
+    guess: gtsam.Pose3 | None
+    offset_s: float
+    config: SearchConfig
+
+    @property
+    def spacing(self) -> float:
+        """Of the grid of rotations [rad]."""
+        return float(_GRID_STEP if self.guess is None else _BOX_STEP)
+
+    def grid(self) -> States:
+        """Rotations to begin with, at the guess's translation."""
+        rotations, translation = _so3_grid(_GRID_STEP), np.zeros(3)
+        if self.guess is not None:
+            box = np.radians(self.config.box_deg)
+            axis = _BOX_STEP * np.arange(-round(box / _BOX_STEP), round(box / _BOX_STEP) + 1)
+            vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+            vectors = vectors[np.linalg.norm(vectors, axis=1) <= _REACH * box]
+            rotations = rotation_matrices(vectors) @ np.asarray(self.guess.rotation().matrix())
+            translation = np.asarray(self.guess.translation(), dtype=np.float64)
+        m = len(rotations)
+        return States(rotations, np.tile(translation, (m, 1)), np.full(m, self.offset_s))
+
+    def in_reach(self, states: States) -> IntArray:
+        """Indices of the states whose rotation is in reach of the guess; all of them where none is."""
+        every = np.arange(len(states))
+        if self.guess is None:
+            return every
+        reach = min(_REACH * np.radians(self.config.box_deg), np.pi)
+        trace = np.einsum("mij,ij->m", states.rotations, np.asarray(self.guess.rotation().matrix()))
+        inside = np.flatnonzero(trace >= 1.0 + 2.0 * np.cos(reach))
+        return inside if len(inside) else every
+
+
+def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[list[Candidate]]:
+    """Candidates of several families in turn, best first in each.
+
+    A family is one score with the translation near the guess's, or wherever it may be.
 
     Raises:
         EstimationError: no frame has a point and a pixel of one of the classes.
     """
-    config = config or SearchConfig()
+    config = problem.config
     rng = np.random.default_rng(config.seed)
-    votes = Votes.gather(frames, camera, classes, config.points_per_class, rng)
+    points = LabelledPoints.sampled(
+        problem.frames, problem.camera, problem.classes, config.points_per_class, rng
+    )
     yield 5
+    free_m = config.free_translation_m if problem.guess is None else config.translation_m
     families = []
-    for judge in config.judges:
-        levels = []
-        for blur_px, share in zip(config.blurs_px, config.shares, strict=True):
-            levels.append(votes.level(blur_px, share, judge))
+    for score in _SCORES:
+        # 1. A grid of rotations on the most blurred masks.
+        maps = []
+        for stage in stages:
+            maps.append(points.agreement_map(stage.blur_px, stage.share, score))
             yield 5
-        families += yield from _families(levels, guess, offset_s, votes.moving, config, rng)
+        grid = problem.grid()
+        scores = yield from maps[0].score_steps(grid)
+        best, _ = _peaks(grid, scores, _kept(stages[0], problem), 1.5 * problem.spacing)
+        # 2. The best improved on ever sharper masks.
+        for half_width_m in (_NEAR_TRANSLATION_M, free_m):
+            region = _Region.of(problem, half_width_m, points.moving)
+            families.append(
+                (yield from _improve_steps(best, list(zip(stages, maps, strict=True)), problem, region, rng))
+            )
     found = [c for several in itertools.zip_longest(*families) for c in several if c is not None]
-    cells = len(frames) * CELLS[0] * CELLS[1]
+    cells = len(problem.frames) * CELLS[0] * CELLS[1]
     return [replace(candidate, score=candidate.score / cells) for candidate in found]
 
 
-def _families(
-    levels: Sequence[Level],
-    guess: gtsam.Pose3 | None,
-    offset_s: float,
-    moving: bool,
-    config: SearchConfig,
-    rng: np.random.Generator,
-) -> Stepwise[list[list[Candidate]]]:
-    """Candidates under one score: with the translation held near the guess, and free."""
-    # 1. A grid of rotations on the most blurred masks.
-    rotations, translation = _grid(guess, config)
-    states = States(rotations, np.tile(translation, (len(rotations), 1)), np.full(len(rotations), offset_s))
-    breadth = config.free_breadth if guess is None else 1
-    apart = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
-    scores = yield from levels[0].scoring(states)
-    best, _ = _peaks(states, scores, breadth * config.candidates[0], 1.5 * apart)
-    # 2. Refined at every blur, fewer surviving each: with the translation held near the guess, and free.
-    #    The first is hard to mislead, for it has less to give way with; the second reaches farther.
-    spread_r = np.radians(config.grid_step_deg if guess is None else config.box_step_deg)
-    free_t = config.free_translation_m if guess is None else config.translation_m
-    families = []
-    for spread_t in (config.held_translation_m, free_t):
-        scale = np.array([spread_r] * 3 + [0.5 * spread_t] * 3 + [0.5 * config.delay_s * moving])
-        limits = _Limits(translation, spread_t, offset_s, config.delay_s)
-        families.append((yield from _refined(best, levels, guess, scale, limits, config, rng)))
-    return families
+def _kept(stage: Stage, problem: SearchProblem) -> int:
+    return stage.candidates * (_WITHOUT_GUESS if problem.guess is None else 1)
 
 
-def _refined(
+def _improve_steps(
     best: States,
-    levels: Sequence[Level],
-    guess: gtsam.Pose3 | None,
-    scale: FloatArray,
-    limits: _Limits,
-    config: SearchConfig,
+    stages: Sequence[tuple[Stage, AgreementMap]],
+    problem: SearchProblem,
+    region: _Region,
     rng: np.random.Generator,
 ) -> Stepwise[list[Candidate]]:
-    """Candidates after all blurs, the best first, with their plain scores."""
-    breadth = config.free_breadth if guess is None else 1
+    """Candidates after all stages, the best first, with their plain scores."""
     scores = np.zeros(len(best))
-    for number, (level, blur) in enumerate(zip(levels, config.blurs_px, strict=True)):
-        shrunk = scale * (blur / config.blurs_px[0]) ** 0.7
-        moved = yield from _cross_entropy(level, best, shrunk, limits, config, rng)
-        near = moved.take(_within(moved, guess, np.radians(config.reach_deg)))
-        keep = breadth * config.candidates[min(number + 1, len(config.candidates) - 1)]
-        found = yield from level.scoring(near)
-        best, scores = _peaks(near, found, keep, np.radians(config.apart_deg))
+    for number, (stage, agreement) in enumerate(stages):
+        scale = region.scale * (stage.blur_px / stages[0][0].blur_px) ** 0.7
+        moved = yield from _cross_entropy_steps(agreement, best, scale, region, stage, rng)
+        near = moved.take(problem.in_reach(moved))
+        found = yield from agreement.score_steps(near)
+        following = stages[min(number + 1, len(stages) - 1)][0]
+        best, scores = _peaks(near, found, _kept(following, problem), _APART)
     return [
         Candidate(gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t), float(offset), float(score))
         for R, t, offset, score in zip(best.rotations, best.translations, best.offsets, scores, strict=True)
     ]
-
-
-def _grid(guess: gtsam.Pose3 | None, config: SearchConfig) -> tuple[FloatArray, FloatArray]:
-    """Rotations (m, 3, 3) to begin with, and the translation they share."""
-    if guess is None:
-        return _so3_grid(np.radians(config.grid_step_deg)), np.zeros(3)
-    n = round(config.box_deg / config.box_step_deg)
-    axis = np.radians(config.box_step_deg) * np.arange(-n, n + 1)
-    vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-    vectors = vectors[np.linalg.norm(vectors, axis=1) <= np.radians(config.reach_deg)]
-    rotations = rotation_matrices(vectors) @ np.asarray(guess.rotation().matrix())
-    return rotations, np.asarray(guess.translation(), dtype=np.float64)
 
 
 def _so3_grid(step: float) -> FloatArray:
@@ -234,13 +253,28 @@ def rotation_matrices(vectors: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class _Limits:
-    """Box that translations [m] and time offsets [s] stay in."""
+class _Region:
+    """Box that translations [m] and time offsets [s] stay in.
+
+    Attributes:
+        translation, offset_s: its centre.
+        half_width_m, half_width_s: half its width.
+        scale: (7,) standard deviations of the first samples: rotation vector, translation, offset.
+    """
 
     translation: FloatArray
-    half_width_m: float
     offset_s: float
+    half_width_m: float
     half_width_s: float
+    scale: FloatArray
+
+    @classmethod
+    def of(cls, problem: SearchProblem, half_width_m: float, moving: bool) -> _Region:
+        """Around a problem's guess; the time offset is sampled where something moves."""
+        translation = np.zeros(3) if problem.guess is None else np.asarray(problem.guess.translation())
+        half_width_s = problem.config.time_offset_s
+        scale = [problem.spacing] * 3 + [0.5 * half_width_m] * 3 + [0.5 * half_width_s * moving]
+        return cls(translation, problem.offset_s, half_width_m, half_width_s, np.array(scale))
 
     def clip(self, states: States) -> States:
         return States(
@@ -249,15 +283,6 @@ class _Limits:
             + np.clip(states.translations - self.translation, -self.half_width_m, self.half_width_m),
             self.offset_s + np.clip(states.offsets - self.offset_s, -self.half_width_s, self.half_width_s),
         )
-
-
-def _within(states: States, guess: gtsam.Pose3 | None, reach_rad: float) -> IntArray:
-    """Indices of the states whose rotation is in reach of the guess; all of them where none is."""
-    if guess is None:
-        return np.arange(len(states))
-    trace = np.einsum("mij,ij->m", states.rotations, np.asarray(guess.rotation().matrix()))
-    inside = np.flatnonzero(trace >= 1.0 + 2.0 * np.cos(reach_rad))
-    return inside if len(inside) else np.arange(len(states))
 
 
 _PEAKS_AT_ONCE = 512
@@ -284,28 +309,28 @@ def _peaks(states: States, scores: FloatArray, count: int, apart_rad: float) -> 
     return states.take(index), scores[index]
 
 
-def _cross_entropy(
-    level: Level,
+def _cross_entropy_steps(
+    agreement: AgreementMap,
     states: States,
     scale: FloatArray,
-    limits: _Limits,
-    config: SearchConfig,
+    region: _Region,
+    stage: Stage,
     rng: np.random.Generator,
 ) -> Stepwise[States]:
     """Each state moved to a better one nearby, sorted by score."""
-    elite = max(4, config.population // 8)
-    m, n = len(states), config.population
+    elite = max(4, stage.samples // 8)
+    m, n = len(states), stage.samples
     sigmas = np.tile(scale, (m, 1))
-    incumbent, scores = states, (yield from level.scoring(states))
-    for _ in range(config.rounds):
+    incumbent, scores = states, (yield from agreement.score_steps(states))
+    for _ in range(stage.rounds):
         delta = rng.standard_normal((m, n, 7)) * sigmas[:, None, :]
         delta[:, 0] = 0.0
-        samples = limits.clip(_perturbed(incumbent, delta))
-        values = (yield from level.scoring(samples)).reshape(m, n)
+        samples = region.clip(_perturbed(incumbent, delta))
+        values = (yield from agreement.score_steps(samples)).reshape(m, n)
         order = np.argsort(-values, axis=1, kind="stable")[:, :elite]
         chosen = np.take_along_axis(delta, order[:, :, None], axis=1)
-        mean = limits.clip(_perturbed(incumbent, chosen.mean(axis=1, keepdims=True)))
-        mean_scores = yield from level.scoring(mean)
+        mean = region.clip(_perturbed(incumbent, chosen.mean(axis=1, keepdims=True)))
+        mean_scores = yield from agreement.score_steps(mean)
         top = samples.take(np.arange(m) * n + order[:, 0])
         top_scores = np.take_along_axis(values, order[:, :1], axis=1)[:, 0]
         use_mean = mean_scores >= top_scores

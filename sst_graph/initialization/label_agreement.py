@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -26,9 +26,9 @@ Float32 = NDArray[np.float32]
 IntArray = NDArray[np.intp]
 
 CELLS = (10, 32)
-"""Rows and columns of the cells of an image whose votes share one voice."""
+"""Rows and columns of the cells of an image; the votes of a cell share one weight."""
 
-_DOUBT = 0.1
+_WRONG_LABELS = 0.1
 """Share of labels that are no better than chance: a vote against a pose is never below its logarithm."""
 _BATCH_POINTS = 400_000
 
@@ -67,12 +67,12 @@ class States:
         return len(self.offsets)
 
 
-Judge = Literal["votes", "dependence"]
+LabelScore = Literal["votes", "dependence"]
 
 
 @dataclass(frozen=True)
-class Level:
-    """All points and masks at one blur, ready to be scored.
+class AgreementMap:
+    """All points and masks at one blur: what scores poses.
 
     Attributes:
         camera: full-sized; masks are ``shrink`` times smaller, ``shape`` rows and columns.
@@ -85,7 +85,7 @@ class Level:
         weights: (n,) of the votes.
         classes: (n,) number of each point's class; ``class_count`` for the rest.
         cell_count: cells of all images.
-        judge: which score.
+        kind: which score.
     """
 
     camera: PinholeCamera
@@ -101,19 +101,10 @@ class Level:
     cell_count: int
     shrink: float
     shape: tuple[int, int]
-    judge: Judge
+    kind: LabelScore
 
-    @property
-    def voice(self) -> float:
-        """Weight of the votes that give a cell half a voice."""
-        return 0.5 * float(self.weights.mean())
-
-    def score(self, states: States) -> FloatArray:
-        """(m,) scores of poses."""
-        return whole(self.scoring(states))
-
-    def scoring(self, states: States) -> Stepwise[FloatArray]:
-        """(m,) scores of poses, step by step."""
+    def score_steps(self, states: States) -> Stepwise[FloatArray]:
+        """(m,) scores of poses, some of them a step."""
         chunk = max(1, _BATCH_POINTS // max(1, len(self.lPs)))
         scores = []
         for start in range(0, len(states), chunk):
@@ -122,17 +113,18 @@ class Level:
         return np.concatenate(scores)
 
     def _score(self, states: States) -> FloatArray:
-        """The votes of one cell of one image share one voice.
+        """The votes of one cell of one image share one weight.
 
-        Without this a pose gains by crowding all points into one large mask.
+        Without this a pose gains by crowding all points into one large mask. A single mean vote gives a cell
+        two thirds of its full weight.
         """
-        state, point, pixel = self._seen(states)
+        state, point, pixel = self._in_image(states)
         weights = self.weights[point]
         cell = state * self.cell_count + self.first_cells[point] + self.cells[pixel]
-        crowd = np.bincount(cell, weights, len(states) * self.cell_count)[cell]
-        weights = weights / (self.voice + crowd)
+        in_cell = np.bincount(cell, weights, len(states) * self.cell_count)[cell]
+        weights = weights / (0.5 * float(self.weights.mean()) + in_cell)
         first = self.starts[point] + pixel
-        if self.judge == "dependence":
+        if self.kind == "dependence":
             return self._dependence(state, point, first, weights, len(states))
         votes = self.tables[first + self.classes[point] * self._size]
         return np.bincount(state, votes * weights, len(states)).astype(np.float64, copy=False)
@@ -154,7 +146,7 @@ class Level:
     def _size(self) -> int:
         return self.shape[0] * self.shape[1]
 
-    def _seen(self, states: States) -> tuple[IntArray, IntArray, IntArray]:
+    def _in_image(self, states: States) -> tuple[IntArray, IntArray, IntArray]:
         """State, point and pixel of the shrunk mask of every projection that falls into its image."""
         camera, shrink = self.camera, np.float32(self.shrink)
         R = states.rotations.astype(np.float32)
@@ -197,8 +189,8 @@ def _reach(centre: float, width: int, focal: float) -> np.float32:
 
 
 @dataclass(frozen=True)
-class Votes:
-    """Sampled points of all frames and the masks they vote on."""
+class LabelledPoints:
+    """Sampled points of all frames, and the masks that they are compared with."""
 
     camera: PinholeCamera
     frames: Sequence[SearchFrame]
@@ -214,14 +206,14 @@ class Votes:
         return any(float(np.linalg.norm(frame.l_twist[3:])) > 0.3 for frame in self.frames)
 
     @classmethod
-    def gather(
+    def sampled(
         cls,
         frames: Sequence[SearchFrame],
         camera: PinholeCamera,
         classes: Sequence[SemanticClass],
         points_per_class: int,
         rng: np.random.Generator,
-    ) -> Votes:
+    ) -> LabelledPoints:
         lPs, frame_of, class_of, weights = [], [], [], []
         for number, frame in enumerate(frames):
             channel = _channels(frame.classes, classes)
@@ -246,20 +238,20 @@ class Votes:
             np.concatenate(weights).astype(np.float32),
         )
 
-    def level(self, blur_px: float, share: float, judge: Judge = "votes") -> Level:
-        """A share of the votes, on masks blurred by a width [px at 1242 px image width]."""
+    def agreement_map(self, blur_px: float, share: float, kind: LabelScore = "votes") -> AgreementMap:
+        """A share of the points, on masks blurred by a width [px at 1242 px image width]."""
         some = np.arange(len(self.lPs)) % round(1.0 / share) == 0
         blur = blur_px * self.camera.width / 1242.0
         shrink = max(1.0, blur / 3.0)
         size = (max(8, round(self.camera.width / shrink)), max(8, round(self.camera.height / shrink)))
         shrink = self.camera.width / size[0]
-        table_of = _vote_tables if judge == "votes" else _share_tables
+        table_of = _vote_tables if kind == "votes" else _share_tables
         tables = [table_of(frame.mask, self.classes, size, blur / shrink) for frame in self.frames]
         starts = self.frame_of * ((len(self.classes) + 1) * size[0] * size[1])
         velocities = self._velocities()
         taus = np.array([frame.base_tau_s for frame in self.frames])[self.frame_of, None]
         down, across = (np.arange(n) * c // n for n, c in zip(size[::-1], CELLS, strict=True))
-        return Level(
+        return AgreementMap(
             self.camera,
             (self.lPs - taus * velocities)[some].astype(np.float32),
             velocities[some].astype(np.float32),
@@ -273,7 +265,7 @@ class Votes:
             len(self.frames) * CELLS[0] * CELLS[1],
             shrink,
             (size[1], size[0]),
-            judge,
+            kind,
         )
 
     def _velocities(self) -> FloatArray:
@@ -318,7 +310,7 @@ def _vote_tables(
     """(classes + 1, h, w) log-likelihood ratios of each class on a shrunk, blurred mask."""
     tables = []
     for c, p in enumerate(_share_tables(mask, classes, size, blur)):
-        votes = np.log(_DOUBT + (1.0 - _DOUBT) * p / max(float(p.mean()), 0.02))
+        votes = np.log(_WRONG_LABELS + (1.0 - _WRONG_LABELS) * p / max(float(p.mean()), 0.02))
         # Background on background is no evidence: a pose must not gain by seeing more of it.
         tables.append(np.minimum(votes, 0.0) if c == len(classes) else votes)
     return np.stack(tables).astype(np.float32)

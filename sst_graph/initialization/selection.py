@@ -1,4 +1,11 @@
-"""Which start is right: candidates of the global search are solved on a few frames and compared."""
+"""The start of the joint method: candidates, refined side by side, and the best of them selected.
+
+1. Candidates: poses of a grid whose labels agree (:mod:`~sst_graph.initialization.candidates`).
+2. Refinement: all of them by silhouettes on some scans, under narrowing kernels; the worse ones and those
+   that have met are dropped on the way (:mod:`~sst_graph.initialization.refinement`).
+3. Selection: the best by silhouettes and by the labels of all points, and different ones that are nearly as
+good.
+"""
 
 from __future__ import annotations
 
@@ -9,236 +16,183 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import GraphConfig, Tracks
-from sst_graph.graph.outer_loop import JointConfig, JointSolution, agreement, solve_joint
+from sst_graph.graph.building import GraphConfig
+from sst_graph.graph.matching import edges_of
+from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolution, agreement
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartConfig, finding_start, scoring_labels
+from sst_graph.initialization.candidates import StartConfig, StartProblem, candidate_steps, label_score_steps
 from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.label_agreement import States
-from sst_graph.initialization.many_poses import Poses, Steps
-from sst_graph.initialization.refinement import Field, holding_heat
-from sst_graph.stepwise import Stepwise, whole
-from sst_graph.types import SemanticClass
+from sst_graph.initialization.pose_batch import BatchEquations, Poses
+from sst_graph.initialization.refinement import RefinementProblem, refine_steps
+from sst_graph.stepwise import Stepwise
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+_Start = tuple[gtsam.Pose3, float]
 
+SELECTION_SCANS = 10
+"""Most scans of each drive that candidates are compared on."""
+_CANDIDATES, _CANDIDATES_WITHOUT_GUESS = 320, 1280
+"""Most candidates that are refined; 640 without a guess fail now and then."""
+_WIDE_POINTS = 500
+"""Boundary points, in all, that they are compared on while the kernels are wide."""
+_KEPT_SHARE, _KEPT = 0.4, 16
+"""Share of the candidates that goes on from one kernel stage to the next, but so many at least, if so many
+differ."""
+_WIDE_STAGES = (KERNELS_PX[:3], KERNELS_PX[3:6])
+"""Scales of the wide kernels, by stages."""
+_NARROW_STAGE = (*NARROW_KERNELS_PX, *[NARROW_KERNELS_PX[-1]] * 6)
+"""Of the narrow ones; at the last scale most have converged after six steps."""
+_SELECTED = 2
+"""Most different solutions that are solved on all frames ..."""
+_SELECTED_RATIO = 0.7
+"""... if their score is at least this fraction of the best one's."""
+ALTERNATIVE_RATIO = 0.9
+"""A different solution with at least this fraction of the best one's score makes the answer ambiguous."""
 _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
 """Solutions on a few frames that are closer than all of these lead to one answer."""
-_SAME_DEG = 2.0
-"""Solutions closer than this are one [deg]."""
-_FAR_DEG = 20.0
-"""A search around one pose finds those that are closer than this [deg]."""
+_STILL_ALIKE = 3.0
+"""While kernels are wide, candidates count as one at this many times the distance."""
+_SAME_RAD = float(np.radians(2.0))
+"""Solutions closer than this are one [rad]."""
+_FAR_RAD = float(np.radians(20.0))
+"""A search around one pose finds those that are closer than this [rad]."""
+_DISTANT = 3
+"""Most poses that the second search looks around. Of 29 drives with bad labels or few objects, one was lost
+without it; it takes a quarter of the time of a start without a guess."""
 REACH = 1.25
 """Solutions may lie this many times as far from the guess as was searched, along each axis; without a guess,
 in all."""
 
 
 @dataclass(frozen=True)
-class Contest:
-    """Outcome of a contest.
+class Selection:
+    """Selected starts.
 
     Attributes:
-        finalists: (cTl, offset [s]) of the best supported solutions, no two alike; the winner first, then one
+        starts: (cTl, offset [s]) of the best supported solutions, no two alike; the best first, then one
             that is nearly as good and not near it, where there is one.
-        leads: the winner and those of the others, with the support of a finalist, that are far from it.
+        distant: the best, and those nearly as good that are far from it and from each other.
         score: of the search's best candidate.
     """
 
-    finalists: tuple[tuple[gtsam.Pose3, float], ...]
-    leads: tuple[tuple[gtsam.Pose3, float], ...]
+    starts: tuple[_Start, ...]
+    distant: tuple[_Start, ...]
     score: float
 
 
-def choose_start(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    classes: Sequence[SemanticClass],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
-    joint: JointConfig,
+def select_start_steps(
+    problem: StartProblem,
+    graph: GraphConfig,
     config: StartConfig,
-) -> Contest:
-    """All steps of :func:`choosing_start`."""
-    steps = choosing_start(drives, tracks, classes, guess_cTl, guess_offset_s, joint, config)
-    return whole(steps)
+    most_scans: int = SELECTION_SCANS,
+    most_candidates: int = _CANDIDATES,
+) -> Stepwise[Selection]:
+    """Search candidates for a start, refine them and select the best.
 
+    Without a guess a second search looks more closely around the best that are far from each other.
 
-def choosing_start(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    classes: Sequence[SemanticClass],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
-    joint: JointConfig,
-    config: StartConfig,
-) -> Stepwise[Contest]:
-    """Search for a start and let the candidates compete.
-
-    Without a guess a second search looks closer around the best of the first that are far from each other.
+    Args:
+        graph: noise and priors of the matches.
+        most_scans: scans of each drive that candidates are compared on.
+        most_candidates: that are refined of a search around a guess.
 
     Raises:
-        EstimationError: no candidate leads anywhere.
+        EstimationError: no candidate leads to a solution near the guess.
     """
-    coarse = replace(config, search=_coarse(config))
-    candidates = yield from finding_start(drives, tracks, classes, guess_cTl, guess_offset_s, coarse)
-    contest = yield from holding_contest(
-        drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config
-    )
-    if guess_cTl is not None:
-        return contest
-    closer = []
-    for cTl, offset_s in contest.leads:
-        around = yield from finding_start(drives, tracks, classes, cTl, guess_offset_s, coarse)
-        closer += [Candidate(cTl, offset_s, contest.score), *around[: config.contenders]]
-    return (yield from holding_contest(drives, tracks, classes, closer, None, guess_offset_s, joint, config))
-
-
-def hold_contest(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    classes: Sequence[SemanticClass],
-    candidates: Sequence[Candidate],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
-    joint: JointConfig,
-    config: StartConfig,
-) -> Contest:
-    """All steps of :func:`holding_contest`."""
-    steps = holding_contest(drives, tracks, classes, candidates, guess_cTl, guess_offset_s, joint, config)
-    return whole(steps)
-
-
-def holding_contest(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    classes: Sequence[SemanticClass],
-    candidates: Sequence[Candidate],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
-    joint: JointConfig,
-    config: StartConfig,
-) -> Stepwise[Contest]:
-    """Solve the best candidates on a few scans; the solution that the labels agree with most wins.
-
-    Raises:
-        EstimationError: no candidate leads anywhere.
-    """
+    candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
         start = ((candidates[0].cTl, candidates[0].offset_s),)
-        return Contest(start, start, candidates[0].score)
-    # 1. All candidates under wide kernels, on some of the points.
-    few = [_thinned(drive, config.contest_scans) for drive in drives]
-    field = Field.of(few, tracks, classes, _simple(joint.graph, config))
-    quick = field.thinned(config.heat_points)
-    yield 10
-    contenders = config.free_contenders if guess_cTl is None else config.contenders
-    poses = _poses(_with_offsets(candidates[:contenders], guess_offset_s), field.biases)
-    centres = _centres(poses, guess_cTl, guess_offset_s)
-    for kernels_px in _wide_heats(joint):
-        poses = yield from holding_heat(quick, poses, centres, kernels_px)
-        steps = yield from quick.stepping(poses, kernels_px[-1])
-        kept = _survivors(poses, steps, config)
-        poses, centres = poses.take(kept), centres.take(kept)
-    # 2. What is left under narrow ones, on all points.
-    narrow = narrowed(joint).kernel_px
-    poses = yield from holding_heat(field, poses, centres, (*narrow, *[narrow[-1]] * config.settling))
-    # 3. The best that stayed within reach, by boundaries and by all labels.
-    steps = yield from field.stepping(poses, narrow[-1])
-    states = States(poses.rotations, poses.translations, poses.offsets)
-    scores = yield from scoring_labels(drives, tracks, classes, states, guess_offset_s, config)
-    ranks = _agreements(steps) * np.sqrt(np.maximum(scores, 0.0)) * _within(poses, guess_cTl, config)
-    order = _different(poses, ranks)
-    if ranks[order[0]] <= 0.0:
-        raise EstimationError("no candidate of the search leads to a solution near the guess")
-    poses, ranks = poses.take(order), ranks[order]
-    finalists = [
-        (pose, float(offset))
-        for pose, offset, rank in zip(_cTls(poses), poses.offsets, ranks, strict=True)
-        if rank > config.finalist_ratio * ranks[0]
-    ]
-    leads = tuple(_far_apart(finalists)[: config.leads])
-    rival, most = _rival(_cTls(poses), ranks, config), config.finalists
-    if rival is not None:
-        finalists.insert(1, finalists.pop(rival))
-        most += 1
-    return Contest(tuple(finalists[:most]), leads, candidates[0].score)
+        return Selection(start, start, candidates[0].score)
+    candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
+    selection = yield from select_among_steps(problem, candidates, graph, config.search, most_scans)
+    if problem.guess is not None:
+        return selection
+    closer = []
+    for cTl, offset_s in selection.distant:
+        around = yield from candidate_steps(replace(problem, guess=cTl), config)
+        closer += [Candidate(cTl, offset_s, selection.score), *around[:most_candidates]]
+    return (yield from select_among_steps(problem, closer, graph, config.search, most_scans))
 
 
-def solve_all(
-    drives: Sequence[Drive],
-    starts: Sequence[tuple[State, State]],
-    joint: JointConfig,
-    tracks: Tracks,
-    progress: Progress | None = None,
-) -> list[JointSolution]:
-    """Solutions from (start, what the weak priors are centred on), the one that agrees best first.
+def select_among_steps(
+    problem: StartProblem,
+    candidates: Sequence[Candidate],
+    graph: GraphConfig,
+    config: SearchConfig,
+    most_scans: int = SELECTION_SCANS,
+) -> Stepwise[Selection]:
+    """Refine candidates; the solution that the labels agree with most is the first of the selection.
 
     Raises:
-        EstimationError: none leads anywhere.
+        EstimationError: no candidate leads to a solution near the guess.
     """
-    solutions, failures = [], []
-    for start, centre in starts:
-        try:
-            solutions.append(solve_joint(drives, start, joint, progress, centre, tracks))
-        except EstimationError as error:
-            failures.append(error)
-    if not solutions:
-        raise failures[0]
-    return sorted(solutions, key=agreement, reverse=True)
+    # 1. All candidates under wide kernels, on some of the points.
+    few = [_thinned(drive, most_scans) for drive in problem.drives]
+    full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
+    rough = full.thinned(_WIDE_POINTS)
+    yield 10
+    poses = _poses(_with_offsets(candidates, problem.offset_s), full.biases)
+    centres = _centres(poses, problem)
+    for kernels_px in _WIDE_STAGES:
+        poses = yield from refine_steps(rough, poses, centres, kernels_px)
+        equations = yield from rough.equation_steps(poses, kernels_px[-1])
+        kept = _kept(poses, equations)
+        poses, centres = poses.take(kept), centres.take(kept)
+    # 2. What is left under narrow ones, on all points.
+    poses = yield from refine_steps(full, poses, centres, _NARROW_STAGE)
+    equations = yield from full.equation_steps(poses, _NARROW_STAGE[-1])
+    # 3. The best that stayed within reach, by boundaries and by all labels.
+    states = States(poses.rotations, poses.translations, poses.offsets)
+    scores = yield from label_score_steps(problem, states, config)
+    scores = equations.agreements * np.sqrt(np.maximum(scores, 0.0)) * _in_reach(poses, problem.guess, config)
+    order = _different(poses, scores)
+    if scores[order[0]] <= 0.0:
+        raise EstimationError("no candidate of the search leads to a solution near the guess")
+    poses, scores = poses.take(order), scores[order]
+    good = scores > _SELECTED_RATIO * scores[0]
+    starts = list(zip(_cTls(poses.take(np.flatnonzero(good))), poses.offsets[good].tolist(), strict=True))
+    return Selection(_with_alternative(starts, scores[good]), _far_apart(starts), candidates[0].score)
 
 
-def rivals(
-    solutions: Sequence[JointSolution],
-    guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
-    config: StartConfig,
-) -> list[tuple[JointSolution, State]]:
-    """The best solution and others elsewhere that agree well, too, with what their priors centre on.
+def alternatives(solutions: Sequence[JointSolution]) -> list[JointSolution]:
+    """The best solution and those elsewhere that agree with the labels well, too.
 
     Args:
         solutions: the one that agrees best first.
     """
     best = solutions[0]
-    least = config.finalist_ratio * agreement(best)
-    chosen = [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
-    return [(solution, prior_centre(solution.state, guess_cTl, guess_offset_s)) for solution in chosen]
+    least = _SELECTED_RATIO * agreement(best)
+    return [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
+
+
+def _with_alternative(starts: Sequence[_Start], scores: FloatArray) -> tuple[_Start, ...]:
+    """The first of some starts, best first, after the best one an alternative to it, where there is one."""
+    for number, (cTl, _) in enumerate(starts):
+        if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(starts[0][0], cTl) > _SAME_RAD:
+            others = [start for other, start in enumerate(starts) if other not in (0, number)]
+            return (starts[0], starts[number], *others[: _SELECTED - 1])
+    return tuple(starts[:_SELECTED])
+
+
+def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
+    """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
+    chosen: list[_Start] = []
+    for cTl, offset_s in starts:
+        if all(_turn_rad(cTl, other) > _FAR_RAD for other, _ in chosen):
+            chosen.append((cTl, offset_s))
+    return tuple(chosen[:_DISTANT])
 
 
 def _alike(one: State, other: State) -> bool:
     """Whether two solutions lead to one answer."""
     step = one.cTl.between(other.cTl)
-    near = float(np.linalg.norm(gtsam.Rot3.Logmap(step.rotation()))) < _ALIKE_RAD
+    near = _turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
     near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
     return near and abs(one.offsets_s[0] - other.offsets_s[0]) <= _ALIKE_S
-
-
-def narrowed(joint: JointConfig) -> JointConfig:
-    """Settings from a start that is nearly right: wide kernels would only lead away from it."""
-    half = (len(joint.kernel_px) + 1) // 2
-    return replace(joint, kernel_px=joint.kernel_px[half:] or joint.kernel_px[-1:])
-
-
-def prior_centre(start: State, guess_cTl: gtsam.Pose3 | None, guess_offset_s: float) -> State:
-    """What the weak priors are centred on: the guess, or the start's rotation without a translation."""
-    rotation = start.cTl.rotation()
-    cTl = guess_cTl if guess_cTl is not None else gtsam.Pose3(rotation, np.zeros(3))
-    return State(cTl, (guess_offset_s,) * len(start.offsets_s))
-
-
-def _coarse(config: StartConfig) -> SearchConfig:
-    """The search on the most blurred masks only: the heats reach farther than what they leave undone."""
-    search = config.search
-    return replace(
-        search,
-        blurs_px=search.blurs_px[:1],
-        shares=search.shares[:1],
-        candidates=search.candidates[:1],
-        population=config.population,
-        rounds=config.rounds,
-    )
 
 
 def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
@@ -247,19 +201,6 @@ def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> lis
         return list(candidates)
     others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
     return [*candidates, *others]
-
-
-def _simple(graph: GraphConfig, config: StartConfig) -> GraphConfig:
-    """Settings to compare with: only objects that are matched well."""
-    share = max(graph.match.min_object_share, config.min_object_share)
-    return replace(graph, match=replace(graph.match, min_object_share=share))
-
-
-def _wide_heats(joint: JointConfig) -> list[tuple[float, ...]]:
-    """The wider half of the kernels in two heats."""
-    half = (len(joint.kernel_px) + 1) // 2
-    wide = joint.kernel_px[:half]
-    return [kernels for kernels in (wide[: half // 2], wide[half // 2 :]) if kernels]
 
 
 def _thinned(drive: Drive, most: int) -> Drive:
@@ -284,30 +225,25 @@ def _cTls(poses: Poses) -> list[gtsam.Pose3]:
     ]
 
 
-def _centres(poses: Poses, guess_cTl: gtsam.Pose3 | None, guess_offset_s: float) -> Poses:
-    """What the weak priors of each pose are centred on, as in :func:`prior_centre`."""
-    offsets = np.full(len(poses), guess_offset_s)
-    if guess_cTl is None:
+def _centres(poses: Poses, problem: StartProblem) -> Poses:
+    """What the weak priors of each pose are centred on, as in :meth:`StartProblem.centre`."""
+    offsets, guess = np.full(len(poses), problem.offset_s), problem.guess
+    if guess is None:
         return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)
-    rotations = np.broadcast_to(guess_cTl.rotation().matrix(), poses.rotations.shape)
-    translations = np.broadcast_to(guess_cTl.translation(), poses.translations.shape)
+    rotations = np.broadcast_to(guess.rotation().matrix(), poses.rotations.shape)
+    translations = np.broadcast_to(guess.translation(), poses.translations.shape)
     return Poses(rotations, translations, offsets, poses.biases)
 
 
-def _agreements(steps: Steps) -> FloatArray:
-    """(m,) as :func:`sst_graph.graph.outer_loop.agreement`."""
-    return np.asarray(steps.support**2 / np.maximum(steps.seen, 1.0))
+def _kept(poses: Poses, equations: BatchEquations) -> IntArray:
+    """The better share of the poses, as far as they differ."""
+    most = max(_KEPT, round(_KEPT_SHARE * len(poses)))
+    return _different(poses, equations.agreements, _STILL_ALIKE)[:most]
 
 
-def _survivors(poses: Poses, steps: Steps, config: StartConfig) -> IntArray:
-    """The better ``config.survival`` of the poses, as far as they differ; ``config.survivors`` or more."""
-    most = max(config.survivors, round(config.survival * len(poses)))
-    return _different(poses, _agreements(steps), 3.0)[:most]
-
-
-def _different(poses: Poses, ranks: FloatArray, slack: float = 1.0) -> IntArray:
+def _different(poses: Poses, scores: FloatArray, slack: float = 1.0) -> IntArray:
     """Positions of the poses that are not alike a better one, the best first."""
-    remaining, chosen = np.argsort(-ranks, kind="stable"), []
+    remaining, chosen = np.argsort(-scores, kind="stable"), []
     flat = poses.rotations.reshape(-1, 9)
     trace = 1.0 + 2.0 * np.cos(slack * _ALIKE_RAD)
     while len(remaining):
@@ -322,32 +258,13 @@ def _different(poses: Poses, ranks: FloatArray, slack: float = 1.0) -> IntArray:
     return np.array(chosen, dtype=np.intp)
 
 
-def _within(poses: Poses, guess: gtsam.Pose3 | None, config: StartConfig) -> NDArray[np.bool_]:
+def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> NDArray[np.bool_]:
     """(m,) whether the translation stayed where it was searched, and did not run away with the points."""
-    search, away = config.search, poses.translations
     if guess is None:
-        return np.asarray(np.linalg.norm(away, axis=1) < REACH * search.free_translation_m)
-    return np.asarray(
-        (np.abs(away - np.asarray(guess.translation())) < REACH * search.translation_m).all(axis=1)
-    )
+        return np.asarray(np.linalg.norm(poses.translations, axis=1) < REACH * config.free_translation_m)
+    away = np.abs(poses.translations - np.asarray(guess.translation()))
+    return np.asarray((away < REACH * config.translation_m).all(axis=1))
 
 
-def _far_apart(starts: Sequence[tuple[gtsam.Pose3, float]]) -> list[tuple[gtsam.Pose3, float]]:
-    """The starts that are turned by more than :data:`_FAR_DEG` against every better one."""
-    chosen: list[tuple[gtsam.Pose3, float]] = []
-    for cTl, offset_s in starts:
-        if all(_turn_deg(cTl, other) > _FAR_DEG for other, _ in chosen):
-            chosen.append((cTl, offset_s))
-    return chosen
-
-
-def _turn_deg(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
-    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation()))))
-
-
-def _rival(cTls: Sequence[gtsam.Pose3], ranks: FloatArray, config: StartConfig) -> int | None:
-    """Which other pose, not near the first one, is nearly as good; None where none is."""
-    for number, (other, rank) in enumerate(zip(cTls[1:], ranks[1:], strict=True), 1):
-        if _turn_deg(cTls[0], other) > _SAME_DEG and rank > config.rival_ratio * ranks[0]:
-            return number
-    return None
+def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    return float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))

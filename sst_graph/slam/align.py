@@ -9,7 +9,13 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sst_graph.association.edge_matching import MatchConfig, Motion, SilhouetteMatches, match_silhouettes
+from sst_graph.association.edge_matching import (
+    MatchConfig,
+    Motion,
+    ScanWithImage,
+    SilhouetteMatches,
+    match_silhouettes,
+)
 from sst_graph.drive.preparation import (
     ImageFeatures,
     PrepareConfig,
@@ -89,7 +95,7 @@ def align_frame(
         l_velocities: (3,) over ground of objects that move, in the scan's LiDAR frame, by class and number
             within the scan (the data's instance, where all points of the class carry one) [m/s]; all others
             stand. Not with ``lTs``.
-        kernel: robust kernel of the matches; its scale, times ``config.gate``, is also the gate [px].
+        kernel: robust kernel of the matches; its scale, times ``GATE``, is also the farthest match [px].
         config: how boundary points meet contours.
 
     Returns:
@@ -101,19 +107,16 @@ def align_frame(
     _check_time(lTs, from_ns, l_velocities)
     points, contours = features_of(scan, image, classes)
     boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
-    found = match_silhouettes(
+    pair = ScanWithImage(
         boundaries,
         contours.contours,
         camera,
-        cTl if lTs is None else cTl * lTs,
-        offset_s,
         (contours.stamp_ns - (points.stamp_ns if from_ns is None else from_ns)) * 1e-9,
         _camera_motion(cTl, l_twist, l_acceleration),
-        biases_px or {},
-        kernel,
-        config,
         velocities_of_points(_velocities(l_velocities or {}), boundaries),
     )
+    place = cTl if lTs is None else cTl * lTs
+    found = match_silhouettes(pair, place, offset_s, biases_px or {}, kernel, config)
     return _frame_alignments(found)
 
 

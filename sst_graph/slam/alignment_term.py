@@ -265,7 +265,7 @@ class AlignmentTerm:
 
         Args:
             values: with extrinsic, offset, biases and the poses around the image.
-            kernel_px: scale of the robust kernel [px]; ``config.match.gate`` times it is the search range.
+            kernel_px: scale of the robust kernel [px]; ``GATE`` times it is the search range.
             information: what the image counts, over what its matches would by themselves.
         """
         place = self.place(values)

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.edge_matching import GATE
 from sst_graph.slam.alignment_term import TermMatches
 from sst_graph.slam.config import RematchConfig
 
@@ -69,8 +70,7 @@ def wide_uncertainty(
     found = [(each, each.term) for each in matches if each.factor is not None and each.term is not None]
     if not found:
         return []
-    gate = found[0][1].config.match.gate
-    limit = gate * found[0][0].kernel_px if reach_px is None else reach_px
+    limit = GATE * found[0][0].kernel_px if reach_px is None else reach_px
     if not np.isfinite(covariance).all():
         return [TermWarning(WarningKind.WIDE_UNCERTAINTY, float("inf"), limit, "px")]
     sigmas = [each.predicted_sigma_px(values, covariance) for each, _ in found]

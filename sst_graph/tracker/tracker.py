@@ -15,7 +15,8 @@ import numpy as np
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.object_store import lay_out
-from sst_graph.initialization.selection import narrowed
+from sst_graph.graph.convergence import FULL_STEPS
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import HistoryEntry
 from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
@@ -220,7 +221,6 @@ class Tracker(Tracking):
         Returns:
             Whether it rests: the last whole step was below 0.02 standard deviations.
         """
-        joint = self.config.calibration.joint
         at_last = self.smoother is None and self._finish_start()
         smoother = self.smoother
         if smoother is None:
@@ -231,7 +231,7 @@ class Tracker(Tracking):
         alive = self.window.objects.live
         try:
             rests = settle_window(
-                smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
+                smoother, self.matcher, NARROW_KERNELS_PX, most, FULL_STEPS, alive, self._share
             )
             self.known = Known.of(smoother)
             self.tests.look(smoother)

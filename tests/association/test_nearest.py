@@ -34,7 +34,7 @@ def blobs(seed: int) -> np.ndarray:
 def test_nearest_pixel_is_exact(seed: int) -> None:
     mask = blobs(seed)
     uvs = np.random.default_rng(seed).uniform([-0.5, -0.5], [63.499, 47.499], (400, 2))
-    found = NearestPixels.of(mask, VEHICLE).at(uvs)
+    found = NearestPixels.of(mask == VEHICLE).at(uvs)
     assert (mask[found[:, 1].astype(int), found[:, 0].astype(int)] == VEHICLE).all()
     members = np.argwhere(mask == VEHICLE)[:, ::-1].astype(float)
     cells = np.floor(uvs + 0.5)
@@ -43,7 +43,7 @@ def test_nearest_pixel_is_exact(seed: int) -> None:
 
 
 def test_no_pixel_of_a_class_has_no_map() -> None:
-    assert NearestPixels.of(np.zeros((4, 5), np.uint8), VEHICLE) is None
+    assert NearestPixels.of(np.zeros((4, 5), np.bool_)) is None
 
 
 def test_nearest_point_is_exact() -> None:
@@ -57,14 +57,14 @@ def test_pixels_are_sampled_from_the_class() -> None:
     mask = blobs(1)
     mask[10:30, 10:60] = VEHICLE
     total = int((mask == VEHICLE).sum())
-    pixels = sample_pixels(mask, VEHICLE, 0.02, np.random.default_rng(0))
+    pixels = sample_pixels(mask == VEHICLE, 0.02, np.random.default_rng(0))
     assert len(pixels) == round(0.02 * total) and len(np.unique(pixels, axis=0)) == len(pixels)
     assert (mask[pixels[:, 1].astype(int), pixels[:, 0].astype(int)] == VEHICLE).all()
-    assert len(sample_pixels(blobs(2), VEHICLE, 1e-6, np.random.default_rng(0))) == 1
+    assert len(sample_pixels(blobs(2) == VEHICLE, 1e-6, np.random.default_rng(0))) == 1
 
 
 def view(mask: np.ndarray, lPs: np.ndarray, base_tau_s: float = 0.0, share: float = 1.0) -> ClassView:
-    found = ClassView.of(CAMERA, lPs, base_tau_s, mask, VEHICLE, share, np.random.default_rng(0))
+    found = ClassView.of(CAMERA, lPs, base_tau_s, mask == VEHICLE, share, np.random.default_rng(0))
     assert found is not None
     return found
 
@@ -117,4 +117,4 @@ def test_points_beyond_the_truncation_are_left_out() -> None:
 def test_a_camera_that_sees_no_point_has_no_match() -> None:
     mask = np.full((48, 64), VEHICLE, np.uint8)
     assert match_nearest(view(mask, np.array([[0.0, 0.0, -3.0]])), FORWARD, 0.0, STILL, 5.0) is None
-    assert ClassView.of(CAMERA, np.zeros((0, 3)), 0.0, mask, VEHICLE, 0.1, np.random.default_rng(0)) is None
+    assert ClassView.of(CAMERA, np.zeros((0, 3)), 0.0, mask == VEHICLE, 0.1, np.random.default_rng(0)) is None

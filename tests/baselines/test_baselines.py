@@ -232,7 +232,7 @@ def test_truncated_distances_by_hand(drive: Drive) -> None:
     z = np.array([10.0, 10.0, -10.0])
     lPs = np.column_stack([(u - camera.cx) / camera.fx, np.full(3, (row - camera.cy) / camera.fy), [1, 1, 1]])
     rng = np.random.default_rng(0)
-    view = ClassView.of(camera, lPs * z[:, None], 0.0, mask, SemanticClass.VEHICLE, 0.1, rng)
+    view = ClassView.of(camera, lPs * z[:, None], 0.0, mask == SemanticClass.VEHICLE, 0.1, rng)
     assert view is not None
     frame = MatchFrame(frame_pairs([drive])[0], "drive", (view,), np.zeros(6))
     found = truncated_distances(frame, [gtsam.Pose3()], SemAlignConfig(truncation_px=20.0))

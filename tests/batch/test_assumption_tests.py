@@ -22,7 +22,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
 from sst_graph.experiments.wrong_drives import with_focal
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.inspect.budget_words import budget_lines
 from sst_graph.objects.tracks import object_tracks
@@ -109,8 +109,8 @@ def problem() -> SolvedProblem:
     truth = crowded_street().truth
     assert truth is not None and truth.time_offset_s is not None
     guess = State(truth.cTl, (truth.time_offset_s,))
-    joint = dataclasses.replace(CONFIG.joint, kernel_px=(5.0, 3.0), max_outer=6)
-    solution = solve_joint(drives, guess, joint, None, guess, tracks)
+    joint = dataclasses.replace(CONFIG.joint, max_outer=6)
+    solution = solve_joint(JointProblem(drives, tracks, joint, guess), guess, (5.0, 3.0))
     return SolvedProblem(drives, tracks, objects, solution, joint, guess)
 
 

@@ -21,7 +21,7 @@ from sst_graph.config import with_overrides
 from sst_graph.covariance.contradiction import PartAnswer
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import JointConfig, solve_joint
+from sst_graph.graph.outer_loop import JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
@@ -234,7 +234,8 @@ def test_a_part_without_labels_in_common_says_nothing() -> None:
 def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     parts = parts_of(drives, STREET.time_offset_s)
-    solution = solve_joint(drives, parts.reference, JointConfig(kernel_px=(5.0, 3.0)), tracks=parts.tracks)
+    problem = JointProblem(drives, parts.tracks, JointConfig())
+    solution = solve_joint(problem, parts.reference, (5.0, 3.0))
     sigmas = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
     sure = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
     agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartAnswer(np.zeros(7), sure))

@@ -13,13 +13,18 @@ from sst_graph.batch.lower_edges import UndersideConfig, underside_support, with
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.building import Tracks, associate
-from sst_graph.graph.outer_loop import JointConfig, JointSolution, solve_joint
+from sst_graph.graph.outer_loop import (
+    NARROW_KERNELS_PX,
+    JointConfig,
+    JointProblem,
+    JointSolution,
+    solve_joint,
+)
 from sst_graph.graph.state import State
-from sst_graph.initialization.selection import narrowed
 from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
-JOINT = replace(narrowed(JointConfig()), min_matches=10)
+JOINT = JointConfig(min_matches=10)
 CONFIG = UndersideConfig(min_support=10.0)
 
 
@@ -41,7 +46,7 @@ def street(shadow_px: int = 0) -> Drive:
 
 def solved(drive: Drive) -> tuple[JointSolution, State]:
     start = State(standing_street().truth.cTl)
-    return solve_joint([drive], start, JOINT), start
+    return solve_joint(JointProblem.of([drive], JOINT), start, NARROW_KERNELS_PX), start
 
 
 def test_edges_towards_the_ground_are_kept_apart() -> None:
@@ -68,7 +73,7 @@ def test_matched_where_they_are_asked_for() -> None:
 
 def test_used_where_the_labels_agree() -> None:
     drive = street()
-    below = with_undersides([drive], Tracks([drive]), [solved(drive)], JOINT, CONFIG)
+    below = with_undersides(JointProblem([drive], Tracks([drive]), JOINT), [solved(drive)], CONFIG)
     assert below.joint.graph.undersides == (VEHICLE,)
     assert below.concentration[VEHICLE] > CONFIG.min_concentration
     truth = standing_street().truth.cTl
@@ -87,7 +92,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
     tracks = Tracks([drive])
     shares = underside_support([drive], tracks, one.state, JOINT).agreed(config)[1]
     assert shares[VEHICLE] < CONFIG.min_concentration
-    below = with_undersides([drive], tracks, [(one, centre)], JOINT, config)
+    below = with_undersides(JointProblem([drive], tracks, JOINT), [(one, centre)], config)
     if use == "always":
         assert below.joint.graph.undersides == (VEHICLE,)
     else:

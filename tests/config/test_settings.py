@@ -164,8 +164,8 @@ def test_the_bounds_themselves_are_taken(command: str) -> None:
     assert {name.rpartition(".")[2] for name in beside} <= {
         *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "delay_s"),
         *("patience", "window", "confirmations", "start_scans", "restart_scans", "lost", "kept"),
-        *("box_deg", "box_step_deg", "max_offset_s", "step_s", "search_m", "search_step_m"),
-        *("rival_ratio", "finalist_ratio", "first_px", "last_px"),
+        *("max_offset_s", "step_s", "search_m", "search_step_m"),
+        *("first_px", "last_px"),
         *("min_voxel_m", "max_voxel_m", "near_m", "far_m", "min_points", "max_points"),
     }
 
@@ -197,11 +197,6 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
     ("settings", "message"),
     [
         ("calibration.start.search.box_deg=60", ""),
-        (
-            "calibration.start.search.box_step_deg=0.5",
-            r"box_deg: found 30, expected at most 20 deg \(40 box_step_deg\)",
-        ),
-        ("calibration.start.search.shares=[1.0]", "blurs_px: found 4 of them, expected 1, as many as shares"),
         ("calibration.joint.graph.object_bias_sigma_px=0", ""),
         ("calibration.joint.graph.object_bias_sigma_px=1e-9", "found 1e-09, expected 0 or at least 0.001 px"),
         (
@@ -218,7 +213,6 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
             "calibration.paper.static_weights=[1.0]",
             "static_weights: found 1 of them, expected 3, one for each",
         ),
-        ("calibration.start.rival_ratio=0.5", r"expected at least 0.7 \(finalist_ratio\)"),
         ("alarm.patience=2", r"alarm.patience: found 2, expected at least 4 \(frames and confirmations\)"),
         ("window=5", r"^window: found 5, expected at least 12 \(start_scans and restart_scans\)"),
     ],
@@ -235,10 +229,9 @@ def test_rules_between_settings(settings: str, message: str) -> None:
     ("setting", "message"),
     [
         ("joint.max_outer=0", "joint.max_outer: found 0, expected at least 1 and at most 1000"),
-        ("joint.kernel_px=[]", r"joint.kernel_px: found \[\], expected a list of 1 to 100 values"),
-        ("joint.kernel_px=[0]", r"joint.kernel_px\[0\]: found 0, expected at least 0.1 and at most 1000 px"),
-        ("start.contenders=0", "start.contenders: found 0, expected at least 1"),
-        ("start.leads=0", "start.leads: found 0, expected at least 1"),
+        ("joint.graph.undersides=[vehicle]", "unknown setting 'joint.graph.undersides'"),
+        ("joint.graph.estimate=[focal]", "unknown setting 'joint.graph.estimate'"),
+        ("start.search.frames=0", "start.search.frames: found 0, expected at least 1"),
         ("prepare.lidar_odometry.voxel_m=0", "voxel_m: found 0, expected at least 0.02 and at most 10 m"),
         ("motion.kernel.scale=0", "motion.kernel.scale: found 0, expected at least 0.01"),
         ("motion.kernel.kind=square", "motion.kernel.kind: found 'square', expected one of none, huber"),

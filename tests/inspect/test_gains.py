@@ -21,7 +21,15 @@ from sst_graph.covariance.cluster_robust import (
 )
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
-from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate, joint_graph
+from sst_graph.graph.building import (
+    PRIOR_ROTATION_SIGMA_RAD,
+    PRIOR_TRANSLATION_SIGMA_M,
+    GraphConfig,
+    PairMatches,
+    Tracks,
+    associate,
+    joint_graph,
+)
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
@@ -122,7 +130,7 @@ def test_without_each_frame_and_frame_by_frame(motion: str) -> None:
 @pytest.mark.parametrize("motion", ["standing", "constant"])
 def test_a_view_is_the_frame_alone(motion: str) -> None:
     for k, frame in enumerate(gains(motion)[1]):
-        priors = np.diag(np.repeat([CONFIG.rest_sigma_rad, CONFIG.rest_sigma_m], 3) ** -2.0)
+        priors = np.diag(np.repeat([PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M], 3) ** -2.0)
         alone = covariance_by_model(motion, [k])
         given_offset = np.linalg.inv(np.linalg.inv(alone)[:6, :6])
         found = np.linalg.inv(frame.view + priors)

@@ -11,7 +11,7 @@ from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import PairMatches, Tracks, associate, joint_graph, state_from
-from sst_graph.graph.outer_loop import JointConfig, solve_joint
+from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.objects.tracks import object_tracks
@@ -43,11 +43,11 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
     config, objects = JointConfig(), [object_tracks(drive)]
     tracks, truth = Tracks([drive], objects), State(source.truth.cTl, (0.05,))
-    solution = solve_joint([drive], truth, config, tracks=tracks)
+    solution = solve_joint(JointProblem([drive], tracks, config), truth)
     frozen = solution.graph, solution.values, solution.pairs, solution.state
     robust = robust_covariance(*frozen, objects)
     frames = frame_gains(*frozen, [drive], robust)
-    kernel = RobustKernel("geman_mcclure", config.kernel_px[-1])
+    kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
     steps = gtsam.GaussNewtonParams()
     steps.setMaxIterations(2)
     # all frames, too, matched anew: what is left is due to the frame

@@ -12,8 +12,8 @@ from sst_graph import Tracker, TrackerConfig
 from sst_graph.batch.lower_edges import with_undersides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import prepare_drive
-from sst_graph.graph.building import Tracks, tracked_objects
-from sst_graph.graph.outer_loop import solve_joint
+from sst_graph.graph.building import tracked_objects
+from sst_graph.graph.outer_loop import KERNELS_PX, JointProblem, solve_joint
 from sst_graph.graph.state import State, underside_track
 from sst_graph.objects.dynamic_objects import find_dynamic_objects
 from sst_graph.objects.tracks import object_tracks
@@ -52,13 +52,14 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     assert bool(tracker.point.tracks) == by_object
     # The batch from the same start, run until it rests.
     drive = prepare_drive(street, calibration.classes, calibration.prepare)
-    joint = dataclasses.replace(calibration.joint, step_sigmas=0.02, max_outer=80)
+    joint = dataclasses.replace(calibration.joint, max_outer=80)
     start = State(street.truth.cTl, (0.04,))
-    plain = solve_joint([drive], start, joint)
-    twists = Tracks([drive], [object_tracks(drive)] if by_object else None)
-    below = with_undersides([drive], twists, [(plain, start)], joint, calibration.undersides)
+    problem = JointProblem.of([drive], joint)
+    plain = solve_joint(problem, start)
+    below = with_undersides(problem, [(plain, start)], calibration.undersides)
     assert tracker.matcher.graph.undersides == below.joint.graph.undersides == calibration.classes
-    solution = below.solutions[0]
+    problem = dataclasses.replace(problem, config=below.joint, centre=start)
+    solution = solve_joint(problem, below.solutions[0].state, KERNELS_PX[-1:], step_sigmas=0.02)
     state = solution.state
     turn = gtsam.Pose3.Logmap(tracker.point.cTl.between(state.cTl))
     step = np.append(turn, state.offset_s(0) - tracker.point.offset_s)

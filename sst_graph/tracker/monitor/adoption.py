@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from sst_graph.association.edge_matching import GATE
 from sst_graph.drive.preparation import Drive, outline_size
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
@@ -71,7 +72,7 @@ def held_out_cost(
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
     counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.undersides)) for pair in pairs]
-    return mean_cost(counted, point, classes, kernel, config)
+    return mean_cost(counted, point, classes, kernel)
 
 
 def mean_cost(
@@ -79,10 +80,9 @@ def mean_cost(
     point: Point,
     classes: tuple[SemanticClass, ...],
     kernel: RobustKernel,
-    config: GraphConfig,
 ) -> float | None:
     """Mean robust cost of boundary points, given each pair's matches and number of boundary points."""
-    worst = float(kernel.loss(config.match.gate * kernel.scale))
+    worst = float(kernel.loss(GATE * kernel.scale))
     cost, count = 0.0, 0
     for pair, total in pairs:
         count += total

@@ -14,10 +14,25 @@ from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.graph.building import GraphConfig, Tracks
-from sst_graph.graph.outer_loop import JointConfig, explained, solving_joint
+from sst_graph.graph.building import (
+    LOWER_EDGE_BIAS_SIGMA_PX,
+    PRIOR_ROTATION_SIGMA_RAD,
+    PRIOR_TRANSLATION_SIGMA_M,
+    GraphConfig,
+    Tracks,
+)
+from sst_graph.graph.outer_loop import (
+    KERNELS_PX,
+    MIN_EXPLAINED,
+    NARROW_KERNELS_PX,
+    JointConfig,
+    JointProblem,
+    explained,
+    solve_joint_steps,
+)
 from sst_graph.graph.state import State
-from sst_graph.initialization.selection import choosing_start, narrowed
+from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.selection import SELECTION_SCANS, select_start_steps
 from sst_graph.stepwise import Stepwise, whole
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
@@ -84,17 +99,15 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
             while one that did not explains the labels better.
     """
     searched = guess.search or guess.cTl is None
-    reach = config.calibration.start.search.delay_s if guess.search else 0.0
+    reach = config.calibration.start.search.time_offset_s if guess.search else 0.0
     # 1. Candidates, with time offsets around the guess's.
     starts = yield from _starts(drive, guess, config, reach)
     # 2. Their poses with the guess's time offset; then as they are.
     held = [State(start.cTl, (guess.offset_s,)) for start in _of_other_basins(starts)]
-    if searched:
-        # The contest has led them near.
-        joint = narrowed(config.calibration.joint)
-        config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, joint=joint))
+    # After a search they are near.
+    kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     ways = [held, starts] if reach > 0.0 else [starts]
-    solved, failed = yield from _tried([_best(drive, way, config) for way in ways])
+    solved, failed = yield from _tried([_best(drive, way, kernels_px, config) for way in ways])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -147,13 +160,15 @@ def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: Tra
             )
 
 
-def _best(drive: Drive, starts: Sequence[State], config: TrackerConfig) -> Stepwise[_Solved]:
+def _best(
+    drive: Drive, starts: Sequence[State], kernels_px: Sequence[float], config: TrackerConfig
+) -> Stepwise[_Solved]:
     """The best of the solutions from some starts.
 
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    solved, failed = yield from _tried([_solution(drive, start, config) for start in starts])
+    solved, failed = yield from _tried([_solution(drive, start, kernels_px, config) for start in starts])
     if not solved:
         if reached := _unsettled(failed):
             raise _Unsettled(str(failed[0]), min(reached, key=lambda one: one.cost))
@@ -168,40 +183,42 @@ def _best(drive: Drive, starts: Sequence[State], config: TrackerConfig) -> Stepw
     return best
 
 
-def _starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
-    """Where the solutions begin: the winners of the batch's contest, with offsets within ``delay_s`` of the
+def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -> Stepwise[list[State]]:
+    """Where the solutions begin: those that the batch would select, with offsets within ``reach_s`` of the
     guess's, or the guess itself.
 
     Raises:
         EstimationError: nothing to search for, or no guess and no search.
     """
     calibration = config.calibration
-    search = dataclasses.replace(calibration.start.search, delay_s=delay_s)
+    search = dataclasses.replace(calibration.start.search, time_offset_s=reach_s)
     enabled = guess.search or guess.cTl is None
     start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    scans = SELECTION_SCANS
     if config.start_work > 0:
         # The estimate is waited for, and scans of one second show much the same: candidates are compared on
         # every other one, and the best are solved on all.
-        few = min(start.contest_scans, (len(drive.scans) + 1) // 2)
-        start = dataclasses.replace(start, contest_scans=few)
-    joint = _damped(config) if delay_s == 0.0 else calibration.joint
-    contest = yield from choosing_start(
-        [drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s, joint, start
-    )
-    return [State(cTl, (offset_s,)) for cTl, offset_s in contest.finalists]
+        scans = min(scans, (len(drive.scans) + 1) // 2)
+    joint = _damped(config) if reach_s == 0.0 else calibration.joint
+    problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s)
+    selection = yield from select_start_steps(problem, joint.graph, start, scans)
+    return [State(cTl, (offset_s,)) for cTl, offset_s in selection.starts]
 
 
 def _damped(config: TrackerConfig) -> JointConfig:
     """The joint method with small steps of the time offset."""
     joint = config.calibration.joint
-    graph = dataclasses.replace(joint.graph, delay_sigma_s=config.start_offset_step_s)
+    graph = dataclasses.replace(joint.graph, time_offset_sigma_s=config.start_offset_step_s)
     return dataclasses.replace(joint, graph=graph)
 
 
-def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_Solved]:
+def _solution(
+    drive: Drive, start: State, kernels_px: Sequence[float], config: TrackerConfig
+) -> Stepwise[_Solved]:
     """The joint method from a start, its offset damped."""
     calibration = config.calibration
-    solution = yield from solving_joint([drive], start, _damped(config))
+    problem = JointProblem.of([drive], _damped(config))
+    solution = yield from solve_joint_steps(problem, start, kernels_px)
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
@@ -211,7 +228,7 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_So
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
-    if explained(solution) < calibration.start.min_explained:
+    if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
     _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
@@ -221,7 +238,7 @@ def _solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[_So
 def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
     """Mean cost of all boundary points of the window."""
     joint, classes = config.calibration.joint, config.calibration.classes
-    kernel = RobustKernel("geman_mcclure", joint.kernel_px[-1])
+    kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
     cost = held_out_cost(drive, Tracks([drive]), point, classes, kernel, joint.graph)
     if cost is None:
         raise EstimationError("no boundary point meets an image")
@@ -230,15 +247,14 @@ def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
 
 def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, config: TrackerConfig) -> None:
     """Refuse a solution that has run off in time: it leaves pairs behind, or the searched offsets."""
-    limit = config.calibration.joint.graph.max_interval_periods * drive.image_period_s
     seen = [
         pair
-        for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, limit)
+        for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, drive.image_period_s)
         if drive.scans[pair.scan].boundaries and drive.images[pair.image].contours
     ]
     if pairs < config.start_share * len(seen):
         raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
-    reach = config.calibration.start.search.delay_s
+    reach = config.calibration.start.search.time_offset_s
     if abs(offset_s - start_s) > reach:
         raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
 
@@ -252,11 +268,11 @@ def prior_belief(
     assumption is around 0.
     """
     estimated = dict(named_sigmas(config.estimate))
-    sigmas = [config.rest_sigma_rad] * 3 + [config.rest_sigma_m] * 3 + [config.delay_sigma_s]
+    sigmas = [PRIOR_ROTATION_SIGMA_RAD] * 3 + [PRIOR_TRANSLATION_SIGMA_M] * 3 + [config.time_offset_sigma_s]
     k = len(classes)
     sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
     information = np.diag(1.0 / np.square(sigmas))
-    tie, biases = config.underside_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
+    tie, biases = LOWER_EDGE_BIAS_SIGMA_PX**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
     information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
     centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
     return Gaussian(point, information, information @ point.local(centre))

@@ -15,7 +15,7 @@ from sst_graph.covariance.stationary_objects import moving_matches
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
-from sst_graph.graph.building import GraphConfig, PairMatches
+from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, GraphConfig, PairMatches
 from sst_graph.graph.nuisances import columns_beside
 from sst_graph.graph.state import underside_track
 from sst_graph.objects.tracks import numbers_in, of_each
@@ -144,7 +144,7 @@ def score_pair(
     weight, bend = float(roots @ roots), float(curvature.sum())
     motion = np.zeros_like(H)
     columns = [*range(7), *range(m, m + 6)]
-    motion[np.ix_(columns, columns)] = _motion_information(pair, point, config)
+    motion[np.ix_(columns, columns)] = _motion_information(pair, point)
     belief, gain = _without_twist(point, H + motion, g)
     bent, _ = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
     known = np.array([*range(n), *range(m, m + 6)])
@@ -239,11 +239,11 @@ def _rows(
     return np.concatenate(blocks), np.concatenate(twists), np.concatenate(residuals), np.concatenate(roots)
 
 
-def _motion_information(pair: PairMatches, point: Point, config: GraphConfig) -> FloatArray:
+def _motion_information(pair: PairMatches, point: Point) -> FloatArray:
     """(13, 13) information of the odometry on [extrinsic, offset, twist]; its residual at the point is 0."""
     if pair.l_twist is None:
         information = np.zeros((13, 13))
-        information[7:, 7:] = np.diag(np.repeat(config.still_sigma, 3) ** -2.0)
+        information[7:, 7:] = np.diag(UNKNOWN_TWIST_SIGMAS**-2.0)
         return information
     Ad = np.asarray(point.cTl.AdjointMap())
     A = np.zeros((6, 13))

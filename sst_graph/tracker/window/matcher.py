@@ -15,6 +15,8 @@ from sst_graph.drive.preparation import Drive, outline_size, outlines
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import PairMatches, Tracks, associate
+from sst_graph.graph.matching import DYNAMIC_REACH_M
+from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import mean_cost
 from sst_graph.tracker.sums.scan_scores import PairScore, score_pair, with_share
@@ -37,7 +39,7 @@ class WindowMatcher:
         self.classes = config.calibration.classes
         self.graph = config.calibration.joint.graph
         self.held_names = held_at_zero(self.graph.estimate)
-        self.kernel = RobustKernel("geman_mcclure", config.calibration.joint.kernel_px[-1])
+        self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
         self._twists: tuple[int, Tracks] | None = None
         self._growing = GrowingTrack(_SMOOTHED)
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
@@ -153,9 +155,10 @@ class WindowMatcher:
             By the scan's number and the object's track.
         """
         part, numbers = self.window.drive(chosen.__contains__)
-        limit = self.graph.max_interval_periods * part.image_period_s
         found = {}
-        for pair in pair_by_time(part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, limit):
+        for pair in pair_by_time(
+            part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, part.image_period_s
+        ):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
             for c, points in outlines(part.scans[pair.scan], self.graph.undersides).items():
@@ -172,7 +175,7 @@ class WindowMatcher:
         self, pair: PairMatches, number: int, offset_s: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
         """The objects of a scan that count for less with the image of a pair, or for nothing: they move."""
-        return self.window.left_out(number, offset_s + pair.pair.base_tau_s, self.graph.mover_reach_m)
+        return self.window.left_out(number, offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""
@@ -199,7 +202,7 @@ class WindowMatcher:
             pairs, _ = self._pairs(point, chosen, self.kernel)
         scans, below = dict(self.window.scans), self.graph.undersides
         counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
-        return mean_cost(counted, point, self.classes, self.kernel, self.graph)
+        return mean_cost(counted, point, self.classes, self.kernel)
 
     def _pairs(
         self, point: Point, chosen: Collection[int] | None, kernel: RobustKernel
@@ -227,7 +230,7 @@ class WindowMatcher:
             self._twists = (self.window.next_scan, Tracks([part], growing=self._growing))
         twists = self._twists[1]
         return (
-            twists.seeing(*self.window.objects_of(numbers))
+            twists.with_objects(*self.window.objects_of(numbers))
             if self.graph.object_bias_sigma_px > 0.0
             else twists
         )

@@ -170,7 +170,7 @@ class WindowSmoother:
     def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What odometry says of the twist of a pair's image."""
         (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.belief.point
-        return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s, self.graph)
+        return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s)
 
     def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
         """The random walk of extrinsic and offset from one epoch to the next."""

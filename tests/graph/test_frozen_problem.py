@@ -14,7 +14,7 @@ from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph, state_from
 from sst_graph.graph.frozen_problem import FrozenProblem, NormalEquations
-from sst_graph.graph.matching import DriveMatches, match_all, outlines_of
+from sst_graph.graph.matching import DriveMatches, edges_of, match_all
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.objects.dynamic_objects import DynamicObject
 from sst_graph.objects.tracks import ObjectId, object_tracks
@@ -51,7 +51,7 @@ def moving(rolling: bool) -> Drive:
 
 def matched(drives: list[Drive], state: State, config: GraphConfig, by_object: bool) -> list[DriveMatches]:
     tracks = Tracks(drives, [object_tracks(drive) for drive in drives] if by_object else None)
-    return match_all(outlines_of(drives, tracks, config), state, KERNEL)
+    return match_all(edges_of(drives, tracks, config), state, KERNEL)
 
 
 def whole(system: NormalEquations) -> tuple[np.ndarray, np.ndarray]:
@@ -172,11 +172,11 @@ def test_the_optimum_is_the_graphs() -> None:
     assert problem.step_sigmas(point, system) == pytest.approx(length, rel=1e-4)
 
 
-def test_a_belief_holds_the_extrinsic() -> None:
+def test_a_prior_holds_the_extrinsic() -> None:
     drive, state = moving(False), State(standing_street().truth.cTl, (0.0,))
     there = state.cTl.retract(np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
-    belief = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
-    point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, belief=belief).optimum(20)
+    prior = gtsam.PriorFactorPose3(EXTRINSIC, there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-6))
+    point, _ = FrozenProblem(matched([drive], state, PLAIN, True), state, PLAIN, prior=prior).optimum(20)
     np.testing.assert_allclose(point.cTl.matrix(), there.matrix(), atol=1e-4)
 
 
@@ -189,8 +189,8 @@ def test_moving_objects_are_matched_where_they_are() -> None:
         for name in list(tracks)[::2]
     }
     slow: dict[ObjectId, DynamicObject] = {name: DynamicObject(0.06) for name in list(tracks)[1::2]}
-    found = Tracks([drive]).seeing(tracks, fast | slow)
-    matches = match_all(outlines_of([drive], found, PLAIN), state, KERNEL)
+    found = Tracks([drive]).with_objects(tracks, fast | slow)
+    matches = match_all(edges_of([drive], found, PLAIN), state, KERNEL)
     pairs = [pair for own in matches for pair in own.by_pair()]
     assert any(m.alignment.l_velocities is not None for pair in pairs for m in pair.matches.values())
     graph, values = joint_graph(pairs, state, PLAIN)

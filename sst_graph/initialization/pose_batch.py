@@ -1,33 +1,49 @@
-"""Many poses against the silhouettes of one drive at once, with one Gauss-Newton step each.
+"""The silhouettes of one drive under many poses at once: normal equations for one Gauss-Newton step each.
 
-The matches and residuals are those of :mod:`~sst_graph.association.edge_matching`; what a graph would hold as
-variables beside pose, offset and mask biases (the twists) is fixed. So candidates can be told apart at
-a hundredth of what their graphs would cost; the answer itself comes from a graph.
+Matches are those of :func:`~sst_graph.association.edge_matching.match_edges`, made by the same rules. What
+differs is there for speed, for a search matches some hundred poses where a graph matches one: points that are
+far out of view are sorted out first; motion is of second order in the interval; the contours' distances and
+normals come from one bilinear cell; objects are taken as static, points as measured. The unknowns are pose,
+time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of that of
+:class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the answer itself.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.edge_matching import SIDE_OF, SIDES, MatchConfig
+from sst_graph.association.edge_matching import (
+    GATE,
+    faces,
+    match_sigmas,
+    of_matched_objects,
+    side_weights,
+    sides_of,
+)
+from sst_graph.association.time_pairing import nearest_images
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import cross
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.features.lidar_edges import Boundaries, Edge
+from sst_graph.features.lidar_edges import Edge
 from sst_graph.features.mask_contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
-from sst_graph.types import SemanticClass
+from sst_graph.graph.matching import DriveEdges
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _MIN_DEPTH_M = 0.5
 _REACH_M = 3.0
-"""Farthest that a point moves between its scan and its image [m]."""
+"""Farthest that a point moves between its scan and its image [m]: 30 m/s for a tenth of a second."""
+_MIN_OBJECT_SHARE = 0.3
+"""Of an object's boundary that must meet a contour. More than in the graph: under a wrong pose many objects
+cross some contour, and a pose must not gain by them."""
+_NEAR_NS = 4_000_000
+"""Twists this close in time are one [ns]: at 5 m/s^2 they differ by 2 cm/s, and less is looked up."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +64,29 @@ class Poses:
 
 
 @dataclass(frozen=True)
-class Views:
+class BatchEquations:
+    """Normal equations H x = -g of every pose, and how well the labels agree with it.
+
+    Attributes:
+        H: (m, k, k), g: (m, k), over [camera-side rotation, translation, offset, bias of each class]:
+            cP' = Exp(rotation) cP + translation.
+        support: (m,) matches, each counted by its robust weight.
+        seen: (m,) boundary points that fall into an image.
+    """
+
+    H: FloatArray
+    g: FloatArray
+    support: FloatArray
+    seen: FloatArray
+
+    @property
+    def agreements(self) -> FloatArray:
+        """(m,) as :func:`sst_graph.graph.outer_loop.agreement`."""
+        return np.asarray(self.support**2 / np.maximum(self.seen, 1.0))
+
+
+@dataclass(frozen=True)
+class _Pairing:
     """Which image each scan is compared with, under each pose.
 
     Attributes:
@@ -65,24 +103,7 @@ class Views:
 
 
 @dataclass(frozen=True)
-class Steps:
-    """Normal equations H x = -g of every pose, and how well the labels agree with it.
-
-    Attributes:
-        H: (m, k, k), g: (m, k), over [camera-side rotation, translation, offset, bias of each class]:
-            cP' = Exp(rotation) cP + translation.
-        support: (m,) matches, each counted by its robust weight.
-        seen: (m,) boundary points that fall into an image.
-    """
-
-    H: FloatArray
-    g: FloatArray
-    support: FloatArray
-    seen: FloatArray
-
-
-@dataclass(frozen=True)
-class _Seen:
+class _InImage:
     """Boundary points in an image, pose by pose.
 
     Attributes:
@@ -99,8 +120,8 @@ class _Seen:
     uvs: FloatArray
     rates: FloatArray | None
 
-    def take(self, index: IntArray) -> _Seen:
-        return _Seen(
+    def take(self, index: IntArray) -> _InImage:
+        return _InImage(
             self.pose[index],
             self.point[index],
             self.cPs[:, index],
@@ -110,126 +131,84 @@ class _Seen:
         )
 
 
-@dataclass(frozen=True)
-class Outlines:
-    """The boundary points of some scans of a drive, and the contours of its images.
+class PoseBatch:
+    """The boundary points of a drive, by columns, to be matched under many poses."""
 
-    Attributes:
-        camera: of all images.
-        contours: of each image, by class.
-        classes: all classes.
-        lPs, ways: (3, n) boundary points, and the step from each to its neighbour outside the object [m].
-        offsets_s: (n,) time of each point relative to its scan's stamp [s].
-        scans, kinds, objects: (n,) number of its scan, of its class, of its object in all scans.
-        edges: (n,) kind of edge.
-    """
-
-    camera: PinholeCamera
-    contours: Sequence[Mapping[SemanticClass, ContourMap]]
-    classes: Sequence[SemanticClass]
-    lPs: FloatArray
-    ways: FloatArray
-    offsets_s: FloatArray
-    scans: IntArray
-    kinds: IntArray
-    objects: IntArray
-    edges: NDArray[np.uint8]
-
-    @classmethod
-    def gather(
-        cls,
-        scans: Sequence[Mapping[SemanticClass, Boundaries]],
-        contours: Sequence[Mapping[SemanticClass, ContourMap]],
-        classes: Sequence[SemanticClass],
-        camera: PinholeCamera,
-    ) -> Outlines:
-        """All boundary points of the classes."""
-        parts: list[Boundaries] = []
-        numbers: list[tuple[int, int]] = []
-        objects, first = [np.zeros(0, np.intp)], 0
-        for number, boundaries in enumerate(scans):
-            for kind, c in enumerate(classes):
-                if c not in boundaries or len(boundaries[c]) == 0:
-                    continue
-                parts.append(boundaries[c])
-                numbers.append((number, kind))
-                own = np.unique(boundaries[c].objects, return_inverse=True)[1].reshape(-1)
-                objects.append(own + first)
-                first += int(own.max()) + 1
-        counts = [len(part) for part in parts]
-        scan_of, kind_of = np.array(numbers, np.intp).reshape(-1, 2).T
-        lPs = np.concatenate([np.zeros((0, 3)), *(part.lPs for part in parts)])
-        outward = np.concatenate([np.zeros((0, 3)), *(part.outward for part in parts)])
-        return cls(
-            camera,
-            contours,
-            classes,
-            np.ascontiguousarray(lPs.T),
-            np.ascontiguousarray((outward - lPs).T),
-            np.concatenate([np.zeros(0), *(part.offsets_s for part in parts)]),
-            np.repeat(scan_of, counts),
-            np.repeat(kind_of, counts),
-            np.concatenate(objects),
-            np.concatenate([np.zeros(0, np.uint8), *(part.edges for part in parts)]),
-        )
+    def __init__(self, edges: DriveEdges) -> None:
+        self.edges = edges
+        self.camera: PinholeCamera = edges.drive.camera
+        self.classes = sorted(set(edges.classes))
+        points = edges.points
+        # (3, n) points, and the step from each to its neighbour outside the object [m].
+        self._lPs = np.ascontiguousarray(points.lPs.T)
+        self._ways = np.ascontiguousarray((points.outward - points.lPs).T)
+        self._scans = np.array(edges.scans)[edges.group_of]
+        self._classes = np.array([self.classes.index(c) for c in edges.classes])[edges.group_of]
 
     def __len__(self) -> int:
-        return len(self.offsets_s)
+        return len(self.edges)
 
-    def thinned(self, most: int) -> Outlines:
+    def thinned(self, most: int) -> PoseBatch:
         """Evenly spread points, at most so many."""
-        some = np.arange(0, len(self), max(1, -(-len(self) // most)))
-        return replace(
-            self,
-            lPs=self.lPs[:, some],
-            ways=self.ways[:, some],
-            offsets_s=self.offsets_s[some],
-            scans=self.scans[some],
-            kinds=self.kinds[some],
-            objects=self.objects[some],
-            edges=self.edges[some],
-        )
+        return PoseBatch(self.edges.thinned(most))
 
-    def steps(self, poses: Poses, views: Views, kernel: RobustKernel, config: MatchConfig) -> Steps:
+    def equations(self, poses: Poses, kernel: RobustKernel) -> BatchEquations:
         """Match every pose's boundary points to the nearest contours; the kernel's scale is in pixels."""
-        seen = self._seen(poses, views, config)
-        image = views.images[seen.pose, self.scans[seen.point]]
+        config, owners = self.edges.config.match, self.edges.owners
+        pairing = self._pairing(poses.offsets)
+        seen = self._in_image(poses, pairing)
+        image = pairing.images[seen.pose, self._scans[seen.point]]
         distance, normals = self._look_up(seen, image)
-        kind = self.kinds[seen.point]
+        kind = self._classes[seen.point]
         r = distance + poses.biases[seen.pose, kind]
-        # 1. The contour faces the way out of the object, and is near.
+        # 1. The contour faces the way out of the object, and is near; enough of the object meets one.
         way, length = _directions(self.camera, seen)
         cosine = way[0] * normals[0] + way[1] * normals[1]
-        matched = (cosine > config.min_cosine) & (np.abs(r) < config.gate * kernel.scale)
-        # 2. Enough of the object's boundary meets one.
-        count = int(self.objects.max(initial=-1)) + 1
-        owner = seen.pose * count + self.objects[seen.point]
-        whole = np.bincount(owner, minlength=1)
-        matched &= (np.bincount(owner, matched, len(whole)) >= config.min_object_share * whole)[owner]
+        matched = faces(cosine) & (np.abs(r) < GATE * kernel.scale)
+        owner = seen.pose * (int(owners.max(initial=-1)) + 1) + owners[seen.point]
+        matched = of_matched_objects(matched, owner, np.bincount(owner, minlength=1), _MIN_OBJECT_SHARE)
         on = np.flatnonzero(matched)
-        # 3. A side of an object has a voice that grows little with its points.
-        sigma = np.hypot(config.mask_sigma_px, 0.5 * length[on] * cosine[on] / np.sqrt(3.0))
-        point = seen.point[on]
-        side = owner[on] * SIDES + SIDE_OF[self.edges[point], (way[0, on] > 0.0).astype(np.intp)]
-        information = np.bincount(side, sigma**-2.0, 1)[side]
+        # 2. Their weights.
+        sigma = match_sigmas(length[on], cosine[on], config)
+        sides = sides_of(self.edges.points.edges[seen.point[on]], way[0, on])
         robust = kernel.weight(r[on] / sigma)
-        weight = robust / (sigma**2 * (1.0 + information * config.side_sigma_px**2))
-        # 4. Normal equations.
+        weight = robust * side_weights(owner[on], sides, sigma, config) / sigma**2
+        # 3. Normal equations.
         rows = self._rows(seen.take(on), normals[:, on], kind[on], poses.biases.shape[1])
         H, g = _normal_equations(rows, r[on], weight, seen.pose[on], len(poses))
         support = np.bincount(seen.pose[on], robust, len(poses)).astype(np.float64)
-        return Steps(H, g, support, np.bincount(seen.pose, minlength=len(poses)).astype(np.float64))
+        in_image = np.bincount(seen.pose, minlength=len(poses)).astype(np.float64)
+        return BatchEquations(H, g, support, in_image)
 
-    def _seen(self, poses: Poses, views: Views, config: MatchConfig) -> _Seen:
+    def _pairing(self, offsets: FloatArray) -> _Pairing:
+        """The image of each scan under each offset, and the LiDAR's motion then."""
+        drive = self.edges.drive
+        stamps = np.array(drive.image_stamps_ns)
+        images, taus = nearest_images(
+            drive.scan_stamps_ns, drive.image_stamps_ns, offsets, drive.image_period_s
+        )
+        seen = images >= 0
+        # Twists that are near enough in time are one.
+        shifts = np.rint(1e9 * offsets).astype(np.int64)[:, None]
+        near, which = np.unique((stamps[images] + shifts)[seen] // _NEAR_NS, return_inverse=True)
+        instants = (near * _NEAR_NS + _NEAR_NS // 2).tolist()
+        samples = self.edges.tracks.at_all(self.edges.number, instants)
+        if samples is None or not samples.twists.any():
+            return _Pairing(images, taus, None, None)
+        twists, accelerations = np.zeros((2, *images.shape, 6))
+        twists[seen] = samples.twists[which.reshape(-1)]
+        accelerations[seen] = samples.accelerations[which.reshape(-1)]
+        return _Pairing(images, taus, twists, accelerations)
+
+    def _in_image(self, poses: Poses, pairing: _Pairing) -> _InImage:
         """The points that fall into their image."""
         camera = self.camera
         # 1. Where nothing moved: most points are far from the image.
-        near = self._roughly_in_view(poses, views, config)
-        pose, point = np.nonzero(near)
+        pose, point = np.nonzero(self._roughly_in_view(poses, pairing))
         # By row, for rows that lie together are worked on faster.
         R = np.ascontiguousarray(poses.rotations.reshape(-1, 9).T)
         t = np.ascontiguousarray(poses.translations.T)
-        lPs, rates = self._moved(poses, views, pose, point)
+        lPs, rates = self._moved(poses, pairing, pose, point)
         cPs = _rotated(R[:, pose], lPs) + t[:, pose]
         # 2. Where they are at the image's instant.
         ahead = np.maximum(cPs[2], _MIN_DEPTH_M)
@@ -237,40 +216,40 @@ class Outlines:
         inside = np.flatnonzero((cPs[2] > _MIN_DEPTH_M) & camera.in_image(uvs.T))
         pose, point = pose[inside], point[inside]
         turns = R[:, pose]
-        ways = _rotated(turns, self.ways[:, point])
+        ways = _rotated(turns, self._ways[:, point])
         rates = None if rates is None else _rotated(turns, rates[:, inside])
-        return _Seen(pose, point, cPs[:, inside], ways, uvs[:, inside], rates)
+        return _InImage(pose, point, cPs[:, inside], ways, uvs[:, inside], rates)
 
-    def _roughly_in_view(self, poses: Poses, views: Views, config: MatchConfig) -> NDArray[np.bool_]:
+    def _roughly_in_view(self, poses: Poses, pairing: _Pairing) -> NDArray[np.bool_]:
         """(m, n) whether a point that moves by less than :data:`_REACH_M` may fall into its image."""
         camera = self.camera
-        margin = 0.0 if views.twists is None else _REACH_M
+        margin = 0.0 if pairing.twists is None else _REACH_M
         side = max(camera.cx + 0.5, camera.width - camera.cx - 0.5) / camera.fx
         across, ahead = (
-            poses.rotations[:, row] @ self.lPs + poses.translations[:, row, None] for row in (0, 2)
+            poses.rotations[:, row] @ self._lPs + poses.translations[:, row, None] for row in (0, 2)
         )
         near = (ahead > _MIN_DEPTH_M - margin) & (np.abs(across) <= side * (ahead + margin) + margin)
-        near &= views.images[:, self.scans] >= 0
-        if not config.top_edges:
-            near &= self.edges != Edge.TOP
+        near &= pairing.images[:, self._scans] >= 0
+        if not self.edges.config.match.top_edges:
+            near &= self.edges.points.edges != Edge.TOP
         return np.asarray(near)
 
     def _moved(
-        self, poses: Poses, views: Views, pose: IntArray, point: IntArray
+        self, poses: Poses, pairing: _Pairing, pose: IntArray, point: IntArray
     ) -> tuple[FloatArray, FloatArray | None]:
         """Points (3, k) at their images' instant, and their rates by the time offset, in the LiDAR frame.
 
         lP' = Exp(-tau w) lP to second order, w the LiDAR's mean twist over the interval.
         """
-        lPs = self.lPs[:, point]
-        if views.twists is None or views.accelerations is None:
+        lPs = self._lPs[:, point]
+        if pairing.twists is None or pairing.accelerations is None:
             return lPs, None
-        scan = self.scans[point]
-        taus = poses.offsets[pose] + views.base_taus_s[pose, scan] - self.offsets_s[point]
-        number = pose * views.images.shape[1] + scan
+        scan = self._scans[point]
+        taus = poses.offsets[pose] + pairing.base_taus_s[pose, scan] - self.edges.points.offsets_s[point]
+        number = pose * pairing.images.shape[1] + scan
         now, change = (
             np.ascontiguousarray(each.reshape(-1, 6).T)[:, number]
-            for each in (views.twists, views.accelerations)
+            for each in (pairing.twists, pairing.accelerations)
         )
         change *= taus
         mean, last = now - 0.5 * change, now - change
@@ -278,16 +257,17 @@ class Outlines:
         moved = lPs - step + 0.5 * taus * cross(mean[:3], step)
         return moved, -(cross(last[:3], moved) + last[3:])
 
-    def _look_up(self, seen: _Seen, image: IntArray) -> tuple[FloatArray, FloatArray]:
+    def _look_up(self, seen: _InImage, image: IntArray) -> tuple[FloatArray, FloatArray]:
         """Signed distances (k,) [px] and normals (2, k); infinite and 0 where there is no clear contour."""
         distance, normals = np.full(len(image), np.inf), np.zeros((2, len(image)))
         if len(image) == 0:
             return distance, normals
-        key = image * len(self.classes) + self.kinds[seen.point]
+        key = image * len(self.classes) + self._classes[seen.point]
         order = np.argsort(key, kind="stable")
         names, starts = np.unique(key[order], return_index=True)
+        images = self.edges.drive.images
         contours = [
-            self.contours[number].get(self.classes[kind])
+            images[number].contours.get(self.classes[kind])
             for number, kind in (divmod(name, len(self.classes)) for name in names.tolist())
         ]
         ends = [*starts[1:].tolist(), len(order)]
@@ -298,11 +278,12 @@ class Outlines:
         some = np.concatenate([order[:0], *(order[a:b] for _, a, b in known)])
         if len(some):
             counts = [b - a for _, a, b in known]
-            fields = [contour for contour, _, _ in known]
-            distance[some], normals[:, some] = _feet(fields, counts, seen.uvs[:, some])
+            distance[some], normals[:, some] = _nearest_contours(
+                [contour for contour, _, _ in known], counts, seen.uvs[:, some]
+            )
         return distance, normals
 
-    def _rows(self, seen: _Seen, normals: FloatArray, kind: IntArray, classes: int) -> FloatArray:
+    def _rows(self, seen: _InImage, normals: FloatArray, kind: IntArray, classes: int) -> FloatArray:
         """(7 + classes, k) derivatives of the residuals."""
         X, Y, Z = seen.cPs
         rows = np.zeros((7 + classes, len(X)))
@@ -321,7 +302,7 @@ def _rotated(R: FloatArray, x: FloatArray) -> FloatArray:
     return np.stack([R[i] * x[0] + R[i + 1] * x[1] + R[i + 2] * x[2] for i in (0, 3, 6)])
 
 
-def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatArray]:
+def _directions(camera: PinholeCamera, seen: _InImage) -> tuple[FloatArray, FloatArray]:
     """(2, k) unit ways out of the objects in the image, and the lengths (k,) of the steps [px]."""
     X, Y, Z = seen.cPs
     dX, dY, dZ = seen.ways
@@ -331,11 +312,14 @@ def _directions(camera: PinholeCamera, seen: _Seen) -> tuple[FloatArray, FloatAr
     return step / np.maximum(length, 1e-9), length
 
 
-def _feet(
+def _nearest_contours(
     contours: Sequence[ContourMap], counts: Sequence[int], uvs: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Signed distances (k,) and normals (2, k) of contours at pixels (2, k) on their images; infinite at
     ridges.
+
+    As :func:`~sst_graph.features.mask_contour.nearest_contours`, but distance and gradient are those of one
+    bilinear cell: four values are read for a pixel where central differences read twenty.
 
     Args:
         counts: pixels of each contour, one contour's after the other's.

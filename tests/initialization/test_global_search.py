@@ -14,12 +14,21 @@ from sst_graph.factors import PinholeCamera
 from sst_graph.initialization.global_search import (
     Candidate,
     SearchConfig,
+    SearchProblem,
+    Stage,
     _peaks,
     rotation_matrices,
-    search_start,
+    search_steps,
 )
-from sst_graph.initialization.label_agreement import Judge, SearchFrame, States, Votes
+from sst_graph.initialization.label_agreement import (
+    AgreementMap,
+    LabelledPoints,
+    LabelScore,
+    SearchFrame,
+    States,
+)
 from sst_graph.simulator import SimulatedDrive
+from sst_graph.stepwise import whole
 from sst_graph.types import SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -50,48 +59,65 @@ def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
     return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation())))))
 
 
-def search(config: SearchConfig) -> tuple[gtsam.Pose3, list[Candidate]]:
+def sampled(
+    frames: tuple[SearchFrame, ...] | list[SearchFrame], camera: PinholeCamera, most: int
+) -> LabelledPoints:
+    return LabelledPoints.sampled(frames, camera, [VEHICLE], most, np.random.default_rng(0))
+
+
+def scores_of(agreement: AgreementMap, states: States) -> np.ndarray:
+    return whole(agreement.score_steps(states))
+
+
+def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3, list[Candidate]]:
     source, frames = drive()
     turn = np.radians(15.0) * np.array([2.0, -1.0, 2.0]) / 3.0
     guess = source.truth.cTl.retract(np.concatenate([turn, [0.05, -0.05, 0.05]]))
-    return guess, search_start(frames, source.camera, [VEHICLE], guess, 0.0, config)
+    problem = SearchProblem(frames, source.camera, [VEHICLE], guess, 0.0, config)
+    return guess, whole(search_steps(problem, stages))
 
 
-SMALL = SearchConfig(points_per_class=150, candidates=(12, 6, 4, 3), population=32, rounds=3)
+SMALL = SearchConfig(points_per_class=150)
+STAGES = (
+    Stage(45.0, 0.25, 12, samples=32, rounds=3),
+    Stage(22.0, 0.5, 6, samples=32, rounds=3),
+    Stage(10.0, 1.0, 4, samples=32, rounds=3),
+    Stage(4.0, 1.0, 3, samples=32, rounds=3),
+)
 
 
 def test_from_15_degrees_to_below_4() -> None:
     source, _ = drive()
-    guess, found = search(SMALL)
+    guess, found = search(SMALL, STAGES)
     assert angle_deg(guess, source.truth.cTl) == pytest.approx(15.0, abs=0.01)
     assert min(angle_deg(c.cTl, source.truth.cTl) for c in found) < 4.0
-    # Candidates stay within their boxes, and no delay is invented while the vehicle stands.
+    # Candidates stay within their boxes, and no time offset is invented while the vehicle stands.
     for candidate in found:
-        assert angle_deg(candidate.cTl, guess) <= SMALL.reach_deg + 1e-3
+        assert angle_deg(candidate.cTl, guess) <= 1.4 * SMALL.box_deg + 1e-3
         shift = np.abs(candidate.cTl.translation() - guess.translation()).max()
         assert shift <= SMALL.translation_m + 1e-9 and candidate.offset_s == 0.0
-    held = np.abs(found[0].cTl.translation() - guess.translation()).max()
-    assert held <= SMALL.held_translation_m + 1e-9
+    near = np.abs(found[0].cTl.translation() - guess.translation()).max()
+    assert near <= 0.1 + 1e-9
 
 
 def test_the_same_seed_gives_the_same_answer() -> None:
-    small = SearchConfig(points_per_class=60, candidates=(4, 2, 2, 2), population=16, rounds=2)
-    first, second = (search(small)[1] for _ in range(2))
+    stages = (Stage(45.0, 0.25, 4, samples=16, rounds=2), Stage(22.0, 0.5, 2, samples=16, rounds=2))
+    first, second = (search(SearchConfig(points_per_class=60), stages)[1] for _ in range(2))
     assert [c.score for c in first] == [c.score for c in second]
     assert all(a.cTl.equals(b.cTl, 0.0) for a, b in zip(first, second, strict=True))
 
 
-@pytest.mark.parametrize("judge", ["votes", "dependence"])
+@pytest.mark.parametrize("kind", ["votes", "dependence"])
 @pytest.mark.parametrize("blur_px", [45.0, 10.0, 4.0])
-def test_the_truth_scores_above_wrong_poses(blur_px: float, judge: Judge) -> None:
+def test_the_truth_scores_above_wrong_poses(blur_px: float, kind: LabelScore) -> None:
     source, frames = drive()
-    votes = Votes.gather(frames, source.camera, [VEHICLE], 250, np.random.default_rng(0))
-    assert not votes.moving
+    points = sampled(frames, source.camera, 250)
+    assert not points.moving
     truth = source.truth.cTl
     turns = np.concatenate([np.zeros((1, 3)), np.radians(12.0) * np.eye(3), -np.radians(12.0) * np.eye(3)])
     rotations = rotation_matrices(turns) @ truth.rotation().matrix()
     states = States(rotations, np.tile(truth.translation(), (7, 1)), np.zeros(7))
-    scores = votes.level(blur_px, 1.0, judge).score(states)
+    scores = scores_of(points.agreement_map(blur_px, 1.0, kind), states)
     assert int(scores.argmax()) == 0 and scores[0] > 0.0
 
 
@@ -109,11 +135,11 @@ def test_moving_points_go_to_their_images_instant() -> None:
     mask[:, 400:480] = VEHICLE
     twist = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
     frame = SearchFrame(np.array([[6.0, 0.0, 10.0]]), np.array([VEHICLE], np.uint8), mask, 0.1, twist)
-    votes = Votes.gather([frame], camera, [VEHICLE], 5, np.random.default_rng(0))
-    assert votes.moving
+    points = sampled([frame], camera, 5)
+    assert points.moving
     states = States(np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3)), np.array([0.4, -0.1]))
     # u = 320 + 100 * 6 / 5 = 440 with tau = 0.4 + 0.1 s, and 380 with tau = 0.
-    scores = votes.level(4.0, 1.0).score(states)
+    scores = scores_of(points.agreement_map(4.0, 1.0), states)
     assert scores[0] > 0.0 > scores[1]
 
 
@@ -129,9 +155,9 @@ def test_dependence_by_hand() -> None:
     for name, vehicles in kinds.items():
         classes = np.where(vehicles, VEHICLE, SemanticClass.OTHER).astype(np.uint8)
         frame = SearchFrame(lPs, classes, mask, 0.0, np.zeros(6))
-        votes = Votes.gather([frame], camera, [VEHICLE], 40, np.random.default_rng(0))
+        points = sampled([frame], camera, 40)
         states = States(np.eye(3)[None], np.zeros((1, 3)), np.zeros(1))
-        scores[name] = float(votes.level(0.5, 1.0, "dependence").score(states)[0])
+        scores[name] = float(scores_of(points.agreement_map(0.5, 1.0, "dependence"), states)[0])
     assert scores["fits"] == pytest.approx(-scores["opposes"], rel=0.05)
     assert scores["fits"] > 5.0 and abs(scores["says nothing"]) < 1e-6
 
@@ -144,16 +170,17 @@ def test_a_view_of_one_class_only_says_nothing() -> None:
     x = np.linspace(-1.5, 1.5, 40)
     lPs = np.stack([x, 0.0 * x, np.ones(40)], axis=1)
     frame = SearchFrame(lPs, np.full(40, VEHICLE, np.uint8), mask, 0.0, np.zeros(6))
-    votes = Votes.gather([frame], camera, [VEHICLE], 40, np.random.default_rng(0))
+    points = sampled([frame], camera, 40)
     states = States(np.eye(3)[None], np.zeros((1, 3)), np.zeros(1))
-    assert votes.level(4.0, 1.0, "votes").score(states)[0] > 1.0
-    assert votes.level(4.0, 1.0, "dependence").score(states)[0] < 0.5
+    assert scores_of(points.agreement_map(4.0, 1.0, "votes"), states)[0] > 1.0
+    assert scores_of(points.agreement_map(4.0, 1.0, "dependence"), states)[0] < 0.5
 
 
 def test_nothing_to_search_with() -> None:
     source, frames = drive()
+    problem = SearchProblem(frames, source.camera, [SemanticClass.TWO_WHEELER], None, 0.0, SMALL)
     with pytest.raises(EstimationError, match="no labelled point"):
-        search_start(frames, source.camera, [SemanticClass.TWO_WHEELER], None)
+        whole(search_steps(problem, STAGES))
 
 
 @pytest.mark.parametrize("count", [3, 60, 5000])

@@ -9,6 +9,7 @@ from streets import prepared_street, standing_street
 
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import (
+    PRIOR_ROTATION_SIGMA_RAD,
     GraphConfig,
     PairMatches,
     Tracks,
@@ -104,5 +105,5 @@ def test_a_guess_is_what_the_priors_hold() -> None:
     at_guess, values = joint_graph(pairs, state, CONFIG, guess)
     at_state, _ = joint_graph(pairs, state, CONFIG)
     surplus = at_guess.error(values) - at_state.error(values)
-    off = np.array([0.5 / CONFIG.rest_sigma_rad, 0.25 / CONFIG.delay_sigma_s])
+    off = np.array([0.5 / PRIOR_ROTATION_SIGMA_RAD, 0.25 / CONFIG.time_offset_sigma_s])
     assert surplus == pytest.approx(0.5 * off @ off, rel=1e-6)
