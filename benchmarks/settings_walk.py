@@ -152,8 +152,8 @@ def outcome(case: Case, street: Street) -> str:
         for frame in street:
             tracker.add(frame)
         tracker.settle(3)
-        tracker.history()
-        return tracker.current().status
+        tracker.estimate.history()
+        return current(tracker).status
     except ConfigError:
         return "refused"
     except SstGraphError as error:

@@ -70,7 +70,7 @@ def run(seed: int, frames: int) -> dict[str, float]:
     for frame in endless(list(drive), frames):
         alarms += tracker.add(drifted(frame, walk, drive)).alarm
     yaw, offset, steady = [], [], []
-    for entry in tracker.history():
+    for entry in tracker.estimate.history():
         # An epoch's calibration is that of its middle.
         k = min(frames - 1, int(entry.stamp_ns / PERIOD_NS + 0.5e9 * DRIFT.epoch_s / PERIOD_NS))
         truth = gtsam.Rot3.Ry(walk.yaw_rad[k]) * drive.truth.cTl.rotation()

@@ -108,15 +108,15 @@ def drive_report(path: str, image_shift: int, every: int, config: TrackerConfig)
         timed = Timed(Tracker(source.camera, config, source.nominal), saver, every)
         for k, frame in enumerate(source):
             timed.add(frame)
-            started = k if started is None and timed.tracker.started else started
+            started = k if started is None and timed.tracker.estimate.exists else started
     began = time.process_time()
-    timed.tracker.settle()
+    timed.tracker.optimize()
     return {
         "frames": len(timed.ms),
         "started_with_frame": started,
         **timed.report(),
         "settle_s": time.process_time() - began,
-        "status": timed.tracker.current().status,
+        "status": current(timed, tracker).status,
     }
 
 
@@ -163,9 +163,9 @@ def main() -> None:
             if step is not None and frame.index >= args.step_at:
                 assert frame.image is not None
                 frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
-            settling.append(tracker.settling is not None)
+            settling.append(tracker.estimate.relinearization is not None)
             update = timed.add(frame)
-            started = frame.index if started is None and tracker.started else started
+            started = frame.index if started is None and tracker.estimate.exists else started
             memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             if update.alarm:
                 alarms.append(frame.index)
@@ -177,7 +177,7 @@ def main() -> None:
     truth = drive.truth.cTl
     if step is not None:
         truth = gtsam.Pose3(step.rotation, np.zeros(3)) * truth
-    error = truth.between(tracker.point.cTl)
+    error = truth.between(tracker.estimate.point.cTl)
     report = {
         "frames": args.frames,
         "street": args.street,
@@ -199,8 +199,8 @@ def main() -> None:
         "chi2_p999": float(np.quantile(chi2, 0.999)) if chi2 else None,
         "rotation_error_deg": float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))),
         "translation_error_m": float(np.linalg.norm(error.translation())),
-        "time_offset_s": tracker.point.offset_s,
-        "sigmas": np.sqrt(np.diag(tracker.covariance)[:7]).tolist(),
+        "time_offset_s": tracker.estimate.point.offset_s,
+        "sigmas": np.sqrt(np.diag(tracker.estimate.covariance)[:7]).tolist(),
     }
     print(json.dumps(report, indent=2))
 

@@ -18,7 +18,7 @@ from sst_graph.types import CameraImage, SemanticClass
 
 TRACKED_STREET = SimulationConfig(
     seed=3,
-    frames=36,
+    frames=44,
     width=621,
     height=188,
     azimuth_limit_deg=50.0,
@@ -75,8 +75,8 @@ def crowded_street(k1: float = 0.0) -> KeptDrive:
     return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulate(CROWDED_STREET))
 
 
-EARLY_START = TrackerConfig(start_scans=8, start_work=0)
-"""The first estimate comes with the eighth frame, at once."""
+EARLY_START = TrackerConfig(start_scans=8)
+"""Without a search, the first estimate comes with the twelfth frame."""
 
 
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
@@ -89,8 +89,9 @@ def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_STA
 
 def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
     """Mahalanobis distance of a tracker's estimate from a calibration."""
-    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
-    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+    point = tracker.estimate.point
+    step = np.append(gtsam.Pose3.Logmap(point.cTl.between(cTl)), offset_s - point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.estimate.covariance[:7, :7], step)))
 
 
 def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:
