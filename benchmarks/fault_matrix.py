@@ -33,6 +33,7 @@ import numpy as np
 from sst_graph.errors import SstGraphError
 from sst_graph.files.staging import SUFFIX
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.tracker import Tracker
 
 PROGRAM = [sys.executable, "-c", "import sys; from sst_graph.cli import main; sys.exit(main())"]
 """What the installed script does."""

@@ -322,7 +322,7 @@ def _checkpoint(ground: Ground, rng: Rng) -> None:
         later = 60_000_000_000
         tracker.add_image(dataclasses.replace(image, stamp_ns=image.stamp_ns + later))
         tracker.add_scan(dataclasses.replace(scan, stamp_ns=scan.stamp_ns + later))
-    current(tracker).to_dict()
+    tracker.result().to_json()
 
 
 def _calibrate(ground: Ground, rng: Rng) -> None:

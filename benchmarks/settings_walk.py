@@ -44,9 +44,7 @@ QUICK = {"joint": ("start.enabled=false",), "semalign": ("semalign.starts=200",)
 TRACKING = (
     "window=8",
     "start_scans=3",
-    "restart_scans=2",
     "calibration.start.enabled=false",
-    "alarm.warm_up=1",
 )
 """Settings under which a few frames are enough for the tracker to start and go on."""
 
@@ -151,9 +149,9 @@ def outcome(case: Case, street: Street) -> str:
         tracker = Tracker(street.camera, with_overrides(TrackerConfig(), case.settings), street.nominal)
         for frame in street:
             tracker.add(frame)
-        tracker.settle(3)
+        last = tracker.optimize(max_iterations=3)
         tracker.estimate.history()
-        return current(tracker).status
+        return last.status
     except ConfigError:
         return "refused"
     except SstGraphError as error:

@@ -61,7 +61,7 @@ def current(tracker: Tracker, last: TrackUpdate | None = None) -> TrackUpdate:
     """The present estimate, without a frame.
 
     Args:
-        last: answer to the last frame; what it says of that frame stays.
+        last: answer to the last frame; what it holds of that frame stays.
     """
     update = answer(tracker, tracker.inputs.window.last_stamp_ns or 0)
     if last is None:

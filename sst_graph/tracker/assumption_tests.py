@@ -1,7 +1,7 @@
 """Do the data contradict what a tracker assumes? Score tests from its sums, at any time.
 
-What leaves the window is kept as one Gaussian on the unknowns x that carries the parameters of all assumptions
-along (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
+What leaves the window is kept as one Gaussian on the unknowns x and the parameters of all assumptions
+(:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
 With H the information of past and window on [x, theta], g its vector at the estimate and a = [-H_xx^-1 H_xt,
 1], the score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of
 matches add, and
@@ -30,7 +30,7 @@ _EVERY = 10
 
 
 def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[Finding, ...]:
-    """What the data so far say of each assumption that the matches test, the most contradicted first.
+    """Score test of each assumption that the matches determine, the most contradicted first.
 
     Raises:
         EstimationError: a direction without any information.

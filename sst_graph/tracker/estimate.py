@@ -142,7 +142,7 @@ class OnlineEstimate:
 
     @property
     def parameters(self) -> dict[str, tuple[float, float]]:
-        """Value and deviation of each estimated parameter of an assumption, by name; none before the start."""
+        """Value and deviation of each estimated parameter, by its assumption; none before the start."""
         if self.smoother is None:
             return {}
         sigmas = np.sqrt(np.diag(self.covariance))[self.point.parameter_columns]

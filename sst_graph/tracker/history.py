@@ -72,7 +72,7 @@ class History:
 
 
 def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
-    """What the epochs before each one say about it."""
+    """Gaussian on each epoch by those before it, through the random walk."""
     messages = [first]
     for belief, walk in zip(beliefs[:-1], walks, strict=True):
         messages.append(belief.plus(messages[-1]).drifted(walk))

@@ -65,8 +65,8 @@ def moved_to(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMa
 def increment(whole: TrackedMarginal, previous: TrackedMarginal) -> TrackedMarginal:
     """What to add to a marginal to come to another, about the former's point.
 
-    It may be negative in some direction: where later frames show that labels err more than they seemed to, the
-    covariance grows. The sum is the tracker's own information.
+    It may be negative in some direction: where later frames show that labels err more than they seemed to,
+    the covariance grows. The sum is the tracker's own information.
     """
     there = moved_to(whole, previous)
     return replace(

@@ -72,6 +72,7 @@ def _unconfirmed(last: TrackUpdate, new_start: bool) -> tuple[str, ...]:
         return ("no frames that came after the start have been found to agree with those it was made of",)
     return (
         "no frame would have shown a change of where the camera looks for the last "
-        f"{last.unconfirmed_s:.1f} s, nor one of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"
+        f"{last.unconfirmed_s:.1f} s, nor one of the time offset for "
+        f"{last.offset_unconfirmed_s:.1f} s of driving"
         + (f"; {last.suspected_change}" if last.suspected_change else ""),
     )

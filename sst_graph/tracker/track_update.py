@@ -37,8 +37,7 @@ class TrackUpdate(ByValue):
         refused: the sensors of it whose data were not used: they have changed nothing.
         matches: silhouette matches in the window.
         chi2: statistic of the change test, over its usual size; None where there are too few frames.
-        suspected_change: why the statistic, past its threshold for some frames, raises no alarm; empty where it
-            is not.
+        suspected_change: why the statistic, past its threshold for some frames, raises no alarm; else empty.
         alarm: this frame raised the alarm: the calibration has changed.
         unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
             camera; above 1 s the status is ``unconfirmed`` [s].
@@ -47,8 +46,8 @@ class TrackUpdate(ByValue):
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
         covariance_reason: why there is no covariance; empty where there is.
-        converged: of the solution of the whole window after this frame (:meth:`Tracker.optimize`); None where it
-            was not solved.
+        converged: whether the solution of the whole window after this frame did (:meth:`Tracker.optimize`);
+            None where it was not solved.
         contradictions: what the data contradict of what is assumed, with estimate, deviation and remedy.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.

@@ -107,7 +107,7 @@ class Tracker:
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
                 jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
-                # 3. Stamps that jumped: what came before says nothing about the time offset.
+                # 3. Stamps that jumped: earlier frames have another time offset.
                 if restart := self._restart_by_stamps(clock_step_ns, jump):
                     return self._restart(restart, checked.stamp_ns)
                 # 4. Without an estimate: some work on a start.
@@ -132,7 +132,7 @@ class Tracker:
         A start that is not done yet is brought to its end first.
 
         Args:
-            last: answer to the last frame; what it says of that frame stays.
+            last: answer to the last frame; what it holds of that frame stays.
             max_iterations: under the narrowest kernel.
 
         Returns:
@@ -156,8 +156,8 @@ class Tracker:
 
         To add it as it grows: ``known = tracker.marginal()`` once; then, whenever wanted,
         ``more = tracker.marginal(since=known)`` into the graph and ``known = known.plus(more)``. All parts
-        are linearized at the first one's point, and their sum is the tracker's information. A part alone may
-        be negative in some direction: frames may also show that less is known than it seemed.
+        are linearized at the first one's point, and their sum is the tracker's information. A single part
+        may be negative in some direction: frames may also show that less is known than it seemed.
 
         Args:
             since: an earlier marginal of this tracker, with what was added since.

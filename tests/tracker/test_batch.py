@@ -45,6 +45,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     calibration = dataclasses.replace(default.calibration, start=search, joint=joint)
     config = dataclasses.replace(default, calibration=calibration)
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
+    tracker.initializer.work_per_frame = None
     for frame in street:
         tracker.add(frame)
     tracker.optimize()

@@ -20,22 +20,27 @@ from sst_graph.tracker.history import HistoryEntry
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Frame, SemanticClass
 
-STEP = 28
-"""Frame from which on the calibration has changed: a contradiction is no wrong start by then."""
-CHECKED = 16
-"""Frame from which on the start with the twelfth frame has been checked against those that came after it."""
+STEP = 20
+"""Frame from which on the calibration has changed."""
+CHECKED = 12
+"""Frame from which on the start with the eighth frame has been checked against those that came after it."""
 
 BY_LABELS = AlarmConfig(stamps=False)
 """A clock's jump is to be found by the labels alone."""
+
+
+def _warmed_up(tracker: Tracker) -> Tracker:
+    """The same, whose start counts as over soon: a contradiction is an alarm from then on."""
+    tracker.monitor.changes.warm_up_scans = 4
+    return tracker
 
 
 @pytest.mark.parametrize("kind", ["knock", "clock"])
 def test_a_step_raises_the_alarm_and_is_learnt(
     street: SimulatedDrive, frames: list[Frame], kind: str
 ) -> None:
-    """The camera is knocked, or its clock jumps: noticed within ten frames, a second and a half after the start."""
-    tracker = tracker_from_truth(street)
-    alarms = []
+    """The camera is knocked, or its clock jumps: noticed within ten frames, though little is known yet."""
+    tracker, alarms = _warmed_up(tracker_from_truth(street)), []
     for frame in frames:
         image = frame.image
         assert image is not None
@@ -73,7 +78,7 @@ def test_a_jump_in_the_first_seconds_raises_the_alarm(
     street: SimulatedDrive, frames: list[Frame], jump_ms: int
 ) -> None:
     """Soon after the start: noticed by the labels within ten frames, though the estimate follows."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
+    tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
     updates = jumped(tracker, frames[: STEP + 14], jump_ms)
     alarms = [i for i, update in enumerate(updates) if update.alarm]
     assert len(alarms) == 1 and alarms[0] < 10
@@ -86,7 +91,7 @@ def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
     street: SimulatedDrive, frames: list[Frame], jump_ms: int
 ) -> None:
     """With one object left out the others may show too little for an alarm so early: it is suspected then."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS))
+    tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
     told = [
         update.alarm or bool(update.suspected_change)
         for update in jumped(tracker, frames[: STEP + 10], jump_ms)
@@ -127,7 +132,7 @@ def test_stamps_that_jump_against_their_interval_are_an_alarm(
 
 def test_a_jump_before_the_start_empties_the_window(street: SimulatedDrive, frames: list[Frame]) -> None:
     """Frames from before it are of another time offset."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=40))
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=30))
     for frame in frames[: STEP + 5]:
         assert frame.image is not None
         late = 30_000_000 if frame.index >= STEP else 0
@@ -187,9 +192,9 @@ def _largest(frame: Frame, street: SimulatedDrive) -> int:
 
 
 def test_what_one_object_alone_contradicts_is_suspected(street: SimulatedDrive, frames: list[Frame]) -> None:
-    """One car is in view, and its labels are off: no alarm, but it is reported, and the estimate from before is
-    kept as the reference."""
-    tracker = tracker_from_truth(street)
+    """One car is in view, and its labels are off: no alarm, but it is reported, and the estimate from before
+    is kept as the reference."""
+    tracker = _warmed_up(tracker_from_truth(street))
     instance = _largest(frames[STEP + 7], street)
     suspected, kept = [], []
     for frame in frames[: STEP + 6]:
@@ -264,7 +269,7 @@ def test_a_suspected_change_that_is_given_up_is_no_confirmation(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
     """The estimate has followed the one object by then; that they agree confirms nothing."""
-    tracker = _sure_tracker(street)
+    tracker = _warmed_up(_sure_tracker(street))
     tracker.monitor.changes.max_pending = 5
     instance = _largest(frames[STEP + 7], street)
     for frame in frames[: STEP + 14]:

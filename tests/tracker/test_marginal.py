@@ -104,7 +104,7 @@ def test_before_a_start_and_after_a_change(street: SimulatedDrive, frames: list[
     with pytest.raises(EstimationError, match="no estimate yet"):
         tracker.marginal()
     assert current(tracker).covariance is None and current(tracker).covariance_reason
-    for frame in frames[:13]:
+    for frame in frames[:9]:
         tracker.add(frame)
     known = tracker.marginal()
     other = dataclasses.replace(known, start=known.start + 1)

@@ -166,7 +166,7 @@ def test_turn_and_offset_are_confirmed_apart() -> None:
 
 def test_settings_out_of_range() -> None:
     with pytest.raises(ValueError, match="window"):
-        TrackerConfig(window=5)
+        TrackerConfig(window=10)
     with pytest.raises(ValueError, match="chi2"):
         AlarmConfig(chi2=0.0)
 

@@ -18,12 +18,12 @@ from sst_graph.types import Frame
 
 @cache
 def _street() -> SimulatedDrive:
-    return simulate(dataclasses.replace(TRACKED_STREET, frames=34))
+    return simulate(dataclasses.replace(TRACKED_STREET, frames=40))
 
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
-    """Checkpoint of a tracker one frame into a relinearization, begun at the truth, and the frames to come."""
+    """Checkpoint of a tracker one frame into a relinearization of its window, and the frames to come."""
     street, config = _street(), TrackerConfig(start_scans=8, window=18)
     tracker = tracker_from_truth(street, config)
     frames = list(street)

@@ -116,6 +116,7 @@ def tracker() -> Tracker:
     tracker = Tracker(
         street.camera, dataclasses.replace(default, calibration=calibration), street.truth.cTl, 0.05
     )
+    tracker.initializer.work_per_frame = None
     for frame in street:
         tracker.add(frame)
     return tracker

@@ -52,8 +52,8 @@ def _track(
 ) -> tuple[Tracker, TrackUpdate]:
     """Add the frames, and save the tracker as it goes; solve the window as a whole after the last.
 
-    What the last line says is what is written. With a checkpoint the tracker that is solved is the one that the
-    file holds, its arrays laid out as in the file: the result is the same to the last bit whether the run was
+    The last line and the result are the same answer. With a checkpoint it is that of the tracker in the file,
+    whose arrays have the file's memory layout: the result is the same to the last bit whether the run was
     broken off and resumed or not.
 
     Returns:

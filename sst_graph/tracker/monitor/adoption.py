@@ -61,7 +61,7 @@ class Adoption:
             self.costs.append((candidate, in_use))
 
     def propose(self, candidate: Point, trusted: bool) -> bool:
-        """Adopt the candidate if it is trusted and explains held-out frames no worse; whether it is adopted."""
+        """Adopt the candidate if it is trusted and explains held-out frames no worse; whether it was."""
         if not trusted or len(self.costs) < (self.costs.maxlen or 0):
             return False
         ours, theirs = np.mean(self.costs, axis=0)

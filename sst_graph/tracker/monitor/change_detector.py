@@ -36,7 +36,7 @@ _LEAST_SHARE_OF_OTHERS = 0.2
 """Share of the statistic that must remain without any one object: labels of one car may err for a while."""
 _SINGLE_OBJECT_FACTOR = 4.0
 """A single object is believed after FRAMES + CONFIRMATIONS frames at this many times the threshold."""
-MAX_PENDING_FRAMES = 20
+_MAX_PENDING_FRAMES = 20
 """Frames in a row past the threshold after which a suspected change is given up: the estimate has followed
 the objects by then, whether they were right or not."""
 _LOST_FRAMES = 8
@@ -45,11 +45,11 @@ than matches reach."""
 _LOST_SHARE = 0.12
 """Share of the boundary points in view that is next to nothing."""
 _LEAST_IN_VIEW = 16
-"""Boundary points of an object of which it can be said that next to none of them meets a contour."""
+"""Boundary points of an object in view; of fewer, none may meet a contour by chance."""
 _START_CHI2 = 15.0
 """A start is refused where the statistic of some of its own frames is larger. These frames are part of the
 estimate, so the statistic is well below chi-squared's where they are of one calibration."""
-WARM_UP_SCANS = 15
+_WARM_UP_SCANS = 15
 """Scans after a start in which a contradiction gives up the start and is no alarm."""
 _MAX_REFUSED_STARTS = 2
 """Starts in a row that are refused because frames contradict them: labels may err as much."""
@@ -103,14 +103,16 @@ class ChangeDetector:
         refused_starts: starts in a row that frames contradicted.
         max_pending: frames in a row past the threshold after which a suspected change is given up.
         start_threshold: of the statistic of a start's own frames.
+        warm_up_scans: after a start, in which a contradiction gives up the start.
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
         self.matcher, self.config = matcher, config.alarm
         sigma_px = config.calibration.joint.graph.object_bias_sigma_px
         self.statistic = ChangeStatistic(config.alarm.chi2, sigma_px)
-        self.max_pending, self.start_threshold = MAX_PENDING_FRAMES, _START_CHI2
-        self.scans: deque[int] = deque(maxlen=MAX_PENDING_FRAMES)
+        self.start_threshold, self.warm_up_scans = _START_CHI2, _WARM_UP_SCANS
+        self.max_pending = _MAX_PENDING_FRAMES
+        self.scans: deque[int] = deque(maxlen=_MAX_PENDING_FRAMES)
         self.reference: Reference | None = None
         self.suspected_change = ""
         self.confirmation = Confirmation()
@@ -174,7 +176,7 @@ class ChangeDetector:
 
     def start_is_over(self, scan: int) -> bool:
         """Whether a contradiction is a change of the calibration from this scan on, not a wrong start."""
-        return scan - self._start_scan >= WARM_UP_SCANS or self.refused_starts >= _MAX_REFUSED_STARTS
+        return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
     def _confirm_start(
         self, scans: Sequence[int], estimate: Estimate, moving: Collection[int], threshold: float

@@ -16,12 +16,12 @@ from sst_graph.tracker.window.gaussian import Point
 FloatArray = NDArray[np.float64]
 
 FRAMES = 4
-"""New frames that are compared together: fewer tell too little of a turn, more delay the alarm."""
+"""New frames that are compared together: fewer hardly show a turn, more delay the alarm."""
 CONFIRMATIONS = 3
-"""Frames in a row past the threshold before the calibration is said to have changed."""
+"""Frames in a row past the threshold that make a change certain."""
 _LEAST_INFORMATION = 1.0
 """Added to the score's variance [1/rad^2, 1/m^2, 1/s^2, 1/px^2]: at standstill the score of the time offset
-is rounding over rounding, and frames that determine a direction worse than 1 rad, m, s or px say nothing."""
+is rounding over rounding, and frames that determine a direction worse than 1 rad, m, s or px do not count."""
 _USUAL_FRAMES = 300
 """Quiet frames from which the usual size of the statistic is taken: real labels err more than the model."""
 _LEAST_USUAL_FRAMES = 10

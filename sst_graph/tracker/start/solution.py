@@ -30,7 +30,7 @@ _LEAST_PAIRS_SHARE = 0.7
 """Share of the pairs that the first solution must still match: below it, the solution has run off in time."""
 _LEAST_GAIN = 0.1
 """By which fraction of the cost a solution must be better than another one to be preferred to it, where their
-costs hardly tell them apart: one whose offset was searched, or one of another basin."""
+costs hardly differ: one whose offset was searched, or one of another basin."""
 _OFFSET_STEP_S = 0.005
 """Damping of the time offset in the first solution, as the prior deviation of a step [s]: a short stretch at
 one speed does not determine it."""
@@ -51,7 +51,7 @@ class Guess:
     search: bool = True
 
     def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
-        """As an estimate whose mask biases and parameters (``names``) are 0; identity where nothing is known."""
+        """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
         return Point.unbiased(self.cTl or gtsam.Pose3(), self.offset_s, classes, names)
 
 

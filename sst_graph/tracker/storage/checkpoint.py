@@ -234,8 +234,7 @@ def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:
 def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
 
-    Whether it goes on with the drive that it was saved on,
-    :func:`sst_graph.tracker.storage.resume.frames_to_come` tells.
+    :func:`sst_graph.tracker.storage.resume.frames_to_come` checks that it goes on with its own drive.
 
     Args:
         setup: camera, settings and guess that it must have been made with; None for any.
@@ -360,7 +359,7 @@ def _bytes_of(file: zipfile.ZipFile, name: str, most: int) -> memoryview:
 
 
 def _digest(head: bytes | memoryview, data: bytes | memoryview) -> bytes:
-    """SHA-256 of both: a damaged or edited checkpoint is told from one as it was written."""
+    """SHA-256 of both: a damaged or edited checkpoint has another."""
     sum_ = hashlib.sha256(len(head).to_bytes(8, "little"))
     sum_.update(head)
     sum_.update(data)

@@ -15,7 +15,8 @@ class Snapshot:
 
     Lists, dictionaries, sets, deques and the package's own objects are recorded, one level each, wherever
     they are reached from; :meth:`restore` puts their contents back into the very same objects. All else
-    (arrays, poses, iSAM2, frozen dataclasses) must never change in place, only be replaced. Objects of a class whose ``rolls_back`` is False stay as they have become.
+    (arrays, poses, iSAM2, frozen dataclasses) must never change in place, only be replaced. Objects of a
+    class whose ``rolls_back`` is False stay as they have become.
     """
 
     def __init__(self, root: object) -> None:
