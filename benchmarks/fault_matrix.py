@@ -33,7 +33,7 @@ import numpy as np
 from sst_graph.errors import SstGraphError
 from sst_graph.files.staging import SUFFIX
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
-from sst_graph.tracker.storage.checkpoint import load_checkpoint
+from sst_graph.tracker import Tracker
 
 PROGRAM = [sys.executable, "-c", "import sys; from sst_graph.cli import main; sys.exit(main())"]
 """What the installed script does."""
@@ -470,7 +470,7 @@ def _check_checkpoint(row: Row, desk: Path) -> None:
     path = desk / "checkpoint.npz"
     if path.exists():
         try:
-            load_checkpoint(path)
+            Tracker.load(path)
         except SstGraphError as error:
             row.failures.append(str(error))
 

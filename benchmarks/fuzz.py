@@ -46,7 +46,6 @@ from sst_graph.errors import SstGraphError
 from sst_graph.export.marginal import fuse_marginals, marginal_of_result, read_marginal
 from sst_graph.reference import read_reference
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import Frame, SemanticClass
 
 MAX_SECONDS = 5.0
@@ -145,7 +144,7 @@ def prepare(folder: Path, started: bool = False) -> None:
     (folder / "calib.txt").write_text((folder / "street/sequences/00/calib.txt").read_text())
     (folder / "settings.json").write_text(json.dumps(config_to_dict(CalibrationConfig())))
     (folder / "settings.toml").write_text(_toml(config_to_dict(CalibrationConfig())))
-    save_checkpoint(_tracker(started), folder / "tracker.npz")
+    _tracker(started).save(folder / "tracker.npz")
 
 
 def _tracker(started: bool) -> Tracker:
@@ -158,7 +157,7 @@ def _tracker(started: bool) -> Tracker:
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.0)
     for k in range(len(street)):
         tracker.add(street[k])
-    if started and not tracker.started:
+    if started and not tracker.estimate.exists:
         raise RuntimeError("the tracker of the checkpoint has not started")
     return tracker
 
@@ -314,7 +313,7 @@ def _setting_names(table: dict[str, Any], above: tuple[str, ...] = ()) -> Iterat
 
 def _checkpoint(ground: Ground, rng: Rng) -> None:
     with ground.mutated(rng, ground.folder / "tracker.npz", m.checkpoint, special=0.02) as path:
-        tracker = load_checkpoint(path)
+        tracker = Tracker.load(path)
     # What was taken goes on: no frame may bring it down.
     frames: list[Frame] = list(open_source(ground.street))
     for frame in frames[-1:]:
@@ -323,7 +322,7 @@ def _checkpoint(ground: Ground, rng: Rng) -> None:
         later = 60_000_000_000
         tracker.add_image(dataclasses.replace(image, stamp_ns=image.stamp_ns + later))
         tracker.add_scan(dataclasses.replace(scan, stamp_ns=scan.stamp_ns + later))
-    tracker.current().to_dict()
+    tracker.result().to_json()
 
 
 def _calibrate(ground: Ground, rng: Rng) -> None:

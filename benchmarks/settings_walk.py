@@ -149,9 +149,9 @@ def outcome(case: Case, street: Street) -> str:
         tracker = Tracker(street.camera, with_overrides(TrackerConfig(), case.settings), street.nominal)
         for frame in street:
             tracker.add(frame)
-        tracker.settle(3)
-        tracker.history()
-        return tracker.current().status
+        last = tracker.optimize(max_iterations=3)
+        tracker.estimate.history()
+        return last.status
     except ConfigError:
         return "refused"
     except SstGraphError as error:

@@ -22,6 +22,7 @@ from tracker_steps import Step
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.tracker.config import DriftConfig
+from sst_graph.tracker.window.epochs import EPOCH_S
 from sst_graph.types import Frame
 
 DRIFT = DriftConfig(enabled=True, rotation_deg=0.05, translation_m=0.0005, offset_s=0.001)
@@ -65,14 +66,15 @@ def run(seed: int, frames: int) -> dict[str, float]:
         )
     )
     walk = Walk.random(frames, seed)
-    tracker = Tracker(drive.camera, TrackerConfig(start_work=0, drift=DRIFT), drive.truth.cTl)
+    tracker = Tracker(drive.camera, TrackerConfig(drift=DRIFT), drive.truth.cTl)
+    tracker.initializer.work_per_frame = None  # all epochs from the first on
     alarms = 0
     for frame in endless(list(drive), frames):
         alarms += tracker.add(drifted(frame, walk, drive)).alarm
     yaw, offset, steady = [], [], []
-    for entry in tracker.history():
+    for entry in tracker.estimate.history():
         # An epoch's calibration is that of its middle.
-        k = min(frames - 1, int(entry.stamp_ns / PERIOD_NS + 0.5e9 * DRIFT.epoch_s / PERIOD_NS))
+        k = min(frames - 1, int(entry.stamp_ns / PERIOD_NS + 0.5e9 * EPOCH_S / PERIOD_NS))
         truth = gtsam.Rot3.Ry(walk.yaw_rad[k]) * drive.truth.cTl.rotation()
         turn = gtsam.Rot3.Logmap(truth.between(entry.cTl.rotation()))
         axis = truth.matrix().T @ np.array([0.0, 1.0, 0.0])

@@ -11,7 +11,7 @@ Streets: ``plain`` has about 5,000 labelled points a scan, ``heavy`` twice as ma
 time offset) is played forth and back under rising stamps: a drive reversed in time is a drive. Times are
 CPU seconds of this process on one thread, for a busy machine must not count. ``all_frames`` are all, from the
 first on, with the start and the saves; the other times are of those after the first hundred, with those in
-which the tracker settles, which are told apart as well.
+which the window is relinearized, which are given apart as well.
 """
 
 from __future__ import annotations
@@ -102,21 +102,21 @@ class Timed:
 
 
 def drive_report(path: str, image_shift: int, every: int, config: TrackerConfig) -> dict[str, object]:
-    """Cost of each frame of a drive, and of settling at its end."""
+    """Cost of each frame of a drive, and of solving the window at its end."""
     source, started = open_source(path, image_shift=image_shift), None
     with tempfile.TemporaryDirectory() as folder, Saver(f"{folder}/tracker.npz") as saver:
         timed = Timed(Tracker(source.camera, config, source.nominal), saver, every)
         for k, frame in enumerate(source):
             timed.add(frame)
-            started = k if started is None and timed.tracker.started else started
+            started = k if started is None and timed.tracker.estimate.exists else started
     began = time.process_time()
-    timed.tracker.settle()
+    last = timed.tracker.optimize()
     return {
         "frames": len(timed.ms),
         "started_with_frame": started,
         **timed.report(),
-        "settle_s": time.process_time() - began,
-        "status": timed.tracker.current().status,
+        "optimize_s": time.process_time() - began,
+        "status": last.status,
     }
 
 
@@ -131,12 +131,8 @@ def main() -> None:
     parser.add_argument("--drive", help="a drive on disk instead of a street: the cost of all its frames")
     parser.add_argument("--image-shift", type=int, default=0)
     parser.add_argument("--checkpoint-every", type=int, default=0, help="frames between saves; 0: none")
-    default = TrackerConfig()
-    parser.add_argument(
-        "--start-work", type=int, default=default.start_work, help="as the setting start_work"
-    )
     args = parser.parse_args()
-    config = dataclasses.replace(default, start_work=args.start_work, drift=DriftConfig(enabled=args.drift))
+    config = TrackerConfig(drift=DriftConfig(enabled=args.drift))
     if args.drive is not None:
         cv2.setNumThreads(1)
         report = drive_report(args.drive, args.image_shift, args.checkpoint_every, config)
@@ -156,28 +152,28 @@ def main() -> None:
     )
     frames, step = list(drive), STEPS.get(args.step)
     tracker = Tracker(drive.camera, config, drive.nominal)
-    memory, alarms, chi2, settling, started = [], [], [], [], None
+    memory, alarms, chi2, relinearizing, started = [], [], [], [], None
     with tempfile.TemporaryDirectory() as folder, Saver(f"{folder}/tracker.npz") as saver:
         timed = Timed(tracker, saver, args.checkpoint_every)
         for frame in endless(frames, args.frames):
             if step is not None and frame.index >= args.step_at:
                 assert frame.image is not None
                 frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
-            settling.append(tracker.settling is not None)
+            relinearizing.append(tracker.estimate.relinearization is not None)
             update = timed.add(frame)
-            started = frame.index if started is None and tracker.started else started
+            started = frame.index if started is None and tracker.estimate.exists else started
             memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
             if update.alarm:
                 alarms.append(frame.index)
             if update.chi2 is not None:
                 chi2.append(update.chi2)
     costs = timed.ms
-    steady, settles = np.array(costs[WARM_UP:]), np.array(settling[WARM_UP:])
+    steady, settles = np.array(costs[WARM_UP:]), np.array(relinearizing[WARM_UP:])
     block = min(500, len(steady) // 2)
     truth = drive.truth.cTl
     if step is not None:
         truth = gtsam.Pose3(step.rotation, np.zeros(3)) * truth
-    error = truth.between(tracker.point.cTl)
+    error = truth.between(tracker.estimate.point.cTl)
     report = {
         "frames": args.frames,
         "street": args.street,
@@ -188,9 +184,9 @@ def main() -> None:
         "ms_median": float(np.median(steady)),
         "ms_p99": float(np.quantile(steady, 0.99)),
         "ms_max": float(steady.max()),
-        "settling_frames": int(settles.sum()),
-        "ms_settling": _quantiles(steady[settles]),
-        "ms_not_settling": _quantiles(steady[~settles]),
+        "relinearizing_frames": int(settles.sum()),
+        "ms_relinearizing": _quantiles(steady[settles]),
+        "ms_not_relinearizing": _quantiles(steady[~settles]),
         "ms_last_over_first": float(steady[-block:].mean() / steady[:block].mean()),
         "memory_mb_after_200": memory[min(200, len(memory) - 1)],
         "memory_mb_at_end": memory[-1],
@@ -199,8 +195,8 @@ def main() -> None:
         "chi2_p999": float(np.quantile(chi2, 0.999)) if chi2 else None,
         "rotation_error_deg": float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))),
         "translation_error_m": float(np.linalg.norm(error.translation())),
-        "time_offset_s": tracker.point.offset_s,
-        "sigmas": np.sqrt(np.diag(tracker.covariance)[:7]).tolist(),
+        "time_offset_s": tracker.estimate.point.offset_s,
+        "sigmas": np.sqrt(np.diag(tracker.estimate.covariance)[:7]).tolist(),
     }
     print(json.dumps(report, indent=2))
 

@@ -21,10 +21,9 @@ import cv2
 import gtsam
 import numpy as np
 
-from sst_graph import Tracker, TrackerConfig
+from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.simulator.config import Motion
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import CameraImage, Frame
 
 GUESS = np.array([0.02, -0.02, 0.02, 0.05, -0.05, 0.05])
@@ -71,28 +70,28 @@ STEPS = (
 
 
 def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: SimulatedDrive) -> str:
-    """Cells: frame of the alarm, doubts, unconfirmed and silent frames, status, errors at the end, NEES."""
-    alarms, doubts, unconfirmed, silent, speed = [], 0, 0, 0, 0.0
+    """Cells: the alarm's frame; suspected, unconfirmed, silent frames; status, errors and NEES at the end."""
+    alarms, suspected, unconfirmed, silent, speed = [], 0, 0, 0, 0.0
     truth = gtsam.Pose3(step.rotation, np.zeros(3)) * drive.truth.cTl
     offset_s = (drive.truth.time_offset_s or 0.0) - 1e-3 * step.late_ms
     for k, frame in enumerate(frames):
         assert frame.image is not None
         update = tracker.add(dataclasses.replace(frame, image=step.applied(frame.image, drive)))
         alarms += [k + 1] if update.alarm else []
-        doubts += bool(update.doubt)
+        suspected += bool(update.suspected_change)
         unconfirmed += update.status == "unconfirmed"
         error = np.append(
             gtsam.Pose3.Logmap(update.T_camera_lidar.between(truth)), offset_s - update.time_offset_s
         )
         known = np.diag(update.sigmas**2) if update.covariance is None else update.covariance
         nees = error @ np.linalg.solve(known, error) / 7.0
-        silent += update.status == "ok" and not update.doubt and nees > SILENT_NEES
-        if k == 0 and tracker.window.motions:
-            motion = tracker.window.motions[-1]
+        silent += update.status == "ok" and not update.suspected_change and nees > SILENT_NEES
+        if k == 0 and tracker.inputs.window.motions:
+            motion = tracker.inputs.window.motions[-1]
             speed = float(np.linalg.norm(motion.aTb.translation())) / (1e-9 * (motion.to_ns - motion.from_ns))
     return (
-        f"{speed:.1f} | {', '.join(map(str, alarms)) or '–'} | {doubts} | {unconfirmed} | {silent} "
-        f"| {tracker.current().status} | {np.degrees(np.linalg.norm(error[:3])):.2f} "
+        f"{speed:.1f} | {', '.join(map(str, alarms)) or '–'} | {suspected} | {unconfirmed} | {silent} "
+        f"| {update.status} | {np.degrees(np.linalg.norm(error[:3])):.2f} "
         f"| {100 * np.abs(error[3:6]).mean():.1f} | {1e3 * abs(error[6]):.1f} | {nees:.1f}"
     )
 
@@ -106,7 +105,7 @@ def main() -> None:
     args = parser.parse_args()
     cv2.setNumThreads(1)
     print(
-        "| street | motion, moving, density | step | speed [m/s] | alarm in frame | doubts | unconfirmed "
+        "| street | motion, moving, density | step | speed [m/s] | alarm in frame | suspected | unconfirmed "
         "| silent | status | rotation [deg] | ATD [cm] | offset [ms] | NEES / 7 |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|---|---|")
@@ -122,13 +121,14 @@ def main() -> None:
         )
         drive = simulate(config)
         frames = list(drive)
-        tracker = Tracker(drive.camera, TrackerConfig(start_work=0), drive.truth.cTl.retract(GUESS))
+        tracker = Tracker(drive.camera, None, drive.truth.cTl.retract(GUESS))
+        tracker.initializer.work_per_frame = None  # the estimate is there well before the step
         early = sum(tracker.add(frame).alarm for frame in frames[: args.before])
         with tempfile.TemporaryDirectory() as folder:
             checkpoint = Path(folder) / "tracker.npz"
-            save_checkpoint(tracker, checkpoint)
+            tracker.save(checkpoint)
             for step in STEPS:
-                cells = _frames_of(load_checkpoint(checkpoint), frames[args.before :], step, drive)
+                cells = _frames_of(Tracker.load(checkpoint), frames[args.before :], step, drive)
                 said = step.name if not early else f"{step.name} ({early} alarms before it)"
                 print(f"| {config.seed} | {motion}, {moving:g}, {density:g} | {said} | {cells} |", flush=True)
 

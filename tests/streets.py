@@ -77,22 +77,25 @@ def crowded_street(k1: float = 0.0) -> KeptDrive:
     return with_distortion(crowded_street(), k1) if k1 else KeptDrive.of(simulated(CROWDED_STREET))
 
 
-EARLY_START = TrackerConfig(start_scans=8, start_work=0)
-"""The first estimate comes with the eighth frame, at once."""
+EARLY_START = TrackerConfig(start_scans=8)
+"""The first estimate comes with the eighth frame, where its work is not spread over frames."""
 
 
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
-    """A tracker that starts from the truth, so that no search is needed."""
+    """A tracker that starts from the truth without a search, and at once when it has enough scans."""
     calibration = config.calibration
     start = dataclasses.replace(calibration.start, enabled=False)
     config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
-    return Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+    tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
+    tracker.initializer.work_per_frame = None
+    return tracker
 
 
 def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
     """Mahalanobis distance of a tracker's estimate from a calibration."""
-    step = np.append(gtsam.Pose3.Logmap(tracker.point.cTl.between(cTl)), offset_s - tracker.point.offset_s)
-    return float(np.sqrt(step @ np.linalg.solve(tracker.covariance[:7, :7], step)))
+    point = tracker.estimate.point
+    step = np.append(gtsam.Pose3.Logmap(point.cTl.between(cTl)), offset_s - point.offset_s)
+    return float(np.sqrt(step @ np.linalg.solve(tracker.estimate.covariance[:7, :7], step)))
 
 
 def turned(image: CameraImage, street: SimulatedDrive, R: gtsam.Rot3, **border: int) -> CameraImage:

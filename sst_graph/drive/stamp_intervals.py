@@ -1,10 +1,10 @@
-"""The rhythm of the sensors' stamps: a clock that jumps breaks it, whatever is in view.
+"""Jumps of the sensors' stamps against their own frame interval, whatever is in view.
 
 A camera and a LiDAR run at steady rates. Where stamps were regular, one interval is odd, and those after it
 are regular again, all later stamps are off by as much: the clock behind them has jumped, or the sensor has
-paused for part of a period. Labels tell which, once they are seen under motion; until then the offset is not
-known. A jump by whole periods forward looks like missing frames, one back by a single period like a doubled
-one: they are left to the labels. Where both sensors' stamps jump alike, their offset is what it was.
+paused for part of a period. Labels show which, once they are seen under motion; until then the time offset is
+not known. A jump by whole periods forward looks like missing frames, one back by a single period like a
+doubled one: only labels show them. Where both sensors' stamps jump alike, their time offset is what it was.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from dataclasses import dataclass
 import numpy as np
 
 _LEAST = 15
-"""Regular intervals before anything is odd."""
+"""Regular intervals before any is odd."""
 _AFTER = 2
 """Regular intervals behind an odd one that make it a jump: a stamp that is late alone comes back at once."""
 _IRREGULAR = 0.05
-"""Stamps whose intervals vary by more than this share of the period (one sigma) have no rhythm."""
+"""Stamps whose intervals vary by more than this share of the period (one sigma) are not regular."""
 _LEAST_SIGMA_S = 5e-4
 _LEAST_JUMP_S = 0.01
-"""Smaller jumps are left to the labels [s]."""
+"""Smaller jumps are not reported: labels show them [s]."""
 _ALIKE_S = 0.005
 """Two sensors that jump by the same, but for this, share a clock [s] ..."""
 _TOGETHER = 3
-"""... and so many more scans are awaited for the other to jump, too."""
+"""... and for so many more scans the other may jump, too."""
 _GAP = 5.0
-"""After a gap of more periods than this the sensor may have begun anew, out of step with itself."""
+"""After a gap of more periods than this the sensor may have restarted, out of phase with itself."""
 
 Place = tuple[int, int]
 """Numbers that the next image and the next scan have in the window."""
@@ -42,8 +42,8 @@ class Jump:
     Attributes:
         sensor: "image" or "scan".
         place: where it begins.
-        seconds: by how much stamps are later than the rhythm before has them; whole periods are not told [s].
-        chi2: its square over the variance of the rhythm.
+        seconds: by how much stamps are later than the intervals before predict, but for whole periods [s].
+        chi2: its square over the variance of an interval.
     """
 
     sensor: str
@@ -58,10 +58,10 @@ class Jump:
 
     @property
     def sentence(self) -> str:
-        return f"the {self.sensor} stamps jumped by {1e3 * self.seconds:+.0f} ms against their own rhythm"
+        return f"the {self.sensor} stamps jumped by {1e3 * self.seconds:+.0f} ms against their own interval"
 
 
-class Rhythm:
+class FrameIntervals:
     """Intervals of one sensor's stamps.
 
     Attributes:
@@ -77,12 +77,12 @@ class Rhythm:
         self._again: list[int] = []
         self._from: Place = (0, 0)
 
-    def take(self, stamp_ns: int, place: Place, chi2: float) -> Jump | None:
+    def add(self, stamp_ns: int, place: Place, chi2: float) -> Jump | None:
         """A further stamp; the jump that it makes certain, if any.
 
         Args:
             place: where it comes.
-            chi2: what is beyond it, against the rhythm's variance, is a jump.
+            chi2: a square beyond it, over the variance of an interval, is a jump.
         """
         newest = max(self._latest, default=stamp_ns)
         seconds = 1e-9 * (stamp_ns - newest)
@@ -98,11 +98,11 @@ class Rhythm:
         if not steady:
             self.intervals.append(seconds)
             return None
-        # By how much the stamp leaves the rhythm; frames may be missing.
+        # By how much the stamp is off its interval; frames may be missing.
         off = seconds - max(1, round(seconds / period)) * period
         if self._odd:
             self._odd.append(off)
-            return self._decided(least, sigma) if len(self._odd) > _AFTER else None
+            return self._jump_of(least, sigma) if len(self._odd) > _AFTER else None
         if abs(off) > least:
             self._odd, self._from = [off], place
         else:
@@ -115,27 +115,27 @@ class Rhythm:
         period = float(np.median(intervals))
         return period, max(1.4826 * float(np.median(np.abs(intervals - period))), _LEAST_SIGMA_S)
 
-    def _decided(self, least: float, sigma: float) -> Jump | None:
-        """What an odd interval and those behind it make."""
+    def _jump_of(self, least: float, sigma: float) -> Jump | None:
+        """The jump that an odd interval and those behind it make, if any."""
         odd, self._odd = self._odd, []
         seconds = sum(odd)
         if abs(seconds) > least and max(abs(off) for off in odd[1:]) < 0.5 * least:
             return Jump(self.sensor, self._from, seconds, (seconds / sigma) ** 2)
-        # Out of step for a while, or at another rate from now on.
+        # Out of phase for a while, or at another rate from now on.
         self.intervals.extend(float(np.median(self.intervals)) + off for off in odd)
         return None
 
     def _gone_back(
         self, stamp_ns: int, newest: int, place: Place, period: float, least: float
     ) -> Jump | None:
-        """A jump to before the newest stamp: twice in a row one comes where there is one, or out of step.
+        """A jump to before the newest stamp: twice in a row one comes where there is one, or out of phase.
 
         Images that come late are neither.
         """
         seconds = 1e-9 * (stamp_ns - newest)
         nearest = 1e-9 * min((abs(stamp_ns - other) for other in self._latest), default=0)
-        in_step = abs(seconds - round(seconds / period) * period) < least
-        if seconds > 0.3 * period or (nearest > 0.3 * period and in_step):
+        in_phase = abs(seconds - round(seconds / period) * period) < least
+        if seconds > 0.3 * period or (nearest > 0.3 * period and in_phase):
             self._again = []
             return None
         if not self._again:
@@ -151,33 +151,33 @@ class Rhythm:
 
 
 JUMP_CHI2 = 25.0
-"""What is beyond this, against the rhythm's variance, is a jump: five sigmas."""
+"""A square beyond this, over the variance of an interval, is a jump: five sigmas."""
 
 
-class Clocks:
-    """The rhythms of camera and LiDAR, and which of their jumps change the offset between them."""
+class StampMonitor:
+    """Intervals of camera and LiDAR, and which of their jumps change the time offset between them."""
 
     def __init__(self, chi2: float = JUMP_CHI2) -> None:
-        """chi2: what is beyond it, against a rhythm's variance, is a jump."""
+        """chi2: a square beyond it, over the variance of an interval, is a jump."""
         self.chi2 = chi2
-        self.images, self.scans = Rhythm("image"), Rhythm("scan")
+        self.images, self.scans = FrameIntervals("image"), FrameIntervals("scan")
         self._jump: Jump | None = None
         self._waited = 0
 
-    def take_image(self, stamp_ns: int, place: Place) -> None:
+    def add_image(self, stamp_ns: int, place: Place) -> None:
         """An image's stamp, as it comes."""
-        self._take(self.images.take(stamp_ns, place, self.chi2))
+        self._add(self.images.add(stamp_ns, place, self.chi2))
 
-    def take_scan(self, stamp_ns: int, place: Place) -> Jump | None:
+    def add_scan(self, stamp_ns: int, place: Place) -> Jump | None:
         """A scan's stamp; a jump that changes the offset, once it is certain."""
         self._waited += 1
-        self._take(self.scans.take(stamp_ns, place, self.chi2))
+        self._add(self.scans.add(stamp_ns, place, self.chi2))
         if self._jump is None or self._waited < _TOGETHER:
             return None
         jump, self._jump = self._jump, None
         return jump
 
-    def _take(self, jump: Jump | None) -> None:
+    def _add(self, jump: Jump | None) -> None:
         if jump is None:
             return
         other = self._jump
@@ -189,11 +189,11 @@ class Clocks:
 
 def jumps_of(image_stamps_ns: Sequence[int], scan_stamps_ns: Sequence[int]) -> list[Jump]:
     """The jumps of a whole drive's rising stamps that change the offset between camera and LiDAR."""
-    clocks, found, images = Clocks(), [], 0
+    monitor, found, images = StampMonitor(), [], 0
     for scan, stamp_ns in enumerate(scan_stamps_ns):
         while images < len(image_stamps_ns) and image_stamps_ns[images] <= stamp_ns:
-            clocks.take_image(image_stamps_ns[images], (images, scan))
+            monitor.add_image(image_stamps_ns[images], (images, scan))
             images += 1
-        jump = clocks.take_scan(stamp_ns, (images, scan))
+        jump = monitor.add_scan(stamp_ns, (images, scan))
         found += [] if jump is None else [jump]
     return found

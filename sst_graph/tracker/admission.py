@@ -1,4 +1,4 @@
-"""What the tracker refuses to take in, and why."""
+"""Which stamps the tracker refuses, and why."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from sst_graph.types import CameraImage
 _CLOSEST_NS = 1_000_000
 """Scans that are nearer to each other are one; no LiDAR turns a thousand times a second [ns]."""
 _FARTHEST_NS = 86_400 * 10**9
-"""A stamp that is farther ahead of the one before is taken for a slip, not for a pause: a day [ns]."""
+"""A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 _ELSEWHERE = 5
-"""So many stamps in a row that rise, but elsewhere, are no slip: the clock was set."""
+"""So many stamps in a row that rise, but elsewhere, are no error: the clock was set."""
 
 
 class StampOrder:
     """Whether a sensor's stamps go on from those before.
 
-    A single stamp that is out of order, or a day ahead, is refused. Were that all, a clock that was set back,
-    or one broken stamp that was taken, would have every later frame refused.
+    A single stamp that is out of order, or a day ahead, is refused; several in a row mean that the clock was
+    set, else every later frame would be refused.
 
     Attributes:
-        newest_ns: latest stamp that was taken; None before the first.
+        newest_ns: latest stamp that was used; None before the first.
     """
 
     def __init__(self, sensor: str, may_be_late: bool) -> None:
-        """may_be_late: stamps before the newest are no business of this."""
+        """may_be_late: stamps before the newest are allowed."""
         self.sensor, self.may_be_late = sensor, may_be_late
         self.newest_ns: int | None = None
         self._elsewhere: deque[int] = deque(maxlen=_ELSEWHERE)
@@ -38,7 +38,7 @@ class StampOrder:
         return {**vars(self), "_elsewhere": deque(maxlen=_ELSEWHERE)}
 
     def check(self, stamp_ns: int) -> int:
-        """Whether a stamp may be taken; nothing but a refusal is remembered.
+        """Whether a stamp may be used; nothing but a refusal is remembered.
 
         Returns:
             0, or by how much the stamps went elsewhere and now go on from there [ns].
@@ -57,10 +57,10 @@ class StampOrder:
             raise DataError(self.sensor, found, f"one after {newest} ns, by a day at most")
         return stamp_ns - newest
 
-    def take(self, stamp_ns: int, anew: bool) -> None:
-        """A stamp was taken; ``anew``: the stamps go on from there."""
+    def add(self, stamp_ns: int, restarted: bool) -> None:
+        """A stamp was used; ``restarted``: the stamps go on from there."""
         newest = self.newest_ns
-        self.newest_ns = stamp_ns if anew or newest is None else max(newest, stamp_ns)
+        self.newest_ns = stamp_ns if restarted or newest is None else max(newest, stamp_ns)
         self._elsewhere.clear()
 
     def _follows(self, stamp_ns: int, before_ns: int) -> bool:

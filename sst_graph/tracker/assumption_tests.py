@@ -1,7 +1,7 @@
-"""Do the data contradict what a tracker takes for granted? Score tests from its sums, at any time.
+"""Do the data contradict what a tracker assumes? Score tests from its sums, at any time.
 
-What leaves the window is kept as one belief on the unknowns x that carries the parameters of all assumptions
-along (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
+What leaves the window is kept as one Gaussian on the unknowns x and the parameters of all assumptions
+(:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
 With H the information of past and window on [x, theta], g its vector at the estimate and a = [-H_xx^-1 H_xt,
 1], the score of theta with all unknowns free is a'g, its variance a'(H + S)a where S is what clusters of
 matches add, and
@@ -10,7 +10,7 @@ matches add, and
 
 is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
 threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.batch.assumption_tests`).
-Objects are not left out in turn: where an assumption is wrong they all say so, each in its own measure.
+Objects are not left out in turn: where an assumption is wrong all of them show it.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from sst_graph.errors import EstimationError
 from sst_graph.graph.elimination import scaled_inverse
 from sst_graph.tracker.window.smoother import WindowSmoother
 
-EVERY = 10
+_EVERY = 10
 """Scans between two tests: they cost about as much as the covariance, which each frame has."""
 
 
 def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[Finding, ...]:
-    """What the data so far say of each assumption that the matches test, the most contradicted first.
+    """Score test of each assumption that the matches determine, the most contradicted first.
 
     Raises:
         EstimationError: a direction without any information.
@@ -60,7 +60,7 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
 
 
 class AssumptionTests:
-    """When a running tracker tests what it takes for granted, and what it has found.
+    """When a running tracker tests what it assumes, and what it has found.
 
     Attributes:
         found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
@@ -73,18 +73,18 @@ class AssumptionTests:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """Of the last test, the most contradicted first."""
-        return tuple(Finding(ASSUMPTIONS[name], *said) for name, said in self.found.items())
+        return tuple(Finding(ASSUMPTIONS[name], *values) for name, values in self.found.items())
 
     def restart(self) -> None:
         """A new calibration begins."""
         self.found = {}
 
-    def take(self, scan: int, smoother: WindowSmoother) -> None:
-        """The smoother knows a scan of this number."""
-        if scan % EVERY == 0:
-            self.look(smoother)
+    def update(self, scan: int, smoother: WindowSmoother) -> None:
+        """The smoother has used a scan of this number."""
+        if scan % _EVERY == 0:
+            self.run(smoother)
 
-    def look(self, smoother: WindowSmoother) -> None:
+    def run(self, smoother: WindowSmoother) -> None:
         """Test now.
 
         Raises:

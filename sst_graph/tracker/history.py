@@ -18,6 +18,9 @@ from sst_graph.tracker.window.smoother import WindowSmoother
 
 FloatArray = NDArray[np.float64]
 
+_MAX_EPOCHS = 5000
+"""Epochs kept for smoothing: nearly an hour and a half, at some kilobytes each."""
+
 
 @dataclass(frozen=True)
 class HistoryEntry:
@@ -36,18 +39,18 @@ class HistoryEntry:
 
 
 class History:
-    """Beliefs of the epochs that have passed, one run after each alarm; the oldest are forgotten."""
+    """Gaussians of the epochs that have passed since the last alarm; the oldest are forgotten."""
 
-    def __init__(self, most: int) -> None:
-        self.epochs: deque[RetiredEpoch] = deque(maxlen=most)
+    def __init__(self) -> None:
+        self.epochs: deque[RetiredEpoch] = deque(maxlen=_MAX_EPOCHS)
 
     def take(self, smoother: WindowSmoother) -> None:
-        """Take over the epochs that a smoother has retired."""
+        """Move the epochs that a smoother has retired here."""
         self.epochs.extend(smoother.retired)
         smoother.retired.clear()
 
     def cut(self) -> None:
-        """A break: what comes is not tied to what was."""
+        """Forget all: what comes is of another calibration."""
         self.epochs.clear()
 
     def smoothed(self, smoother: WindowSmoother) -> list[HistoryEntry]:
@@ -55,10 +58,10 @@ class History:
         epochs = [*self.epochs, *smoother.live_epochs()]
         walks = [smoother.walk(max(1e-3, (b.start_ns - a.start_ns) * 1e-9)) for a, b in pairwise(epochs)]
         point = smoother.point.core()
-        beliefs = [_honest(epoch, point) for epoch in epochs]
-        forward = _passed(beliefs, walks, smoother.prior)
+        beliefs = [_cluster_robust(epoch, point) for epoch in epochs]
+        forward = _messages(beliefs, walks, smoother.prior)
         nothing = Gaussian(point, np.zeros((point.size, point.size)), np.zeros(point.size))
-        backward = _passed(beliefs[::-1], walks[::-1], nothing)[::-1]
+        backward = _messages(beliefs[::-1], walks[::-1], nothing)[::-1]
         entries = []
         for epoch, belief, a, b in zip(epochs, beliefs, forward, backward, strict=True):
             total = belief.plus(a).plus(b)
@@ -68,16 +71,16 @@ class History:
         return entries
 
 
-def _passed(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
-    """What reaches each epoch from those before it."""
+def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gaussian) -> list[Gaussian]:
+    """Gaussian on each epoch by those before it, through the random walk."""
     messages = [first]
     for belief, walk in zip(beliefs[:-1], walks, strict=True):
         messages.append(belief.plus(messages[-1]).drifted(walk))
     return messages
 
 
-def _honest(epoch: RetiredEpoch, point: Point) -> Gaussian:
-    """The epoch's belief with its cluster-robust information: H M^-1 H, M = H + surplus."""
+def _cluster_robust(epoch: RetiredEpoch, point: Point) -> Gaussian:
+    """The epoch's Gaussian with its cluster-robust information: H M^-1 H, M = H + surplus."""
     belief = epoch.belief.at(point)
     H = belief.information
     diagonal = np.diag(H)

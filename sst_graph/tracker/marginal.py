@@ -1,4 +1,4 @@
-"""What a tracker knows so far as a cost on (E, D), and what it has learnt since it told it last."""
+"""A tracker's estimate as a cost on (E, D), and what to add to an earlier one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class TrackedMarginal(CalibrationMarginal):
     """A tracker's marginal.
 
     Attributes:
-        start: number of the start that its estimate comes from: what another start told is of another
+        start: number of the start that its estimate comes from; that of another start is of another
             calibration.
     """
 
@@ -37,7 +37,7 @@ def tracked_marginal(
     return TrackedMarginal(cTl, offset_s, information, np.zeros(7), start=start)
 
 
-def seen_from(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMarginal:
+def moved_to(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMarginal:
     """A marginal about its own optimum as the cost about another point that leads back to it exactly.
 
     With s = Log(T0^-1 T) from the other point T0 to the optimum T, and J the derivative of
@@ -65,10 +65,10 @@ def seen_from(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedM
 def increment(whole: TrackedMarginal, previous: TrackedMarginal) -> TrackedMarginal:
     """What to add to a marginal to come to another, about the former's point.
 
-    It may take back: where later frames show that labels err more than they seemed to, the tracker is less
-    sure than it was, and the difference is negative there. The sum is the tracker's own information.
+    It may be negative in some direction: where later frames show that labels err more than they seemed to,
+    the covariance grows. The sum is the tracker's own information.
     """
-    there = seen_from(whole, previous)
+    there = moved_to(whole, previous)
     return replace(
         there,
         information=there.information - previous.information,

@@ -29,28 +29,26 @@ class TrackUpdate(ByValue):
         T_camera_lidar: p_camera = T_camera_lidar . p_lidar.
         time_offset_s: t_lidar = t_camera_stamp + time_offset_s [s].
         covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
-        status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until the tracker has
-            converged again; ``contradicted`` where the data contradict something that is taken for granted;
-            ``unconfirmed`` where no frames have lately confirmed it; else whether the limits of observability
-            are met.
-        accepted: all of the frame was taken into the estimate; else ``reason`` says why not.
+        status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until there is an estimate
+            again; ``contradicted`` where the data contradict what is assumed; ``unconfirmed`` where no frames
+            have lately confirmed it; else whether the limits of observability are met.
+        accepted: all of the frame was used; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
-        refused: the sensors of it whose data were not taken in: they have changed nothing.
+        refused: the sensors of it whose data were not used: they have changed nothing.
         matches: silhouette matches in the window.
-        chi2: statistic of the change test, over its usual size, or None where it can't be told.
-        doubt: why the statistic, past its threshold for long, raises no alarm; empty where it is not.
+        chi2: statistic of the change test, over its usual size; None where there are too few frames.
+        suspected_change: why the statistic, past its threshold for some frames, raises no alarm; else empty.
         alarm: this frame raised the alarm: the calibration has changed.
         unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
-            camera; the status is ``unconfirmed`` above ``alarm.confirm_s`` [s].
-        offset_unconfirmed_s: time since frames last agreed with it that would have shown a jump of the clock,
-            as far as the LiDAR was faster than ``alarm.confirm_mps``; the same above
-            ``alarm.confirm_offset_s`` [s].
+            camera; above 1 s the status is ``unconfirmed`` [s].
+        offset_unconfirmed_s: time at more than 3 m/s since frames last agreed with it that would have shown a
+            jump of the clock; above 3 s the status is ``unconfirmed`` [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
         covariance_reason: why there is no covariance; empty where there is.
-        settled: the window was solved as a whole after this frame (:meth:`Tracker.settle`).
-        contradictions: what the data contradict of what is taken for granted, with estimate, deviation and
-            remedy.
+        converged: whether the solution of the whole window after this frame did (:meth:`Tracker.optimize`);
+            None where it was not solved.
+        contradictions: what the data contradict of what is assumed, with estimate, deviation and remedy.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
     """
@@ -65,14 +63,14 @@ class TrackUpdate(ByValue):
     refused: tuple[Sensor, ...] = ()
     matches: int = 0
     chi2: float | None = None
-    doubt: str = ""
+    suspected_change: str = ""
     alarm: bool = False
     unconfirmed_s: float = 0.0
     offset_unconfirmed_s: float = 0.0
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
     covariance_reason: str = ""
-    settled: bool = False
+    converged: bool | None = None
     contradictions: tuple[str, ...] = ()
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
@@ -101,12 +99,12 @@ class TrackUpdate(ByValue):
             "refused": list(self.refused),
             "matches": self.matches,
             "chi2": self.chi2,
-            "doubt": self.doubt,
+            "suspected_change": self.suspected_change,
             "alarm": self.alarm,
             "unconfirmed_s": self.unconfirmed_s,
             "offset_unconfirmed_s": self.offset_unconfirmed_s,
             "adopted": self.adopted,
-            "settled": self.settled,
+            "converged": self.converged,
             "contradictions": list(self.contradictions),
             "estimated": {
                 name: {"value": value, "sigma": sigma} for name, (value, sigma) in self.estimated.items()

@@ -4,45 +4,55 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections import deque
-from collections.abc import Callable, Container
-from functools import partial
-from typing import Any
+from pathlib import Path
 
 import gtsam
 import numpy as np
 
+from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.object_store import lay_out
-from sst_graph.graph.convergence import FULL_STEPS
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
+from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
+from sst_graph.tracker.answer import answer, current
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
+from sst_graph.tracker.inputs import SensorInputs
 from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
+from sst_graph.tracker.monitor.monitor import Monitor
+from sst_graph.tracker.monitor.statistic import Estimate
+from sst_graph.tracker.result import tracker_result
+from sst_graph.tracker.start.initializer import (
+    NUMERICAL_ERRORS,
+    Initialization,
+    Initializer,
+    Restart,
+    searched_scans,
+)
 from sst_graph.tracker.start.solution import Guess
-from sst_graph.tracker.start.steps import EXPECTED
-from sst_graph.tracker.status import Known
-from sst_graph.tracker.storage.resume import FirstFrames, Setup
+from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
+from sst_graph.tracker.storage.resume import Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
-from sst_graph.tracker.update import Tracking
-from sst_graph.tracker.window.whole_window import settle_window
+from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.types import CameraImage, Frame, Scan
-from sst_graph.validation import LATEST_NS, checked_image, checked_scan
+from sst_graph.validation import LATEST_NS
 
 _LOG = logging.getLogger(__name__)
 
-_MOST_FAILURES = 10
-"""After so many scans or images in a row that could not be taken in, what is kept is the likely reason."""
 
-
-class Tracker(Tracking):
+class Tracker:
     """Extrinsic and time offset of one LiDAR and one camera, frame by frame.
 
     Frames, or scans and images on their own, come in the order of their stamps (images may come a little
-    late). Nothing that they bring raises: what cannot be used, whatever its arrays hold, leaves everything as
-    it was, and the answer says why.
+    late). No input raises: what cannot be used leaves everything as it was, and the answer says why.
+
+    Attributes:
+        setup: camera, settings and guess that it was made with.
+        inputs: latest scans and images, odometry, stamps.
+        matcher: matches of the latest scans.
+        initializer: the start that is being made.
+        estimate: extrinsic, time offset and their covariance.
+        monitor: whether the calibration has changed, and which one to use.
     """
 
     def __init__(
@@ -53,26 +63,19 @@ class Tracker(Tracking):
         initial_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        config = config or TrackerConfig()
-        super().__init__(camera, config, Guess(initial, initial_offset_s))
-        self.setup = Setup(camera, config, initial, initial_offset_s)
-        self.first_frames = FirstFrames()
-        self.failures: deque[str] = deque(maxlen=_MOST_FAILURES)
-        self.settled = False
-
-    @property
-    def newest_ns(self) -> int | None:
-        """Stamp of the newest scan that was taken in [ns]."""
-        return self.scan_order.newest_ns
-
-    def __getstate__(self) -> dict[str, Any]:
-        """All but what failed."""
-        return {**vars(self), "failures": deque(maxlen=_MOST_FAILURES)}
+        self.setup = Setup(camera, config or TrackerConfig(), initial, initial_offset_s)
+        config = self.setup.config.estimating
+        guess = Guess(initial, initial_offset_s, search=config.calibration.start.enabled)
+        self.inputs = SensorInputs(camera, config, searched_scans(config))
+        self.matcher = WindowMatcher(self.inputs.window, config)
+        self.initializer = Initializer(guess, config)
+        self.estimate = OnlineEstimate(self.matcher, config, guess)
+        self.monitor = Monitor(self.matcher, config)
 
     def add(self, frame: Frame) -> TrackUpdate:
-        """Take in a frame; its image, or its scan, may be missing, and either may be refused alone."""
+        """Add a frame's image and scan; either may be missing, and either may be refused alone."""
         if not isinstance(frame, Frame) or (frame.image is None and frame.scan is None):
-            return self.answer(0, "a frame without scan and without image")
+            return answer(self, 0, "a frame without scan and without image")
         of_image = None if frame.image is None else self.add_image(frame.image)
         if frame.scan is None:
             assert of_image is not None
@@ -81,176 +84,215 @@ class Tracker(Tracking):
         if of_image is None or of_image.accepted:
             return update
         reason = "; ".join(filter(None, (of_image.reason, update.reason)))
-        return dataclasses.replace(
-            update, accepted=False, reason=reason, refused=(*of_image.refused, *update.refused)
-        )
+        refused = (*of_image.refused, *update.refused)
+        return dataclasses.replace(update, accepted=False, reason=reason, refused=refused)
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
-        """Take in an image; it is used as soon as a scan close to it in true time is there."""
+        """Add an image; it is used as soon as a scan close to it in true time is there."""
         try:
-            checked = checked_image(image, self.camera)
-            moved_ns = self.image_order.check(checked.stamp_ns)
-        except DataError as error:
-            return self._refused("image", image, str(error))
-        return self._whole("image", checked, partial(self.take_image, checked, moved_ns))
+            # 1. Check the image and its stamp.
+            checked, clock_step_ns = self.inputs.check_image(image)
+            with Snapshot(self):
+                # 2. Its contours go into the window.
+                self.inputs.add_image(checked, clock_step_ns, self.estimate)
+                return answer(self, checked.stamp_ns)
+        except Exception as error:
+            return self._not_added("image", image, error)
 
     def add_scan(self, scan: Scan) -> TrackUpdate:
-        """Take in a scan, match it and whatever of the window is to be renewed, and estimate."""
+        """Add a scan, and estimate; where anything fails, everything is as it was."""
         try:
-            checked = checked_scan(scan)
-            moved_ns = self.scan_order.check(checked.stamp_ns)
-        except DataError as error:
-            return self._refused("scan", scan, str(error))
-        return self._whole("scan", checked, partial(self.take_scan, checked, moved_ns))
-
-    def _whole(
-        self, sensor: Sensor, data: Scan | CameraImage, take: Callable[[], TrackUpdate]
-    ) -> TrackUpdate:
-        """Take in a sensor's data whole; where anything fails, everything is as it was."""
-        before = Snapshot(self)
-        try:
-            self.settled = False
-            update = take()
-            self.first_frames.take(data)
-        except DataError as error:
-            before.restore()
-            return self._refused(sensor, data, str(error))
+            # 1. Check the scan and its stamp.
+            checked, clock_step_ns = self.inputs.check_scan(scan)
+            with Snapshot(self):
+                # 2. Its boundary points, and the motion that led to it, go into the window.
+                jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
+                # 3. Stamps that jumped: earlier frames have another time offset.
+                if restart := self._restart_by_stamps(clock_step_ns, jump):
+                    return self._restart(restart, checked.stamp_ns)
+                # 4. Without an estimate: some work on a start.
+                if not self.estimate.exists:
+                    return self._initialize(checked.stamp_ns)
+                # 5. Match new scans, and some of the window anew.
+                matches = self.estimate.match(self.inputs.window.next_scan - 1)
+                # 6. Compare new frames with the estimate before they are used: has the calibration changed?
+                chi2, change = self.monitor.check(matches, self.estimate)
+                if change is not None:
+                    return self._restart(change, checked.stamp_ns)
+                # 7. Put the matches into the graph, and estimate.
+                self.estimate.update(matches)
+                # 8. Do frames since the start agree with it, and may the estimate be adopted?
+                return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
-            before.restore()
-            if not isinstance(error, EXPECTED):
-                _LOG.exception("tracker: an error while a %s was taken in", sensor)
-            return self._failed(sensor, data, " ".join(f"{type(error).__name__}: {error}".split())[:300])
-        except BaseException:
-            before.restore()
-            raise
-        if sensor == "scan":
-            self.failures.clear()
-        return update
+            return self._not_added("scan", scan, error)
 
-    def _refused(self, sensor: Sensor, data: object, why: str) -> TrackUpdate:
-        """The answer to data that are not taken in."""
-        stamp_ns = getattr(data, "stamp_ns", 0)
-        known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
-        return dataclasses.replace(self.answer(int(stamp_ns) if known else 0, why), refused=(sensor,))
-
-    def _failed(self, sensor: Sensor, data: object, why: str) -> TrackUpdate:
-        """The answer to data that could not be taken in; if that goes on, the window is given up."""
-        self.failures.append(why)
-        if len(self.failures) == self.failures.maxlen:
-            _LOG.warning("tracker: begins anew after %d failures: %s", len(self.failures), why)
-            self.forget_all(Guess(self.point.cTl, self.point.offset_s, self.guess.search))
-            why = f"{why}; the tracker begins anew"
-        return self._refused(sensor, data, why)
-
-    def current(self, after: TrackUpdate | None = None) -> TrackUpdate:
-        """The present estimate as an answer, without a frame.
-
-        Args:
-            after: answer to the last frame; what it says of that frame stays.
-        """
-        update = dataclasses.replace(self.answer(self.window.last_stamp_ns or 0), settled=self.settled)
-        if after is None:
-            return update
-        of_frame = ["stamp_ns", "refused", "chi2", "alarm", "adopted"]
-        if after.covariance is not None or update.covariance is None or after.refused:
-            of_frame += ["accepted", "reason"]
-        return dataclasses.replace(update, **{name: getattr(after, name) for name in of_frame})
-
-    def marginal(self) -> TrackedMarginal:
-        """What is known so far of extrinsic and time offset, as a factor for a graph of one's own.
-
-        Linearized at the estimate, as sure as the reported covariance: parameters of assumptions that are
-        estimated are marginalized out, those that are not are considered.
-
-        Raises:
-            EstimationError: there is no estimate yet.
-        """
-        if self.smoother is None:
-            raise EstimationError("the tracker has no estimate yet: no marginal")
-        return tracked_marginal(self.point.cTl, self.point.offset_s, self.reported(), self.starts)
-
-    def marginal_since(self, previous: TrackedMarginal) -> TrackedMarginal:
-        """What to add to an earlier marginal for the present one: nothing counts twice.
-
-        ``known = tracker.marginal()`` once; then, whenever wanted, ``more = tracker.marginal_since(known)``
-        into the graph and ``known = known.plus(more)``. All parts are linearized at the first one's point,
-        and their sum is the tracker's information. A part alone may be negative in some direction: frames
-        may also show that less is known than it seemed.
-
-        Args:
-            previous: an earlier marginal of this tracker, with what was added since.
-
-        Raises:
-            EstimationError: there is no estimate, or the calibration has changed since: take the parts told
-                before out of the graph, and begin with :meth:`marginal`.
-        """
-        whole = self.marginal()
-        if previous.start != whole.start:
-            raise EstimationError(
-                f"found a marginal of start {previous.start}, expected one of start {whole.start}: "
-                "the calibration has changed since"
-            )
-        return increment(whole, previous)
-
-    def history(self) -> list[HistoryEntry]:
-        """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
-        if self.smoother is None:
-            return []
-        entries = self.history_store.smoothed(self.smoother)
-        beside = self.considered().covariance(7)
-        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
-
-    def consolidate(self, laid_out: Container[int] = ()) -> None:
-        """Begin iSAM2 and the odometry's map anew from what a checkpoint holds.
-
-        The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
-
-        Args:
-            laid_out: ids of values that have their memory layout already.
-        """
-        lay_out(self, laid_out)
-        self.odometry.rebuild_map()
-        if self.smoother is not None:
-            self.smoother.relinearize()
-
-    def settle(self, most: int = 20) -> bool:
-        """Solve the whole window again as the batch does, as at the end of a drive.
+    def optimize(self, last: TrackUpdate | None = None, max_iterations: int = 20) -> TrackUpdate:
+        """Solve the whole window as the batch does, as at the end of a drive.
 
         A start that is not done yet is brought to its end first.
 
+        Args:
+            last: answer to the last frame; what it holds of that frame stays.
+            max_iterations: under the narrowest kernel.
+
         Returns:
-            Whether it rests: the last whole step was below 0.02 standard deviations.
+            The answer with the solution; ``converged`` says whether it converged.
         """
-        at_last = self.smoother is None and self._finish_start()
-        smoother = self.smoother
-        if smoother is None:
-            return False
-        self.stop_settling()
-        self.window.dynamics.test_all()
-        self.matcher.look_below(smoother.point)
-        alive = self.window.objects.live
-        try:
-            rests = settle_window(
-                smoother, self.matcher, NARROW_KERNELS_PX, most, FULL_STEPS, alive, self._share
+        at_end = not self.estimate.exists and self._finish_start()
+        converged = self.estimate.optimize(max_iterations)
+        if converged is not None and at_end:
+            self.monitor.check_start_at_end(self.estimate)
+        return dataclasses.replace(current(self, last), converged=converged)
+
+    def result(self, drive: str = "stream", camera_name: str = UNNAMED_CAMERA) -> CalibrationResult:
+        """The present estimate as a calibration result; the frames used are those of the window."""
+        return tracker_result(self, drive, camera_name)
+
+    def marginal(self, since: TrackedMarginal | None = None) -> TrackedMarginal:
+        """What is known of extrinsic and time offset, as a factor for a graph of one's own.
+
+        Linearized at the estimate, with the reported covariance: estimated parameters of assumptions are
+        marginalized out, those that are not estimated are considered.
+
+        To add it as it grows: ``known = tracker.marginal()`` once; then, whenever wanted,
+        ``more = tracker.marginal(since=known)`` into the graph and ``known = known.plus(more)``. All parts
+        are linearized at the first one's point, and their sum is the tracker's information. A single part
+        may be negative in some direction: frames may also show that less is known than it seemed.
+
+        Args:
+            since: an earlier marginal of this tracker, with what was added since.
+
+        Raises:
+            EstimationError: there is no estimate; or the calibration has changed since: take the earlier
+                parts out of the graph, and begin with the whole.
+        """
+        if not self.estimate.exists:
+            raise EstimationError("the tracker has no estimate yet: no marginal")
+        point, starts = self.estimate.point, self.estimate.starts
+        whole = tracked_marginal(point.cTl, point.offset_s, self.estimate.reported_covariance(), starts)
+        if since is None:
+            return whole
+        if since.start != whole.start:
+            raise EstimationError(
+                f"found a marginal of start {since.start}, expected one of start {whole.start}: "
+                "the calibration has changed since"
             )
-            self.known = Known.of(smoother)
-            self.tests.look(smoother)
-        except EstimationError as error:
-            _LOG.warning("tracker: not settled: %s", error)
-            return False
-        self.entered.extend(set(smoother.entries) - set(self.entered))
-        if at_last:
-            self.trial.look_last(self.watch, smoother, self.known, self.window.dynamics.recently_moving())
-        self.settled = True
-        return rests
+        return increment(whole, since)
+
+    def save(self, path: str | Path) -> None:
+        """Write a checkpoint; a file that exists is replaced in one step.
+
+        iSAM2 and the odometry's map are built anew first, so that this tracker and one that is loaded go on
+        alike. :class:`~sst_graph.tracker.storage.checkpoint.Saver` spreads the work over frames.
+
+        Raises:
+            OSError: it cannot be written; what stood there is untouched.
+        """
+        with Saver(path) as saver:
+            saver.save(self)
+
+    @staticmethod
+    def load(path: str | Path, setup: Setup | None = None) -> Tracker:
+        """The tracker in a checkpoint, at the estimate it was saved with.
+
+        Args:
+            setup: camera, settings and guess that it must have been made with; None for any.
+
+        Raises:
+            CheckpointError: no such file, not a checkpoint of this version, or one that was changed or
+                damaged.
+            DataError: one of a tracker that was made with another camera, other settings or another guess.
+        """
+        return load_checkpoint(path, setup)
+
+    # ------------------------------------------------------------------ steps
+
+    def _initialize(self, stamp_ns: int) -> TrackUpdate:
+        """Some work towards a first estimate."""
+        try:
+            initialization = self.initializer.work(self.matcher)
+        except NUMERICAL_ERRORS as error:
+            self.initializer.failed()
+            return answer(self, stamp_ns, f"no start yet: {' '.join(str(error).split())}")
+        if initialization is not None:
+            return self._begin(initialization, stamp_ns)
+        under_way = self.initializer.under_way
+        return answer(self, stamp_ns, "looking for a start" if under_way else "collecting frames for a start")
 
     def _finish_start(self) -> bool:
-        """All that is left of a start, where one can be made; whether there is an estimate."""
+        """Do all that is left of a start, where one can be made; whether there is an estimate."""
         try:
-            started = self.starting.finish(self.matcher)
-        except EXPECTED as error:
+            initialization = self.initializer.finish(self.matcher)
+        except NUMERICAL_ERRORS as error:
             _LOG.warning("tracker: no start: %s", error)
             return False
-        if started is not None:
-            self.begin(started, self.window.last_stamp_ns or 0)
-        return self.started
+        if initialization is not None:
+            self._begin(initialization, self.inputs.window.last_stamp_ns or 0)
+        return self.estimate.exists
+
+    def _begin(self, initialization: Initialization, stamp_ns: int) -> TrackUpdate:
+        """Go on from a first estimate, if the frames that it is made of agree with it."""
+        smoother, window = initialization.smoother, self.inputs.window
+        estimate = Estimate(smoother.point, initialization.uncertainty.joint, smoother.model)
+        if why := self.monitor.changes.check_start(list(smoother.entries), estimate):
+            return self._restart(Restart(self.initializer.guess, len(window.scans) // 2, why), stamp_ns)
+        self.estimate.begin(initialization)
+        self.initializer.succeeded()
+        self.monitor.begin(window.next_scan)
+        return answer(self, stamp_ns)
+
+    def _restart_by_stamps(self, clock_step_ns: int, jump: Jump | None) -> Restart | None:
+        """The restart that stamps call for: a clock was set, or stamps jumped against their interval."""
+        window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
+        if clock_step_ns:
+            moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
+            near = Guess(point.cTl, point.offset_s, guess.search)
+            return Restart(near, len(window.scans), f"{moved}: the calibration is estimated anew", alarm=True)
+        if jump is None:
+            return None
+        image, scan = jump.place
+        if jump.sensor == "image":
+            window.forget_images_before(image)
+        since = window.next_scan - scan
+        if not self.estimate.exists:
+            return Restart(guess, since, jump.sentence)
+        # Most likely the clock was set.
+        changes = self.monitor.changes
+        before = changes.before(scan) or point
+        near = Guess(before.cTl, before.offset_s + jump.offset_s, search=changes.far)
+        return Restart(near, since, jump.sentence, alarm=True, chi2=jump.chi2)
+
+    def _restart(self, restart: Restart, stamp_ns: int) -> TrackUpdate:
+        """Give up the estimate and all scans but the last few."""
+        level = logging.WARNING if restart.alarm else logging.INFO
+        _LOG.log(level, "tracker: estimates anew from %d ns on: %s", stamp_ns, restart.reason)
+        self.estimate.restart(restart.guess)
+        self.monitor.restart()
+        self.inputs.window.keep_scans(restart.scans)
+        self.initializer.restart(restart.guess, len(self.inputs.window.scans), restart.alarm)
+        return answer(self, stamp_ns, restart.reason, chi2=restart.chi2, alarm=restart.alarm)
+
+    def _review(self, matches: FrameMatches, stamp_ns: int, chi2: float | None) -> TrackUpdate:
+        """The answer to a scan that has been used; the estimate is adopted where held-out frames agree."""
+        self.monitor.recheck_start(matches.scan, self.estimate)
+        reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
+        update = answer(self, stamp_ns, reason, chi2=chi2)
+        trusted = update.status == "ok" and not update.suspected_change
+        adopted = bool(matches.new) and self.monitor.adoption.propose(self.estimate.point, trusted)
+        return dataclasses.replace(update, adopted=adopted)
+
+    def _not_added(self, sensor: Sensor, data: object, error: Exception) -> TrackUpdate:
+        """The answer to data that could not be used; if that goes on, the window is given up."""
+        why = str(error)
+        if not isinstance(error, DataError):
+            if not isinstance(error, NUMERICAL_ERRORS):
+                _LOG.error("tracker: an error while a %s was added", sensor, exc_info=error)
+            why = " ".join(f"{type(error).__name__}: {error}".split())[:300]
+            if self.inputs.failed(why):
+                point, guess = self.estimate.point, self.initializer.guess
+                self.inputs.restart()
+                self._restart(Restart(Guess(point.cTl, point.offset_s, guess.search), 0, why), 0)
+                why = f"{why}; the calibration is estimated anew"
+        stamp_ns = getattr(data, "stamp_ns", 0)
+        known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
+        return dataclasses.replace(answer(self, int(stamp_ns) if known else 0, why), refused=(sensor,))

@@ -23,7 +23,6 @@ from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
 
 SOON = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
-OPTIONS = [*SOON, "--set", "start_work=0"]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +52,7 @@ def _lines(text: str) -> list[dict[str, Any]]:
 
 def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "calibration.json"
-    code = main(["track", str(street), *OPTIONS, "--out", str(out)])
+    code = main(["track", str(street), *SOON, "--out", str(out)])
     captured = capsys.readouterr()
     lines = _lines(captured.out)
     assert [line["frame"] for line in lines] == list(range(20))
@@ -64,7 +63,7 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
     assert result.method == "track" and result.frames_used
     # The file says what the last line says.
     last = lines[-1]
-    assert last["settled"] and not any(line["settled"] for line in lines[:-1])
+    assert last["converged"] is not None and all(line["converged"] is None for line in lines[:-1])
     np.testing.assert_array_equal(last["T_camera_lidar"], result.T_camera_lidar.matrix())
     assert last["time_offset_s"] == result.time_offset_s
     np.testing.assert_array_equal(last["covariance"], result.covariance)
@@ -79,7 +78,7 @@ def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "calibration.json"
-    main(["track", str(street), *OPTIONS, "--estimate", "focal=0.01", "--out", str(out)])
+    main(["track", str(street), *SOON, "--estimate", "focal=0.01", "--out", str(out)])
     lines, result = _lines(capsys.readouterr().out), read_result(out)
     assert lines[0]["estimated"] == {} and lines[-1]["estimated"] == result.diagnostics["estimated"]
     focal = lines[-1]["estimated"]["focal"]
@@ -93,9 +92,9 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     """SIGKILL at some frame after a checkpoint; what is resumed does what an unbroken run does."""
     whole, rest, checkpoint = tmp_path / "whole.json", tmp_path / "rest.json", tmp_path / "tracker.npz"
     other = ["--checkpoint", str(tmp_path / "other.npz"), "--checkpoint-every", "3"]
-    main(["track", str(street), *OPTIONS, *other, "--out", str(whole)])
+    main(["track", str(street), *SOON, *other, "--out", str(whole)])
     unbroken = _lines(capsys.readouterr().out)
-    command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *OPTIONS]
+    command = [sys.executable, "-m", "sst_graph.cli", "track", str(street), *SOON]
     command += ["--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, bufsize=0, env={**os.environ})
     assert process.stdout is not None
@@ -108,7 +107,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
     process.wait()
     assert checkpoint.exists()
     time.sleep(0.01)
-    command = ["track", str(street), *OPTIONS, "--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
+    command = ["track", str(street), *SOON, "--checkpoint", str(checkpoint), "--checkpoint-every", "3"]
     main([*command, "--resume", "--out", str(rest)])
     resumed = _lines(capsys.readouterr().out)
     assert resumed[0]["frame"] in (6, 9, 12, 15, 18) and resumed[-1]["frame"] == 19
@@ -130,7 +129,7 @@ def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.Capture
 def saved(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A checkpoint after eight frames of the street."""
     path = tmp_path_factory.mktemp("saved") / "tracker.npz"
-    main(["track", str(street), "--frames", "0:8", *OPTIONS, "--checkpoint", str(path)])
+    main(["track", str(street), "--frames", "0:8", *SOON, "--checkpoint", str(path)])
     return path
 
 
@@ -180,7 +179,7 @@ def test_resumed_with_nothing_said_or_the_same_said(
     street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Settings that are not named are the checkpoint's; those that are, are its own."""
-    for options in ([], [*OPTIONS, "--init", "dataset"]):
+    for options in ([], [*SOON, "--init", "dataset"]):
         copy = tmp_path / "tracker.npz"
         shutil.copy(saved, copy)
         command = ["track", str(street), "--frames", "0:9", "--checkpoint", str(copy), "--resume"]
@@ -194,7 +193,7 @@ def test_resumed_with_nothing_said_or_the_same_said(
         (["--resume"], "--resume needs --checkpoint"),
         (["--checkpoint", "x.npz", "--checkpoint-every", "0"], "expected 1 or more"),
         (["--set", "windw=3"], "unknown setting 'windw'; did you mean 'window'?"),
-        (["--set", "drift.epoch_s=-1"], "epoch_s"),
+        (["--set", "drift.rotation_deg=-1"], "rotation_deg"),
         (["--init", "none.json"], "none.json: found no such file"),
     ],
 )

@@ -25,8 +25,7 @@ from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.tracker.result import tracker_result
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.answer import current
 from sst_graph.tracker.sums.score_sums import ScoreSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
@@ -70,7 +69,7 @@ def _tracked(drive: KeptDrive, *settings: str, settle: bool = True) -> Tracker:
     for frame in drive:
         tracker.add(frame)
     if settle:
-        tracker.settle()
+        tracker.optimize()
     return tracker
 
 
@@ -94,10 +93,10 @@ def leaving(bent: KeptDrive) -> Tracker:
 
 def _state(tracker: Tracker) -> State:
     """The state at which all matches of a tracker's window were made."""
-    assert tracker.smoother is not None
-    points = [entry.score.belief.point for entry in tracker.smoother.entries.values()]
+    assert tracker.estimate.smoother is not None
+    points = [entry.score.belief.point for entry in tracker.estimate.smoother.entries.values()]
     assert all(point.cTl.equals(points[0].cTl, 0.0) for point in points)
-    state = points[0].state(tracker.classes)
+    state = points[0].state(tracker.matcher.classes)
     seen = [(point.tracks, point.object_biases_px.tolist()) for point in points]
     biases = {(0, track): bias for own in seen for track, bias in zip(*own, strict=True)}
     return dataclasses.replace(state, object_biases_px={**state.object_biases_px, **biases})
@@ -105,26 +104,28 @@ def _state(tracker: Tracker) -> State:
 
 def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> None:
     """The batch's function on the window's own matches, at the tracker's state."""
-    assert settled.smoother is not None
-    entries = dict(sorted(settled.smoother.entries.items()))
-    assert list(entries) == list(range(len(entries))) and not settled.smoother.sums.recent
+    assert settled.estimate.smoother is not None
+    entries = dict(sorted(settled.estimate.smoother.entries.items()))
+    assert list(entries) == list(range(len(entries))) and not settled.estimate.smoother.sums.recent
     pairs, state = [entry.pair for entry in entries.values()], _state(settled)
-    guess = State(settled.guess.cTl or gtsam.Pose3(), (settled.guess.offset_s,))
+    guess = State(settled.initializer.guess.cTl or gtsam.Pose3(), (settled.initializer.guess.offset_s,))
     graph, values = joint_graph(pairs, state, settled.matcher.graph, guess)
-    robust = robust_covariance(graph, values, pairs, state, [settled.window.objects_of(list(entries))[0]])
-    plain = consider(robust, pairs, values, state, settled.config.calibration.assumptions)
-    expected = told_by(plain, settled.tests.findings)
-    found = settled.considered()
+    robust = robust_covariance(
+        graph, values, pairs, state, [settled.inputs.window.objects_of(list(entries))[0]]
+    )
+    plain = consider(robust, pairs, values, state, settled.setup.config.calibration.assumptions)
+    expected = told_by(plain, settled.estimate.tests.findings)
+    found = settled.estimate.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
-    scale = np.sqrt(np.diag(settled.covariance)[:7])
+    scale = np.sqrt(np.diag(settled.estimate.covariance)[:7])
     for name, step in expected.sensitivities.items():
         size = np.linalg.norm(step / scale)
         np.testing.assert_allclose(found.sensitivities[name] / scale, step / scale, atol=1e-3 * size)
     np.testing.assert_allclose(
         np.sqrt(np.diag(found.covariance(7))), np.sqrt(np.diag(expected.covariance(7))), rtol=1e-3
     )
-    total = settled.covariance[:7, :7] + expected.covariance(7)
-    np.testing.assert_allclose(np.diag(settled.reported()), np.diag(total), rtol=1e-3)
+    total = settled.estimate.covariance[:7, :7] + expected.covariance(7)
+    np.testing.assert_allclose(np.diag(settled.estimate.reported_covariance()), np.diag(total), rtol=1e-3)
 
 
 N, HELD = 9, 3
@@ -201,9 +202,9 @@ def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) ->
 
 
 def test_a_clean_street_contradicts_nothing(settled: Tracker) -> None:
-    update = settled.current()
+    update = current(settled)
     assert update.contradictions == () and update.status == "ok" and update.estimated == {}
-    report = tracker_result(settled).diagnostics["assumptions"]
+    report = settled.result().diagnostics["assumptions"]
     assert list(report) == list(ASSUMPTIONS)
     tested = {name for name, entry in report.items() if "estimate" in entry}
     assert tested == {name for name, assumption in ASSUMPTIONS.items() if assumption.by_matches}
@@ -214,26 +215,26 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     drive = with_principal_point(street, 20.0, 0.0)
     # A dozen vehicles in half-size pictures tell it to 16 px at most: asked for one deviation.
     tracker = _tracked(drive, "calibration.assumptions.threshold=1.0", settle=False)
-    update = tracker.current()
+    update = current(tracker)
     assert update.status == "contradicted" and "principal point cx" in update.contradictions[0]
     assert update.to_dict()["contradictions"] == list(update.contradictions)
-    result = tracker_result(tracker)
+    result = tracker.result()
     assert result.status == "not_converged" and result.reasons[0] == update.contradictions[0]
-    found = tracker.tests.findings[0]
+    found = tracker.estimate.tests.findings[0]
     assert found.contradicted and found.score > 1.0
     assert 10.0 < found.value < 30.0  # one step from where matches are near
     # Not tested: nothing is found, and no more is considered than beforehand.
-    tracker.tests.restart()
-    assert tracker.current().contradictions == () and tracker.current().status != "contradicted"
-    assert tracker.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
-    assert np.all(tracker.current().sigmas < update.sigmas)
+    tracker.estimate.tests.restart()
+    assert current(tracker).contradictions == () and current(tracker).status != "contradicted"
+    assert tracker.estimate.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
+    assert np.all(current(tracker).sigmas < update.sigmas)
 
 
 def test_what_is_estimated_agrees_with_the_batch(
     street: KeptDrive, bent: KeptDrive, settled: Tracker, estimating: Tracker
 ) -> None:
     """And it is the answer of the street without distortion."""
-    update = estimating.current()
+    update = current(estimating)
     assert update.contradictions == (), update
     value, sigma = update.estimated["k1"]
     assert abs(value - K1) < 3.0 * sigma and sigma < 0.05
@@ -258,24 +259,24 @@ def test_what_is_estimated_agrees_with_the_batch(
     own = np.sqrt(np.diag(estimating.covariance)[:7])
     np.testing.assert_allclose([*own, sigma], sigmas, rtol=0.3)
     # Without distortion.
-    clean = settled.current()
+    clean = current(settled)
     back = gtsam.Pose3.Logmap(update.T_camera_lidar.between(clean.T_camera_lidar))
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
 
 def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive, tmp_path: Path) -> None:
-    assert leaving.smoother is not None and leaving.smoother.sums.recent
-    save_checkpoint(leaving, tmp_path / "tracker")
-    again = load_checkpoint(tmp_path / "tracker")
-    assert again.current().to_dict() == leaving.current().to_dict()
-    assert again.current().to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
+    assert leaving.estimate.smoother is not None and leaving.estimate.smoother.sums.recent
+    leaving.save(tmp_path / "tracker")
+    again = Tracker.load(tmp_path / "tracker")
+    assert current(again).to_dict() == current(leaving).to_dict()
+    assert current(again).to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
     last = bent[len(bent) - 1]
     assert last.scan is not None and last.image is not None
     later = [dataclasses.replace(one, stamp_ns=one.stamp_ns + 100_000_000) for one in (last.image, last.scan)]
     for tracker in (leaving, again):
         tracker.add_image(later[0])  # type: ignore[arg-type]
         tracker.add_scan(later[1])  # type: ignore[arg-type]
-    assert again.current().to_dict() == leaving.current().to_dict()
+    assert current(again).to_dict() == current(leaving).to_dict()
 
 
 def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None:
@@ -283,7 +284,7 @@ def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None
     marginal = leaving.marginal()
     covariance = np.linalg.inv(marginal.information)
     scale = np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))
-    np.testing.assert_allclose(covariance / scale, leaving.reported() / scale, atol=1e-6)
+    np.testing.assert_allclose(covariance / scale, leaving.estimate.reported_covariance() / scale, atol=1e-6)
 
 
 def shifted(sigma: float) -> AssumptionConfig:
@@ -292,8 +293,8 @@ def shifted(sigma: float) -> AssumptionConfig:
 
 def test_the_principal_point_turns_the_camera(settled: Tracker) -> None:
     """Told that it lies 1 px to the right, the answer turns back as a turn that moves all points by 1 px."""
-    camera, cTl = settled.camera, settled.point.cTl
-    step = settled.considered().sensitivities["cx"]
+    camera, cTl = settled.setup.camera, settled.estimate.point.cTl
+    step = settled.estimate.considered().sensitivities["cx"]
     turned = np.asarray(cTl.AdjointMap() @ step[:6])  # a step of the camera
     assert turned[1] == pytest.approx(-1.0 / camera.fx, rel=0.3), turned * camera.fx
     assert abs(turned[0]) < 0.3 / camera.fx

@@ -15,7 +15,6 @@ from sst_graph import Tracker
 from sst_graph.errors import DataError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
 from sst_graph.validation import checked_image, checked_scan
 
@@ -101,9 +100,9 @@ def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytes
     tracker = tracker_from_truth(street)
     for frame in frames[:14]:
         tracker.add(frame)
-    assert tracker.started
+    assert tracker.estimate.exists
     path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
-    save_checkpoint(tracker, path)
+    tracker.save(path)
     return path
 
 
@@ -137,7 +136,7 @@ def _whole(scan: Scan) -> Scan:
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], seed: int) -> None:
     """Each frame is taken, or refused with a reason; then the tracker is byte for byte what it was."""
-    tracker, rng = load_checkpoint(running), np.random.default_rng(seed)
+    tracker, rng = Tracker.load(running), np.random.default_rng(seed)
     refused = 0
     for frame in _bad(rng, frames, 60):
         for add, data in ((tracker.add_image, frame.image), (tracker.add_scan, frame.scan)):
@@ -152,7 +151,7 @@ def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], 
 
 
 def test_a_frame_may_be_anything(running: Path) -> None:
-    tracker = load_checkpoint(running)
+    tracker = Tracker.load(running)
     before = stored(tracker)
     for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
         update = tracker.add(thing)  # type: ignore[arg-type]
@@ -161,13 +160,13 @@ def test_a_frame_may_be_anything(running: Path) -> None:
 
 
 def test_one_sensor_s_data_are_refused_and_the_other_s_are_taken(running: Path, frames: list[Frame]) -> None:
-    tracker, good = load_checkpoint(running), frames[14]
+    tracker, good = Tracker.load(running), frames[14]
     assert good.image is not None
     wrong = dataclasses.replace(good.image, mask=good.image.mask[:9])
-    scans, images = tracker.window.place[1], len(tracker.window.images)
+    scans, images = tracker.inputs.window.place[1], len(tracker.inputs.window.images)
     update = tracker.add(Frame(14, good.scan, wrong))
     assert update.refused == ("image",) and not update.accepted and "camera's size" in update.reason
-    assert tracker.window.place[1] == scans + 1 and len(tracker.window.images) == images
+    assert tracker.inputs.window.place[1] == scans + 1 and len(tracker.inputs.window.images) == images
 
 
 @pytest.mark.parametrize(
@@ -234,8 +233,8 @@ def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, fra
 def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     running: Path, frames: list[Frame]
 ) -> None:
-    """A stamp years ahead does not shut out what follows; one that stays elsewhere begins anew there."""
-    tracker, year = load_checkpoint(running), 365 * 86_400 * 10**9
+    """A stamp years ahead does not shut out what follows; one that stays elsewhere estimated anew there."""
+    tracker, year = Tracker.load(running), 365 * 86_400 * 10**9
     scans = [frame.scan for frame in frames[14:]]
     assert all(scan is not None for scan in scans)
     assert "by a day at most" in tracker.add_scan(_later(scans[0], year)).reason
@@ -243,7 +242,7 @@ def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     updates = [tracker.add_scan(_later(scan, -year)) for scan in scans[1:9]]
     assert [bool(update.refused) for update in updates] == [True] * 4 + [False] * 4
     assert updates[4].alarm and "scan stamps moved by -31535999" in updates[4].reason
-    assert not tracker.started and len(tracker.window.scans) == 4
+    assert not tracker.estimate.exists and len(tracker.inputs.window.scans) == 4
 
 
 def _later(scan: Scan | None, by_ns: int) -> Scan:
@@ -256,7 +255,7 @@ def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frame
 
     The smoother, the window, the odometry and all counters go on as if the scan had never come.
     """
-    tracker, other = load_checkpoint(running), load_checkpoint(running)
+    tracker, other = Tracker.load(running), Tracker.load(running)
     scan = frames[14].scan
     assert scan is not None
     before = stored(tracker)
@@ -265,7 +264,7 @@ def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frame
         if update.refused:
             assert stored(tracker) == before
         else:  # it was of use after all
-            tracker = load_checkpoint(running)
+            tracker = Tracker.load(running)
             before = stored(tracker)
     for frame in frames[14:18]:
         a, b = tracker.add(frame), other.add(frame)
@@ -295,10 +294,10 @@ def _hard_to_use(scan: Scan) -> Iterator[Scan]:
     yield dataclasses.replace(scan, rings=np.full(n, 65535, np.uint16))
 
 
-def test_ten_failures_in_a_row_begin_anew(running: Path, frames: list[Frame]) -> None:
+def test_after_ten_failures_in_a_row_the_window_is_given_up(running: Path, frames: list[Frame]) -> None:
     """What is kept may be the reason: then it is given up, and the frames after it are taken again."""
-    tracker = load_checkpoint(running)
-    smoother = tracker.smoother
+    tracker = Tracker.load(running)
+    smoother = tracker.estimate.smoother
     assert smoother is not None
     # A graph that no update can be solved with.
     smoother.past = dataclasses.replace(
@@ -306,13 +305,13 @@ def test_ten_failures_in_a_row_begin_anew(running: Path, frames: list[Frame]) ->
     )
     updates = [tracker.add_scan(frame.scan) for frame in frames[14:25]]
     assert all(update.refused == ("scan",) for update in updates[:10])
-    assert "begins anew" in updates[9].reason and not updates[10].refused
-    assert not tracker.started
+    assert "estimated anew" in updates[9].reason and not updates[10].refused
+    assert not tracker.estimate.exists
 
 
 def test_a_tracker_still_works_after_all_that(running: Path, frames: list[Frame]) -> None:
     """Bad frames between good ones leave no trace: the estimates are those of the good ones alone."""
-    tracker, clean, rng = load_checkpoint(running), load_checkpoint(running), np.random.default_rng(9)
+    tracker, clean, rng = Tracker.load(running), Tracker.load(running), np.random.default_rng(9)
     for k, frame in enumerate(frames[14:22]):
         wrong = _changed(rng, frame.scan, -1)  # type: ignore[arg-type]
         tracker.add_scan(wrong)
@@ -325,7 +324,7 @@ def test_a_new_tracker_survives_bad_first_frames(street: SimulatedDrive, frames:
     tracker, rng = Tracker(street.camera, initial=street.nominal), np.random.default_rng(5)
     for frame in _bad(rng, frames, 40):
         update = tracker.add(frame)
-        assert tracker.started == (update.status not in ("starting", "alarm"))
+        assert tracker.estimate.exists == (update.status not in ("starting", "alarm"))
 
 
 def test_what_readers_leave_out_is_carried_over(street: SimulatedDrive, frames: list[Frame]) -> None:

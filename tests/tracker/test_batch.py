@@ -38,7 +38,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
             moving_fraction=0.3 if by_object else 0.0,
         )
     )
-    default = TrackerConfig(start_scans=10, start_work=0)
+    default = TrackerConfig(start_scans=10)
     search = dataclasses.replace(default.calibration.start, enabled=False)
     joint = default.calibration.joint
     graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
@@ -46,10 +46,11 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     calibration = dataclasses.replace(default.calibration, start=search, joint=joint)
     config = dataclasses.replace(default, calibration=calibration)
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
+    tracker.initializer.work_per_frame = None
     for frame in street:
         tracker.add(frame)
-    tracker.settle()
-    assert bool(tracker.point.tracks) == by_object
+    tracker.optimize()
+    assert bool(tracker.estimate.point.tracks) == by_object
     # The batch from the same start, run until it rests.
     drive = prepare_drive(street, calibration.classes, calibration.prepare)
     joint = dataclasses.replace(calibration.joint, max_outer=80)
@@ -61,30 +62,30 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     problem = dataclasses.replace(problem, config=below.joint, centre=start)
     solution = solve_joint(problem, below.solutions[0].state, KERNELS_PX[-1:], step_sigmas=0.02)
     state = solution.state
-    turn = gtsam.Pose3.Logmap(tracker.point.cTl.between(state.cTl))
-    step = np.append(turn, state.offset_s(0) - tracker.point.offset_s)
-    sigmas = np.sqrt(np.diag(tracker.covariance)[:7])
+    turn = gtsam.Pose3.Logmap(tracker.estimate.point.cTl.between(state.cTl))
+    step = np.append(turn, state.offset_s(0) - tracker.estimate.point.offset_s)
+    sigmas = np.sqrt(np.diag(tracker.estimate.covariance)[:7])
     assert np.abs(step / sigmas).max() == pytest.approx(0.0, abs=0.3), np.round(step / sigmas, 2)
     if not by_object:
         return
     # The same objects are left out, and each object's bias and the uncertainty agree.
-    positions = [number for number, _ in tracker.window.scans]
+    positions = [number for number, _ in tracker.inputs.window.scans]
     tracks = object_tracks(drive)
     moving = find_dynamic_objects(drive, tracks)
-    found, found_moving = tracker.window.objects_of(positions)
+    found, found_moving = tracker.inputs.window.objects_of(positions)
     assert found == tracks
     assert moving and set(found_moving) == set(moving)
     for name, mover in moving.items():
         other = found_moving[name]
         assert (other.speed_mps, other.unknown_mps) == pytest.approx((mover.speed_mps, mover.unknown_mps))
     assert any(mover.velocity is not None for mover in moving.values())
-    ours = dict(zip(tracker.point.tracks, tracker.point.object_biases_px, strict=True))
+    ours = dict(zip(tracker.estimate.point.tracks, tracker.estimate.point.object_biases_px, strict=True))
     shared = underside_track(SemanticClass.VEHICLE)
-    assert tracker.point.biases_px[1] == pytest.approx(state.object_biases_px[0, shared], abs=0.2)
+    assert tracker.estimate.point.biases_px[1] == pytest.approx(state.object_biases_px[0, shared], abs=0.2)
     matched = {track for _, _, track in tracked_objects(solution.pairs)} - {shared}
     theirs = {track: state.object_biases_px[0, track] for track in matched}
     assert len(theirs) > 5 and {track: ours[track] for track in theirs} == pytest.approx(theirs, abs=0.2)
     robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, [tracks])
     expected = robust.matrix
-    ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
+    ratio = np.sqrt(np.diag(tracker.estimate.covariance)[:7] / np.diag(expected)[:7])
     np.testing.assert_allclose(ratio, 1.0, atol=0.2)  # leaving an object out may hang on few matches

@@ -20,7 +20,7 @@ from sst_graph.errors import CheckpointError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.tracker.storage import checkpoint
-from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint, save_checkpoint
+from sst_graph.tracker.storage.checkpoint import Saver
 
 SMALL = SimulationConfig(seed=5, frames=3, width=160, height=48, azimuth_step_deg=1.0, motion="no_stop")
 
@@ -32,7 +32,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     for k in range(len(street)):
         tracker.add(street[k])
     path = tmp_path_factory.mktemp("checkpoint") / "tracker.npz"
-    save_checkpoint(tracker, path)
+    tracker.save(path)
     return path.read_bytes()
 
 
@@ -55,17 +55,17 @@ def refused(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "tracker.npz"
     path.write_bytes(content)
     with pytest.raises(CheckpointError, match=message) as caught:
-        load_checkpoint(path)
+        Tracker.load(path)
     assert str(caught.value).isprintable() and "tracker.npz" in str(caught.value)
 
 
 def test_what_was_saved_is_read(tmp_path: Path, good: bytes) -> None:
     path = tmp_path / "tracker.npz"
     path.write_bytes(good)
-    tracker = load_checkpoint(path)
-    assert tracker.window.next_scan == 3 and not tracker.started
+    tracker = Tracker.load(path)
+    assert tracker.inputs.window.next_scan == 3 and not tracker.estimate.exists
     path.write_bytes(forged(*parts_of(good)))
-    assert load_checkpoint(path).window.next_scan == 3
+    assert Tracker.load(path).inputs.window.next_scan == 3
 
 
 def test_a_save_is_written_with_the_frames_that_follow(
@@ -75,7 +75,7 @@ def test_a_save_is_written_with_the_frames_that_follow(
     street, path = simulate(SMALL), tmp_path / "tracker.npz"
     tracker = Tracker(street.camera, None, street.nominal)
     tracker.add(street[0])
-    save_checkpoint(tracker, path)
+    tracker.save(path)
     monkeypatch.setattr(checkpoint, "_STEP_BYTES", 100_000)  # such a small file is written at once
     former = path.read_bytes()
     with pytest.raises(KeyboardInterrupt), Saver(path) as saver:
@@ -92,9 +92,9 @@ def test_a_save_is_written_with_the_frames_that_follow(
         saver.follow(tracker)
         assert path.read_bytes() == former
         saver.finish()
-        assert load_checkpoint(path).window.next_scan == 2
+        assert Tracker.load(path).inputs.window.next_scan == 2
         saver.save(tracker)
-    assert load_checkpoint(path).window.next_scan == 3 and list(tmp_path.iterdir()) == [path]
+    assert Tracker.load(path).inputs.window.next_scan == 3 and list(tmp_path.iterdir()) == [path]
 
 
 def test_what_is_saved_does_not_depend_on_when_it_was_stored(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_what_is_saved_does_not_depend_on_when_it_was_stored(tmp_path: Path) -> 
                 tracker.add(street[k])
             saver.save(tracker)
     documents = [parts_of(path.read_bytes())[0] for path in paths]
-    trackers = [load_checkpoint(path) for path in paths]
+    trackers = [Tracker.load(path) for path in paths]
     assert [len(document["blocks"]) for document in documents] == [len(documents[0]["blocks"])] * 2
     assert stored(trackers[0]) == stored(trackers[1])
 
@@ -192,6 +192,11 @@ def _attribute(node: Any, name: str) -> Any:
     return next(pair for pair in node[2][1] if pair[0] == name)
 
 
+def _inputs(tracker: Any) -> Any:
+    """The node of a tracker's inputs."""
+    return _attribute(tracker, "inputs")[1]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -212,11 +217,13 @@ def _attribute(node: Any, name: str) -> Any:
         lambda tracker: _nodes(tracker, "object")[1].__setitem__(1, "sst_graph.types:Scan"),
         lambda tracker: tracker.clear(),
         lambda tracker: _attribute(tracker, "setup").__setitem__(1, None),
-        lambda tracker: _attribute(tracker, "first_frames").__setitem__(1, None),
-        lambda tracker: _attribute(_attribute(tracker, "first_frames")[1], "digests")[1][1][0].__setitem__(
-            1, 7
+        lambda tracker: _attribute(_inputs(tracker), "first_frames").__setitem__(1, None),
+        lambda tracker: _attribute(_attribute(_inputs(tracker), "first_frames")[1], "digests")[1][1][
+            0
+        ].__setitem__(1, 7),
+        lambda tracker: _attribute(_attribute(_inputs(tracker), "scan_order")[1], "newest_ns").__setitem__(
+            1, "late"
         ),
-        lambda tracker: _attribute(_attribute(tracker, "scan_order")[1], "newest_ns").__setitem__(1, "late"),
         lambda tracker: _attribute(_attribute(tracker, "setup")[1], "camera").__setitem__(1, None),
     ],
 )
@@ -266,7 +273,7 @@ def test_another_thing_than_a_tracker_is_refused(tmp_path: Path, good: bytes) ->
 
 def test_no_file_and_no_regular_file(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no such file"):
-        load_checkpoint(tmp_path / "nothing.npz")
+        Tracker.load(tmp_path / "nothing.npz")
     os.mkfifo(tmp_path / "fifo")
     with pytest.raises(CheckpointError, match="a FIFO"):
-        load_checkpoint(tmp_path / "fifo")
+        Tracker.load(tmp_path / "fifo")

@@ -13,7 +13,8 @@ from sst_graph import Tracker
 from sst_graph.errors import EstimationError
 from sst_graph.export import DELAY, EXTRINSIC, fuse_marginals
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.marginal import TrackedMarginal, increment, seen_from
+from sst_graph.tracker.answer import current
+from sst_graph.tracker.marginal import TrackedMarginal, increment, moved_to
 from sst_graph.types import Frame
 
 SHORT = dataclasses.replace(EARLY_START, window=10)
@@ -32,20 +33,20 @@ def _far(seed: int, start: int = 1) -> TrackedMarginal:
 def told(
     street: SimulatedDrive, frames: list[Frame]
 ) -> tuple[TrackedMarginal, list[TrackedMarginal], Tracker]:
-    """The first marginal of a tracker, what it told every four frames since, and the tracker."""
+    """The first marginal of a tracker, what it added every four frames since, and the tracker."""
     tracker = tracker_from_truth(street, SHORT)
     first: TrackedMarginal | None = None
     parts: list[TrackedMarginal] = []
     for frame in frames[:30]:
         tracker.add(frame)
-        if tracker.started and frame.index % 4 == 1:
+        if tracker.estimate.exists and frame.index % 4 == 1:
             if first is None:
                 first = known = tracker.marginal()
             else:
-                parts.append(tracker.marginal_since(known))
+                parts.append(tracker.marginal(since=known))
                 known = known.plus(parts[-1])  # type: ignore[assignment]
-    assert first is not None and len(parts) >= 4 and tracker.window.first_scan > 10
-    parts.append(tracker.marginal_since(known))
+    assert first is not None and len(parts) >= 4 and tracker.inputs.window.first_scan > 10
+    parts.append(tracker.marginal(since=known))
     return first, parts, tracker
 
 
@@ -59,7 +60,7 @@ def test_the_parts_together_are_the_whole(
     np.testing.assert_allclose(fused.information / scale, whole.information / scale, atol=1e-6)
     assert fused.cTl.equals(whole.cTl, 1e-9)
     assert fused.offset_s == pytest.approx(whole.offset_s, abs=1e-9)
-    np.testing.assert_allclose(whole.covariance(), tracker.current().covariance, rtol=1e-6)
+    np.testing.assert_allclose(whole.covariance(), current(tracker).covariance, rtol=1e-6)
     # And it did grow on the way.
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
 
@@ -71,7 +72,7 @@ def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMargin
     for part in (first, *parts):
         graph.add(part.factor())
     values = gtsam.LevenbergMarquardtOptimizer(graph, first.point()).optimize()
-    update = tracker.current()
+    update = current(tracker)
     assert update.covariance is not None
     sigmas = np.sqrt(np.diag(update.covariance))
     step = gtsam.Pose3.Logmap(update.T_camera_lidar.between(values.atPose3(EXTRINSIC)))
@@ -90,7 +91,7 @@ def test_a_part_is_exact_however_far_the_estimate_has_moved(seed: int) -> None:
     fused = fuse_marginals([before, part], significance=0.0)
     np.testing.assert_allclose(fused.information, after.information, rtol=1e-6, atol=1e-3)
     assert fused.cTl.equals(after.cTl, 1e-9) and fused.offset_s == pytest.approx(after.offset_s, abs=1e-10)
-    again = seen_from(after, after)
+    again = moved_to(after, after)
     np.testing.assert_allclose(again.information, after.information, rtol=1e-12)
     # Some of it is taken back: that is no answer to compare with others.
     assert np.linalg.eigvalsh(part.information)[0] < 0.0
@@ -102,10 +103,10 @@ def test_before_a_start_and_after_a_change(street: SimulatedDrive, frames: list[
     tracker = tracker_from_truth(street)
     with pytest.raises(EstimationError, match="no estimate yet"):
         tracker.marginal()
-    assert tracker.current().covariance is None and tracker.current().covariance_reason
+    assert current(tracker).covariance is None and current(tracker).covariance_reason
     for frame in frames[:9]:
         tracker.add(frame)
     known = tracker.marginal()
     other = dataclasses.replace(known, start=known.start + 1)
     with pytest.raises(EstimationError, match="the calibration has changed"):
-        tracker.marginal_since(other)
+        tracker.marginal(since=other)

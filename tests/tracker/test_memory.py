@@ -8,6 +8,7 @@ import pytest
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.object_store import stored
+from sst_graph.tracker.inputs import _MAX_IMAGES
 from sst_graph.types import CameraImage, Frame, Scan
 
 CAMERA = PinholeCamera(8.0, 8.0, 4.0, 3.0, 9, 7)
@@ -44,8 +45,8 @@ def test_what_is_kept_is_bounded(sensors: str) -> None:
         image = _image(k) if both or sensors in ("images", "scans die") else None
         update = tracker.add(Frame(k, scan, image))
         assert not update.refused
-        assert len(tracker.window.scans) <= tracker.config.window
-        assert len(tracker.window.images) <= tracker.config.images
+        assert len(tracker.inputs.window.scans) <= tracker.setup.config.window
+        assert len(tracker.inputs.window.images) <= _MAX_IMAGES
         if k % 200 == 99 and 800 < k < FRAMES - 100:
             sizes.append(_size(tracker))
     assert max(sizes) < 1.1 * min(sizes) and max(sizes) < 2e6
@@ -57,7 +58,7 @@ def test_images_at_any_rate_are_bounded() -> None:
     for k in range(1000):
         image = _image(0)
         tracker.add_image(CameraImage(k, image.mask, image.pixels))
-    assert len(tracker.window.images) == tracker.config.images
+    assert len(tracker.inputs.window.images) == _MAX_IMAGES
 
 
 def test_a_scan_meets_images_again_after_an_hour_without() -> None:
@@ -67,4 +68,4 @@ def test_a_scan_meets_images_again_after_an_hour_without() -> None:
     hour = 36_000
     for k in range(hour, hour + 30):
         assert not tracker.add(Frame(k, _scan(k), _image(k))).refused
-    assert tracker.window.images[-1].stamp_ns == (hour + 29) * PERIOD_NS
+    assert tracker.inputs.window.images[-1].stamp_ns == (hour + 29) * PERIOD_NS

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import ErrorModel
-from sst_graph.tracker.config import AdoptionConfig, AlarmConfig, TrackerConfig
+from sst_graph.tracker.config import AlarmConfig, TrackerConfig
 from sst_graph.tracker.monitor.adoption import Adoption
-from sst_graph.tracker.monitor.alarm import Comparison, Joint, StepAlarm
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
+from sst_graph.tracker.monitor.statistic import ChangeStatistic, Comparison, EstimateCovariance
 from sst_graph.tracker.sums.scan_scores import PairScore, SideSums
 from sst_graph.tracker.sums.score_sums import ScoreSums, fit_sides
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
@@ -102,14 +102,14 @@ def _model() -> ErrorModel:
     return ErrorModel(0.25, 0.0, 1.0)
 
 
-def _chi2(scores: list[PairScore], joint: Joint) -> float:
-    return Comparison.of(scores, joint, _model(), 0.0).chi2()
+def _chi2(scores: list[PairScore], covariance: EstimateCovariance) -> float:
+    return Comparison.of(scores, covariance, _model(), 0.0).chi2()
 
 
 def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
     rng, P = np.random.default_rng(1), 1e-3 * np.eye(N)
     values = [
-        _chi2([_score(rng, x, 4 * k) for k in range(3)], Joint(P, (), N))
+        _chi2([_score(rng, x, 4 * k) for k in range(3)], EstimateCovariance(P, (), N))
         for x in rng.multivariate_normal(np.zeros(N), P, 300)
     ]
     assert np.mean(values) == pytest.approx(N, rel=0.12)
@@ -118,46 +118,47 @@ def test_the_statistic_is_chi_square_where_nothing_changed() -> None:
 
 def test_a_step_raises_the_alarm_and_quiet_does_not() -> None:
     rng, P = np.random.default_rng(2), 1e-4 * np.eye(N)
-    alarm = StepAlarm(AlarmConfig(warm_up=5))
+    statistic = ChangeStatistic(25.0)
     for k in range(200):
-        alarm.check([_score(rng, np.zeros(N), 4 * k)], Joint(P, (), N), _model())
-        assert not alarm.alarm
+        statistic.add([_score(rng, np.zeros(N), 4 * k)], EstimateCovariance(P, (), N), _model())
+        assert not statistic.confirmed
     step = np.full(N, 0.3)
     raised = [
         k
         for k in range(10)
-        if alarm.check([_score(rng, step, 9000 + 4 * k)], Joint(P, (), N), _model()) and alarm.alarm
+        if statistic.add([_score(rng, step, 9000 + 4 * k)], EstimateCovariance(P, (), N), _model())
+        and statistic.confirmed
     ]
     assert raised and raised[0] < 8
 
 
-def test_steps_that_would_be_seen_are_told_before_they_come() -> None:
-    """What a step is said to make is what frames with that step make, beyond the noise."""
+def test_steps_that_would_be_detected_are_predicted() -> None:
+    """The statistic predicted for a step is that of frames with the step, beyond the noise."""
     rng = np.random.default_rng(5)
     tried = np.zeros((7, 2))
     tried[1, 0], tried[6, 1] = 0.02, 0.3
     scores = [_score(rng, np.zeros(N), 4 * k) for k in range(4)]
-    exact = Joint(np.zeros((N, N)), (), N)
-    alarm = StepAlarm(AlarmConfig())
-    compared = alarm.compare(scores, exact, _model())
+    exact = EstimateCovariance(np.zeros((N, N)), (), N)
+    statistic = ChangeStatistic(25.0)
+    compared = statistic.compare(scores, exact, _model())
     small, large = compared.chi2_of(tried)
     assert small < 5.0 < 50.0 < large
-    assert alarm.shown(compared, tried).tolist() == [False, True]
+    assert statistic.detectable(compared, tried).tolist() == [False, True]
     stepped = [_score(rng, np.append(tried[:, 1], [0.0, 0.0]), 4 * k) for k in range(4)]
     assert _chi2(stepped, exact) == pytest.approx(large + N, rel=0.3)
 
 
-def test_what_is_confirmed_is_told_apart() -> None:
+def test_turn_and_offset_are_confirmed_apart() -> None:
     found, T = Confirmation(), gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, 0.3]))
-    found.suspects.add(3)
+    found.unreliable.add(3)
     found.wait(2.0, moving=True)
     found.wait(1.0, moving=False)
     assert (found.turn_s, found.offset_s) == (3.0, 2.0)
-    found.take(np.array([True, False, True]))
-    assert (found.turn_s, found.offset_s) == (3.0, 0.0) and found.suspects
+    found.add(np.array([True, False, True]))
+    assert (found.turn_s, found.offset_s) == (3.0, 0.0) and found.unreliable
     found.wait(2.0, moving=True)
-    found.take(np.array([True, True, False]))
-    assert (found.turn_s, found.offset_s) == (0.0, 2.0) and not found.suspects
+    found.add(np.array([True, True, False]))
+    assert (found.turn_s, found.offset_s) == (0.0, 2.0) and not found.unreliable
     turned = T.retract(steps(T, 0.01, 0.02)[:6, 1])
     assert turned.equals(gtsam.Pose3(gtsam.Rot3.Ry(0.01), np.zeros(3)) * T, 1e-9)
     assert steps(T, 0.01, 0.02)[6].tolist() == [0.0, 0.0, 0.02]
@@ -165,11 +166,9 @@ def test_what_is_confirmed_is_told_apart() -> None:
 
 def test_settings_out_of_range() -> None:
     with pytest.raises(ValueError, match="window"):
-        TrackerConfig(window=5)
+        TrackerConfig(window=10)
     with pytest.raises(ValueError, match="chi2"):
         AlarmConfig(chi2=0.0)
-    with pytest.raises(ValueError, match="patience"):
-        AlarmConfig(frames=4, patience=3)
 
 
 def test_a_direction_without_information_raises_nothing() -> None:
@@ -185,7 +184,7 @@ def test_a_direction_without_information_raises_nothing() -> None:
     still = dataclasses.replace(
         score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
     )
-    assert _chi2([still], Joint(1e-6 * np.eye(N), (), N)) < 40.0
+    assert _chi2([still], EstimateCovariance(1e-6 * np.eye(N), (), N)) < 40.0
 
 
 def test_objects_come_and_go_without_loss() -> None:
@@ -233,7 +232,7 @@ def test_score_sums_follow_the_objects() -> None:
 
 def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
     P = np.diag(np.arange(1.0, N + 3.0))
-    found = Joint(P, (7, 9), N).seeing({9: 0, 12: 1}, 0.5)
+    found = EstimateCovariance(P, (7, 9), N).with_objects({9: 0, 12: 1}, 0.5)
     assert found.shape == (N + 2, N + 2)
     assert found[N, N] == P[N + 1, N + 1]
     assert found[N + 1, N + 1] == P[8, 8] + 0.25 and found[8, N + 1] == P[8, 8]
@@ -242,17 +241,17 @@ def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
 def test_a_worse_candidate_is_refused() -> None:
     """A covariance within the limits, and held-out costs that are no worse, over enough frames."""
     good, bad = _belief(1).point, _belief(2).point
-    adoption = Adoption(AdoptionConfig(held_out=5, margin=0.02))
+    adoption = Adoption(frames=5, margin=0.02)
     for _ in range(4):
         adoption.compare(1.0, 2.0)
-    assert not adoption.offer(good, trusted=True)  # too few frames
+    assert not adoption.propose(good, trusted=True)  # too few frames
     adoption.compare(1.0, 2.0)
-    assert not adoption.offer(good, trusted=False)  # a covariance past the limits
-    assert adoption.offer(good, trusted=True) and adoption.adopted is good
+    assert not adoption.propose(good, trusted=False)  # a covariance past the limits
+    assert adoption.propose(good, trusted=True) and adoption.adopted is good
     adoption.restart()
     for _ in range(5):
         adoption.compare(1.1, 1.0)  # a confident candidate that explains held-out frames worse
-    assert not adoption.offer(bad, trusted=True) and adoption.adopted is good
+    assert not adoption.propose(bad, trusted=True) and adoption.adopted is good
     for _ in range(5):
         adoption.compare(1.01, 1.0)
-    assert adoption.offer(bad, trusted=True) and adoption.adopted is bad
+    assert adoption.propose(bad, trusted=True) and adoption.adopted is bad

@@ -1,4 +1,4 @@
-"""A running tracker settles with the frames that come, a little with each."""
+"""The window of a running tracker is relinearized with the frames that come, some of it with each."""
 
 from __future__ import annotations
 
@@ -10,70 +10,72 @@ import numpy as np
 import pytest
 from streets import TRACKED_STREET, sigmas_apart, tracker_from_truth
 
-from sst_graph import TrackerConfig
+from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulatedDrive, simulate
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.window.whole_window import SCANS
 from sst_graph.types import Frame
 
 
 @cache
 def _street() -> SimulatedDrive:
-    return simulate(dataclasses.replace(TRACKED_STREET, frames=34))
+    return simulate(dataclasses.replace(TRACKED_STREET, frames=40))
 
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
-    """Checkpoint of a tracker that has settled for a frame, begun at the truth, and the frames to come."""
-    street, config = _street(), TrackerConfig(start_scans=8, start_work=0, window=18, settle_scans=8)
+    """Checkpoint of a tracker one frame into a relinearization of its window, and the frames to come."""
+    street, config = _street(), TrackerConfig(start_scans=8, window=18)
     tracker = tracker_from_truth(street, config)
     frames = list(street)
     for k, frame in enumerate(frames):
-        settled = tracker.settling is not None
+        under_way = tracker.estimate.relinearization is not None
         tracker.add(frame)
-        if settled and tracker.settling is not None:
+        if under_way and tracker.estimate.relinearization is not None:
             path = tmp_path_factory.mktemp("tracker") / "settling.npz"
-            save_checkpoint(tracker, path)
+            tracker.save(path)
             return path, frames[k + 1 :]
-    raise AssertionError("the tracker does not settle")
+    raise AssertionError("the window is not relinearized")
 
 
-def test_a_checkpoint_keeps_the_settling(begun: tuple[Path, list[Frame]]) -> None:
-    tracker = load_checkpoint(begun[0])
-    assert tracker.settling is not None and tracker.window.held
-    # With one frame, edges towards the ground have been looked at; the newest scan is matched as it comes.
-    assert len(tracker.settling.done) == (tracker.config.settle_scans + 1) // 2 + 1
-    assert tracker.settling.below is not None and tracker.settling.below.narrow
+def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]]) -> None:
+    tracker = Tracker.load(begun[0])
+    assert tracker.estimate.relinearization is not None and tracker.inputs.window.held
+    # With one frame, lower edges have been checked; the newest scan is matched as it comes.
+    assert len(tracker.estimate.relinearization.done) == (SCANS + 1) // 2 + 1
+    assert (
+        tracker.estimate.relinearization.below is not None and tracker.estimate.relinearization.below.narrow
+    )
 
 
-def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, list[Frame]]) -> None:
-    tracker, coming = load_checkpoint(begun[0]), begun[1]
-    oldest, sizes = tracker.window.first_scan, []
+def test_the_window_is_relinearized_with_the_frames_that_come(begun: tuple[Path, list[Frame]]) -> None:
+    tracker, coming = Tracker.load(begun[0]), begun[1]
+    oldest, sizes = tracker.inputs.window.first_scan, []
     for frame in coming:
         assert tracker.add(frame).accepted
-        # Nothing leaves before it is settled, though the window is full.
-        assert tracker.window.first_scan == oldest
-        sizes.append(len(tracker.window.scans))
-        if tracker.settling is None:
+        # Nothing leaves before it is done, though the window is full.
+        assert tracker.inputs.window.first_scan == oldest
+        sizes.append(len(tracker.inputs.window.scans))
+        if tracker.estimate.relinearization is None:
             break
-    assert tracker.settling is None and sizes[-1] > tracker.config.window
-    assert tracker.smoother is not None
-    assert set(tracker.smoother.entries) == {number for number, _ in tracker.window.scans}
+    assert tracker.estimate.relinearization is None and sizes[-1] > tracker.setup.config.window
+    assert tracker.estimate.smoother is not None
+    assert set(tracker.estimate.smoother.entries) == {number for number, _ in tracker.inputs.window.scans}
     # What was held leaves two at a time.
-    assert tracker.window.leaving() == [oldest, oldest + 1]
-    found, covariance = tracker.point, tracker.covariance.copy()
-    assert tracker.settle()
+    assert tracker.inputs.window.leaving() == [oldest, oldest + 1]
+    found, covariance = tracker.estimate.point, tracker.estimate.covariance.copy()
+    assert tracker.optimize().converged
     assert sigmas_apart(tracker, found.cTl, found.offset_s) < 1.0
-    np.testing.assert_allclose(np.diag(tracker.covariance), np.diag(covariance), rtol=0.5)
+    np.testing.assert_allclose(np.diag(tracker.estimate.covariance), np.diag(covariance), rtol=0.5)
 
 
-def test_a_settling_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
-    once, again, coming = load_checkpoint(begun[0]), load_checkpoint(begun[0]), begun[1]
-    again.stop_settling()
-    assert not again.window.held and again.add(coming[0]).accepted
-    again.begin_settling()
+def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
+    once, again, coming = Tracker.load(begun[0]), Tracker.load(begun[0]), begun[1]
+    again.estimate.stop_relinearization()
+    assert not again.inputs.window.held and again.add(coming[0]).accepted
+    again.estimate.begin_relinearization()
     once.add(coming[0])
     for frame in coming[1:]:
         once.add(frame)
         again.add(frame)
-    assert once.settling is None and again.settling is None
+    assert once.estimate.relinearization is None and again.estimate.relinearization is None
     assert sigmas_apart(once, again.point.cTl, again.point.offset_s) < 0.5

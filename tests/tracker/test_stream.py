@@ -18,8 +18,7 @@ from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.result import tracker_result
-from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
+from sst_graph.tracker.answer import current
 from sst_graph.tracker.window.epochs import Found
 from sst_graph.types import Frame
 
@@ -30,9 +29,9 @@ def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytes
     tracker = tracker_from_truth(street)
     for frame in frames[:20]:
         tracker.add(frame)
-    assert tracker.started
+    assert tracker.estimate.exists
     path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
-    save_checkpoint(tracker, path)
+    tracker.save(path)
     return path
 
 
@@ -54,9 +53,9 @@ def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Fram
     tracker = tracker_from_truth(street)
     for frame in frames[:20]:
         tracker.add(frame)
-    tracker.settle()
-    drive, _ = tracker.window.drive()
-    state, config = tracker.point.state(tracker.classes), tracker.matcher.graph
+    tracker.optimize()
+    drive, _ = tracker.inputs.window.drive()
+    state, config = tracker.estimate.point.state(tracker.matcher.classes), tracker.matcher.graph
     tracks = object_tracks(drive)
     kernel = tracker.matcher.kernel
     pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, config)
@@ -64,18 +63,18 @@ def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Fram
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     state = state_from(values, state, pairs)
     expected = robust_covariance(graph, values, pairs, state, [tracks]).matrix
-    ratio = np.sqrt(np.diag(tracker.covariance)[:7] / np.diag(expected)[:7])
+    ratio = np.sqrt(np.diag(tracker.estimate.covariance)[:7] / np.diag(expected)[:7])
     np.testing.assert_allclose(ratio, 1.0, atol=0.02)
 
 
-def test_the_result_tells_what_each_scan_brought(running: Path) -> None:
-    tracker = load_checkpoint(running)
-    gained = gained_of(CalibrationResult.from_json(tracker_result(tracker, "drive").to_json()))
+def test_the_result_has_the_information_of_each_scan(running: Path) -> None:
+    tracker = Tracker.load(running)
+    gained = gained_of(CalibrationResult.from_json(tracker.result("drive").to_json()))
     assert gained is not None and gained.kind == "as they came"
     first, *rest = gained.gains
     assert first.bits is None and len(rest) > 5
     assert sum(gain.bits or 0.0 for gain in rest) > 3.0
-    np.testing.assert_allclose(rest[-1].values, tracker.current().sigmas, rtol=1e-3)
+    np.testing.assert_allclose(rest[-1].values, current(tracker).sigmas, rtol=1e-3)
 
 
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:
@@ -86,16 +85,16 @@ def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: lis
     for frame in frames:
         whole.add(frame)
         short.add(frame)
-    assert short.smoother is not None and whole.smoother is not None
-    assert len(short.smoother.entries) <= 10 < len(whole.smoother.entries)
-    assert sigmas_apart(whole, short.point.cTl, short.point.offset_s) < 2.5
-    ratio = np.sqrt(np.diag(short.covariance) / np.diag(whole.covariance))
+    assert short.estimate.smoother is not None and whole.estimate.smoother is not None
+    assert len(short.estimate.smoother.entries) <= 10 < len(whole.estimate.smoother.entries)
+    assert sigmas_apart(whole, short.estimate.point.cTl, short.estimate.point.offset_s) < 2.5
+    ratio = np.sqrt(np.diag(short.estimate.covariance) / np.diag(whole.estimate.covariance))
     assert ratio.min() > 0.7 and ratio.max() < 1.5
 
 
 def test_bad_frames_leave_the_estimate(running: Path, frames: list[Frame]) -> None:
-    tracker, good = load_checkpoint(running), frames[20]
-    before = tracker.point
+    tracker, good = Tracker.load(running), frames[20]
+    before = tracker.estimate.point
     assert good.scan is not None and good.image is not None
     points = good.scan.points.copy()
     points[3, 1] = np.nan
@@ -109,7 +108,7 @@ def test_bad_frames_leave_the_estimate(running: Path, frames: list[Frame]) -> No
     for frame, message in wrong:
         update = tracker.add(frame)
         assert not update.accepted and message in update.reason
-        assert tracker.point is before
+        assert tracker.estimate.point is before
     assert tracker.add(good).accepted
 
 
@@ -129,36 +128,39 @@ def test_images_and_scans_at_their_own_rates(street: SimulatedDrive, frames: lis
 
 def test_gaps_and_half_as_many_scans(street: SimulatedDrive, frames: list[Frame]) -> None:
     """Scans at half the images' rate, and a second in which nothing comes."""
-    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=6, restart_scans=6))
+    tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, start_scans=6))
     for frame in frames:
         if 20 <= frame.index < 29:
             continue
         scan = frame.scan if frame.index % 2 == 0 else None
         update = tracker.add(Frame(frame.index, scan, frame.image))
-    assert tracker.started and update.status in ("ok", "unobservable")
+    assert tracker.estimate.exists and update.status in ("ok", "unobservable")
     assert sigmas_apart(tracker, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0
 
 
 def test_what_comes_too_late_or_out_of_order_is_refused(running: Path, frames: list[Frame]) -> None:
     """An image that is late but not too late is sorted in; older ones, and any older scan, are refused."""
-    tracker = load_checkpoint(running)
-    before, images = tracker.point, [image.stamp_ns for image in tracker.window.images]
+    tracker = Tracker.load(running)
+    before, images = tracker.estimate.point, [image.stamp_ns for image in tracker.inputs.window.images]
     old = frames[1].image
     assert old is not None and frames[10].scan is not None and frames[19].image is not None
     update = tracker.add_image(dataclasses.replace(old, stamp_ns=old.stamp_ns + 7))
     assert not update.accepted and "behind the newest scan" in update.reason and "1.5 s" in update.reason
     update = tracker.add_scan(frames[10].scan)
     assert not update.accepted and "one after" in update.reason
-    assert tracker.point is before and [image.stamp_ns for image in tracker.window.images] == images
+    assert (
+        tracker.estimate.point is before
+        and [image.stamp_ns for image in tracker.inputs.window.images] == images
+    )
     between = dataclasses.replace(frames[19].image, stamp_ns=frames[19].image.stamp_ns - 30_000_000)
     assert tracker.add_image(between).accepted
-    stamps = [image.stamp_ns for image in tracker.window.images]
+    stamps = [image.stamp_ns for image in tracker.inputs.window.images]
     assert between.stamp_ns in stamps and stamps == sorted(stamps)
 
 
 def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]) -> None:
-    tracker = load_checkpoint(running)
-    smoother = tracker.smoother
+    tracker = Tracker.load(running)
+    smoother = tracker.estimate.smoother
     assert smoother is not None
     scan, entry = next(iter(smoother.entries.items()))
     assert entry.pair.l_twist is not None
@@ -177,22 +179,25 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     kept = tracker_from_truth(street)
     for frame in frames[:20]:
         kept.add(frame)
-    save_checkpoint(kept, tmp_path / "tracker.npz")
-    resumed = load_checkpoint(tmp_path / "tracker.npz")
-    assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
-    assert resumed.point.offset_s == kept.point.offset_s
-    np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)
+    kept.save(tmp_path / "tracker.npz")
+    resumed = Tracker.load(tmp_path / "tracker.npz")
+    assert resumed.estimate.point.cTl.equals(kept.estimate.point.cTl, 1e-12)
+    assert resumed.estimate.point.offset_s == kept.estimate.point.offset_s
+    np.testing.assert_allclose(resumed.estimate.covariance, kept.estimate.covariance, rtol=1e-12)
     assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.undersides
-    for (_, a), (_, b) in zip(resumed.window.scans, kept.window.scans, strict=True):
+    for (_, a), (_, b) in zip(resumed.inputs.window.scans, kept.inputs.window.scans, strict=True):
         assert {c: len(points) for c, points in a.undersides.items()} == {
             c: len(points) for c, points in b.undersides.items()
         }
     for frame in frames[20:]:
         kept.add(frame)
         resumed.add(frame)
-        assert sigmas_apart(kept, resumed.point.cTl, resumed.point.offset_s) < 1e-5
-    np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-5)
-    assert resumed.watch.alarm.recent and resumed.watch.alarm.usual == pytest.approx(kept.watch.alarm.usual)
+        assert sigmas_apart(kept, resumed.estimate.point.cTl, resumed.estimate.point.offset_s) < 1e-5
+    np.testing.assert_allclose(resumed.estimate.covariance, kept.estimate.covariance, rtol=1e-5)
+    assert (
+        resumed.monitor.changes.statistic.recent
+        and resumed.monitor.changes.statistic.usual == pytest.approx(kept.monitor.changes.statistic.usual)
+    )
 
 
 def test_saving_hardly_moves_what_follows(
@@ -204,16 +209,16 @@ def test_saving_hardly_moves_what_follows(
         saved.add(frame)
         unsaved.add(frame)
         if k % 10 == 9:
-            before = saved.point
-            save_checkpoint(saved, tmp_path / "tracker.npz")
-            assert saved.point is before
-    assert sigmas_apart(unsaved, saved.point.cTl, saved.point.offset_s) < 0.2
+            before = saved.estimate.point
+            saved.save(tmp_path / "tracker.npz")
+            assert saved.estimate.point is before
+    assert sigmas_apart(unsaved, saved.estimate.point.cTl, saved.estimate.point.offset_s) < 0.2
 
 
 def test_a_broken_checkpoint_is_named(tmp_path: Path, running: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
-        load_checkpoint(tmp_path / "none.npz")
+        Tracker.load(tmp_path / "none.npz")
     half = tmp_path / "half.npz"
     half.write_bytes(running.read_bytes()[:5000])
     with pytest.raises(DataError, match=r"half\.npz: found no readable checkpoint"):
-        load_checkpoint(half)
+        Tracker.load(half)

@@ -110,36 +110,39 @@ def tracker() -> Tracker:
             motion="stop_and_go",
         )
     )
-    default = TrackerConfig(start_scans=8, start_work=0, window=10)
+    default = TrackerConfig(start_scans=8, window=10)
     start = dataclasses.replace(default.calibration.start, enabled=False)
     calibration = dataclasses.replace(default.calibration, start=start)
     tracker = Tracker(
         street.camera, dataclasses.replace(default, calibration=calibration), street.truth.cTl, 0.05
     )
+    tracker.initializer.work_per_frame = None
     for frame in street:
         tracker.add(frame)
     return tracker
 
 
 def test_scans_between_two_images_are_kept_open(tracker: Tracker) -> None:
-    assert tracker.smoother is not None
-    undecided, offset_s = tracker.smoother.undecided, tracker.point.offset_s
+    assert tracker.estimate.smoother is not None
+    undecided, offset_s = tracker.estimate.smoother.undecided, tracker.estimate.point.offset_s
     assert len(undecided.middles_s) > 5
     assert np.array_equal(offset_s >= undecided.middles_s, undecided.early)
-    assert undecided.information.shape[1:] == tracker.smoother.bent.information.shape
+    assert undecided.information.shape[1:] == tracker.estimate.smoother.bent.information.shape
 
 
 def test_the_bent_belief_tells_the_gradient_elsewhere(tracker: Tracker) -> None:
     """The same matches, biases moved by 0.4 px: the gradient is nearer to what the curvatures say."""
-    assert tracker.smoother is not None
+    assert tracker.estimate.smoother is not None
     by_weight, by_curvature = [], []
-    for number, entry in tracker.smoother.entries.items():
+    for number, entry in tracker.estimate.smoother.entries.items():
         score = entry.score
         step = np.zeros(score.belief.point.size)
         step[7:] = 0.4
         there = score.belief.point.moved(step)
-        tracks = tracker.window.tracks[number]
-        fresh = score_pair(entry.pair, there, tracker.classes, tracks, tracker.matcher.graph).belief.vector
+        tracks = tracker.inputs.window.tracks[number]
+        fresh = score_pair(
+            entry.pair, there, tracker.matcher.classes, tracks, tracker.matcher.graph
+        ).belief.vector
         own = slice(score.belief.point.core_size, score.belief.point.size)
         by_weight.append((score.belief.without_held().at(there).vector - fresh)[own].sum())
         by_curvature.append((score.bent.without_held().at(there).vector - fresh)[own].sum())

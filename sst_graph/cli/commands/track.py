@@ -17,8 +17,7 @@ from sst_graph.files import output_file
 from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
 from sst_graph.result import CalibrationResult, Status
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.result import tracker_result
-from sst_graph.tracker.storage.checkpoint import Saver, load_checkpoint
+from sst_graph.tracker.storage.checkpoint import Saver
 from sst_graph.tracker.storage.resume import Setup, check_setup, frames_to_come
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
@@ -35,13 +34,13 @@ def run(args: argparse.Namespace) -> int:
         if args.out is not None:
             out = outputs.enter_context(output_file(args.out, args.overwrite, RESULT_FILE))
         if args.checkpoint is not None:
-            # Taken for the whole run: no other tracker may save there.
+            # Locked for the whole run: no other tracker may save there.
             replace = args.resume or args.overwrite
             outputs.enter_context(output_file(args.checkpoint, replace, CHECKPOINT_FILE))
         read_as = options_of(args)
         tracker, source, frames = _begun(args, open_drive(args, args.data))
         tracker, last = _track(args, source, tracker, frames)
-        result = _with_decision(tracker_result(tracker, source.name, args.camera), source)
+        result = _with_decision(tracker.result(source.name, args.camera), source)
         result = dataclasses.replace(result, read_as=read_as)
         if out is not None:
             out.write_text(result.to_json())
@@ -51,11 +50,14 @@ def run(args: argparse.Namespace) -> int:
 def _track(
     args: argparse.Namespace, source: SweptSource, tracker: Tracker, frames: Iterator[Frame]
 ) -> tuple[Tracker, TrackUpdate]:
-    """Add the frames, and save the tracker as it goes; the settled tracker after the last, and its answer.
+    """Add the frames, and save the tracker as it goes; solve the window as a whole after the last.
 
-    What the last line says is what is written. With a checkpoint the tracker that settles is the one that the
-    file holds, its arrays laid out as in the file: the result is the same to the last bit whether the run was
+    The last line and the result are the same answer. With a checkpoint it is that of the tracker in the file,
+    whose arrays have the file's memory layout: the result is the same to the last bit whether the run was
     broken off and resumed or not.
+
+    Returns:
+        The tracker, and its last answer.
     """
     update = None
     with ExitStack() as outputs:
@@ -67,31 +69,30 @@ def _track(
             if saver is not None and (is_last or number % args.checkpoint_every == 0):
                 saver.save(tracker)
             if is_last:
-                tracker, update = _settled(args, source, tracker, update, saver)
+                tracker, update = _optimized(args, source, tracker, update, saver)
             say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
         if update is not None:
             return tracker, update
         # A save consolidates the tracker: what is saved already is not saved again.
         if saver is not None and not args.checkpoint.exists():
             saver.save(tracker)
-        return _settled(args, source, tracker, None, saver)
+        return _optimized(args, source, tracker, None, saver)
 
 
-def _settled(
+def _optimized(
     args: argparse.Namespace,
     source: SweptSource,
     tracker: Tracker,
     update: TrackUpdate | None,
     saver: Saver | None,
 ) -> tuple[Tracker, TrackUpdate]:
-    """The tracker that is saved, or the one given where none is, settled; and the last answer from it."""
+    """The tracker that is saved, or the one given where none is, its whole window solved; and its answer."""
     if saver is not None:
         saver.finish()
-        tracker = load_checkpoint(args.checkpoint)
-    tracker.settle()
-    last = tracker.current(update)
+        tracker = Tracker.load(args.checkpoint)
+    last = tracker.optimize(update)
     if last.status == "ok" and _is_open(source):
-        last = dataclasses.replace(last, status="unconfirmed", doubt=_OPEN_SWEEP)
+        last = dataclasses.replace(last, status="unconfirmed", suspected_change=_OPEN_SWEEP)
     return tracker, last
 
 
@@ -126,7 +127,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         tracker = Tracker(source.camera, config, initial, offset_s)
         swept = with_sweep(source, config.calibration.sweep.decide)
         return tracker, swept, iter(swept)
-    tracker = load_checkpoint(args.checkpoint)
+    tracker = Tracker.load(args.checkpoint)
     made = tracker.setup
     initial, offset_s = made.initial, made.initial_offset_s
     if args.init is not None:

@@ -1,1 +1,1 @@
-"""Whether the calibration has changed, and which one to use."""
+"""Change detection, confirmation, and adoption of the calibration."""

@@ -12,27 +12,41 @@ from sst_graph.drive.preparation import Drive, outline_size
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
-from sst_graph.tracker.config import AdoptionConfig
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import SemanticClass
 
+_FRAMES = 10
+"""Held-out frames on which the candidate and the calibration in use are compared."""
+_MARGIN = 0.02
+"""The candidate's held-out cost may exceed that of the one in use by this fraction."""
+
 
 class Adoption:
-    """The calibration in use, and the gate to it."""
+    """The calibration in use, and when a candidate replaces it.
 
-    def __init__(self, config: AdoptionConfig, adopted: Point | None = None) -> None:
-        self.config = config
-        self.adopted = adopted
-        self.costs: deque[tuple[float, float]] = deque(maxlen=config.held_out)
+    Attributes:
+        adopted: the calibration in use; None before the first.
+        costs: of the latest held-out frames, under the candidate and under the one in use.
+        margin: fraction by which the candidate's cost may exceed that of the one in use.
+    """
+
+    def __init__(self, frames: int = _FRAMES, margin: float = _MARGIN) -> None:
+        """frames: held-out frames that are compared."""
+        self.margin = margin
+        self.adopted: Point | None = None
+        self.costs: deque[tuple[float, float]] = deque(maxlen=frames)
 
     def restart(self) -> None:
         """Forget the comparison; the calibration in use stays until a better one has shown itself."""
         self.costs.clear()
 
-    def hear(self, cost: Callable[[Point], float | None], candidate: Point, guess: Point | None) -> None:
-        """New frames, before they are used, by what they cost at a point.
+    def add_held_out(
+        self, cost: Callable[[Point], float | None], candidate: Point, guess: Point | None
+    ) -> None:
+        """Compare candidate and calibration in use on new frames, before these are used.
 
         Args:
+            cost: of the frames at a point; None where nothing can be seen.
             candidate: the estimate before them.
             guess: what is in use while nothing has been adopted.
         """
@@ -47,12 +61,12 @@ class Adoption:
         if candidate is not None and in_use is not None:
             self.costs.append((candidate, in_use))
 
-    def offer(self, candidate: Point, trusted: bool) -> bool:
-        """Adopt the candidate if its covariance is within the limits and held-out frames agree."""
-        if not trusted or len(self.costs) < self.config.held_out:
+    def propose(self, candidate: Point, trusted: bool) -> bool:
+        """Adopt the candidate if it is trusted and explains held-out frames no worse; whether it was."""
+        if not trusted or len(self.costs) < (self.costs.maxlen or 0):
             return False
         ours, theirs = np.mean(self.costs, axis=0)
-        if ours > (1.0 + self.config.margin) * theirs:
+        if ours > (1.0 + self.margin) * theirs:
             return False
         self.adopted = candidate
         return True

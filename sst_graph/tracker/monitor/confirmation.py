@@ -10,6 +10,16 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
+DETECTABLE_TURN_RAD = float(np.radians(0.25))
+"""Frames confirm the estimate where a turn of the camera by this about its x or y axis would be past the
+threshold; under the wide kernel a turn of 1 degree looks like this one [rad]."""
+DETECTABLE_OFFSET_S = 0.01
+"""The same of a jump of the clock [s]."""
+_MAX_TURN_AGE_S = 1.0
+"""An estimate is unconfirmed where nothing has confirmed for longer where the camera looks [s] ..."""
+_MAX_OFFSET_AGE_S = 3.0
+"""... or the time offset, in motion [s]; chosen on streets 820 to 829 of ``benchmarks/tracker_steps.py``."""
+
 
 @dataclass
 class Confirmation:
@@ -18,30 +28,35 @@ class Confirmation:
     Attributes:
         turn_s: seconds since a frame last confirmed where the camera looks.
         offset_s: seconds in motion since one last confirmed the time offset; at rest nothing can.
-        suspects: tracks of objects that raised a doubt which was given up; they confirm nothing until others
-            have: the estimate has followed them, whether they were right or not.
+        unreliable: tracks of objects that contradicted the estimate until they were given up; they confirm
+            nothing until others have: the estimate has followed them, whether they were right or not.
     """
 
     turn_s: float = 0.0
     offset_s: float = 0.0
-    suspects: set[int] = field(default_factory=set)
+    unreliable: set[int] = field(default_factory=set)
+
+    @property
+    def too_old(self) -> bool:
+        """Whether the estimate is unconfirmed."""
+        return self.turn_s > _MAX_TURN_AGE_S or self.offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
         """A start confirms all."""
         self.turn_s = self.offset_s = 0.0
-        self.suspects.clear()
+        self.unreliable.clear()
 
     def wait(self, seconds: float, moving: bool) -> None:
         """Time passes."""
         self.turn_s += seconds
         self.offset_s += seconds if moving else 0.0
 
-    def take(self, shown: NDArray[np.bool_]) -> None:
+    def add(self, detectable: NDArray[np.bool_]) -> None:
         """The latest frames agree with the estimate and would have shown some of :func:`steps`."""
-        if shown[:2].all():
+        if detectable[:2].all():
             self.turn_s = 0.0
-            self.suspects.clear()
-        if shown[2]:
+            self.unreliable.clear()
+        if detectable[2]:
             self.offset_s = 0.0
 
 

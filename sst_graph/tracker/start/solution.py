@@ -33,14 +33,22 @@ from sst_graph.graph.outer_loop import (
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import SELECTION_SCANS, select_start_steps
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
 
 _OTHER_BASIN_RAD = float(np.radians(2.0))
-"""Poses that are turned by more are of different basins."""
+"""Poses that are turned by more are in different basins of convergence."""
+_LEAST_PAIRS_SHARE = 0.7
+"""Share of the pairs that the first solution must still match: below it, the solution has run off in time."""
+_LEAST_GAIN = 0.1
+"""By which fraction of the cost a solution must be better than another one to be preferred to it, where their
+costs hardly differ: one whose offset was searched, or one of another basin."""
+_OFFSET_STEP_S = 0.005
+"""Damping of the time offset in the first solution, as the prior deviation of a step [s]: a short stretch at
+one speed does not determine it."""
 
 
 @dataclass(frozen=True)
@@ -57,9 +65,9 @@ class Guess:
     offset_s: float
     search: bool = True
 
-    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point | None:
-        """As an estimate without mask biases, its parameters (``names``) 0; None where nothing is known."""
-        return None if self.cTl is None else Point.unbiased(self.cTl, self.offset_s, classes, names)
+    def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
+        """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
+        return Point.unbiased(self.cTl or gtsam.Pose3(), self.offset_s, classes, names)
 
 
 @dataclass(frozen=True)
@@ -74,29 +82,24 @@ class _Solved:
         return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
-class _Unsettled(EstimationError):
-    """A solution that still moved when its iterations ended, as far as it came."""
+class _NotConverged(EstimationError):
+    """A solution that still moved when its iterations ended; where it was by then."""
 
     def __init__(self, message: str, reached: _Solved) -> None:
         super().__init__(message)
         self.reached = reached
 
 
-def first_estimate(drive: Drive, guess: Guess, config: TrackerConfig) -> Point:
-    """All steps of :func:`estimating_first`."""
-    return whole(estimating_first(drive, guess, config))
-
-
-def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
+def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepwise[Point]:
     """The batch solution of some scans of the window, step by step.
 
-    A short stretch of driving at one speed does not tell the time offset. So the offset stays with the
-    guess unless the labels clearly say otherwise: a solution whose search left the offset free must
-    explain them better by ``start_gain``, and within a solution a step of the offset is damped.
+    A short stretch of driving at one speed does not determine the time offset. So the offset stays near the
+    guess unless the labels clearly contradict it: a solution whose search left the offset free must explain
+    them better by a tenth, and within a solution a step of the offset is damped.
 
     Raises:
-        EstimationError: too little to see, an ambiguous start, or a solution that did not settle, or did
-            while one that did not explains the labels better.
+        EstimationError: too little to see, an ambiguous start, no solution that converged, or one that
+            explains the labels less well than another that did not converge.
     """
     searched = guess.search or guess.cTl is None
     reach = config.calibration.start.search.time_offset_s if guess.search else 0.0
@@ -107,14 +110,14 @@ def estimating_first(drive: Drive, guess: Guess, config: TrackerConfig) -> Stepw
     # After a search they are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     ways = [held, starts] if reach > 0.0 else [starts]
-    solved, failed = yield from _tried([_best(drive, way, kernels_px, config) for way in ways])
+    solved, failed = yield from _all_of([_best(drive, way, kernels_px, config) for way in ways])
     if not solved:
         raise failed[-1]
     best, *others = solved
     for other in others:
-        if other.cost < (1.0 - config.start_gain) * best.cost:
+        if other.cost < (1.0 - _LEAST_GAIN) * best.cost:
             best = other
-    _refuse_beside(best, failed, config)
+    _check_not_converged(best, failed)
     return best.point
 
 
@@ -131,7 +134,7 @@ def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
     return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
-def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
+def _all_of(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
     """The solutions, and why there are no others."""
     solved, failed = [], []
     for way in ways:
@@ -142,21 +145,21 @@ def _tried(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], l
     return solved, failed
 
 
-def _unsettled(failed: Sequence[EstimationError]) -> list[_Solved]:
-    """What those reached that only did not come to rest."""
-    return [error.reached for error in failed if isinstance(error, _Unsettled)]
+def _not_converged(failed: Sequence[EstimationError]) -> list[_Solved]:
+    """Where those were that only did not converge."""
+    return [error.reached for error in failed if isinstance(error, _NotConverged)]
 
 
-def _refuse_beside(best: _Solved, failed: Sequence[EstimationError], config: TrackerConfig) -> None:
-    """Refuse a solution if one of another basin is clearly better, though it has not come to rest.
+def _check_not_converged(best: _Solved, failed: Sequence[EstimationError]) -> None:
+    """Refuse a solution if one of another basin is clearly better, though it has not converged.
 
-    At a steady speed the time offset may slide along with the translation for ever.
+    At a steady speed the time offset may move along with the translation without end.
     """
-    for other in _unsettled(failed):
-        if best.turned_from(other) and other.cost < (1.0 - config.start_gain) * best.cost:
+    for other in _not_converged(failed):
+        if best.turned_from(other) and other.cost < (1.0 - _LEAST_GAIN) * best.cost:
             raise EstimationError(
                 f"another pose explains the labels better (cost {other.cost:.3f} against {best.cost:.3f} a "
-                "point), but has not settled"
+                "point), but has not converged"
             )
 
 
@@ -168,15 +171,15 @@ def _best(
     Raises:
         EstimationError: no solution, or two that differ and explain the labels alike.
     """
-    solved, failed = yield from _tried([_solution(drive, start, kernels_px, config) for start in starts])
+    solved, failed = yield from _all_of([_solution(drive, start, kernels_px, config) for start in starts])
     if not solved:
-        if reached := _unsettled(failed):
-            raise _Unsettled(str(failed[0]), min(reached, key=lambda one: one.cost))
+        if reached := _not_converged(failed):
+            raise _NotConverged(str(failed[0]), min(reached, key=lambda one: one.cost))
         raise failed[0]
     best, *others = sorted(solved, key=lambda solution: solution.cost)
-    _refuse_beside(best, failed, config)
+    _check_not_converged(best, failed)
     for other in others:
-        if best.turned_from(other) and best.cost > (1.0 - config.start_gain) * other.cost:
+        if best.turned_from(other) and best.cost > (1.0 - _LEAST_GAIN) * other.cost:
             raise EstimationError(
                 f"two poses explain the labels alike (cost {best.cost:.3f} and {other.cost:.3f} a point)"
             )
@@ -184,8 +187,8 @@ def _best(
 
 
 def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -> Stepwise[list[State]]:
-    """Where the solutions begin: those that the batch would select, with offsets within ``reach_s`` of the
-    guess's, or the guess itself.
+    """Where the solutions begin: the candidates that the batch's selection keeps, with offsets within
+    ``reach_s`` of the guess's, or the guess itself.
 
     Raises:
         EstimationError: nothing to search for, or no guess and no search.
@@ -194,11 +197,9 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
     search = dataclasses.replace(calibration.start.search, time_offset_s=reach_s)
     enabled = guess.search or guess.cTl is None
     start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
-    scans = SELECTION_SCANS
-    if config.start_work > 0:
-        # The estimate is waited for, and scans of one second show much the same: candidates are compared on
-        # every other one, and the best are solved on all.
-        scans = min(scans, (len(drive.scans) + 1) // 2)
+    # Scans of one second show much the same: candidates are compared on every other one, and the best are
+    # solved on all.
+    scans = min(SELECTION_SCANS, (len(drive.scans) + 1) // 2)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
     problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s)
     selection = yield from select_start_steps(problem, joint.graph, start, scans)
@@ -208,7 +209,7 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
 def _damped(config: TrackerConfig) -> JointConfig:
     """The joint method with small steps of the time offset."""
     joint = config.calibration.joint
-    graph = dataclasses.replace(joint.graph, time_offset_sigma_s=config.start_offset_step_s)
+    graph = dataclasses.replace(joint.graph, time_offset_sigma_s=_OFFSET_STEP_S)
     return dataclasses.replace(joint, graph=graph)
 
 
@@ -227,7 +228,7 @@ def _solution(
     point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
-        raise _Unsettled(message, _Solved(_cost(drive, point, config), point))
+        raise _NotConverged(message, _Solved(_cost(drive, point, config), point))
     if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
@@ -252,14 +253,14 @@ def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, conf
         for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, drive.image_period_s)
         if drive.scans[pair.scan].boundaries and drive.images[pair.image].contours
     ]
-    if pairs < config.start_share * len(seen):
+    if pairs < _LEAST_PAIRS_SHARE * len(seen):
         raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
     reach = config.calibration.start.search.time_offset_s
     if abs(offset_s - start_s) > reach:
         raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
 
 
-def prior_belief(
+def prior_gaussian(
     point: Point, guess: Guess, classes: tuple[SemanticClass, ...], config: GraphConfig
 ) -> Gaussian:
     """The batch's own weak priors around the guess, linearized at a point.

@@ -1,7 +1,7 @@
 """A tracker on disk: one npz file, written whole or not at all, arrays and JSON only.
 
-What is read is held against its checksum, against the classes of the estimators, and against what a tracker
-can answer; a file that passes none of it is refused as a whole.
+What is read is compared with its checksum, with the classes of the estimators, and with what a tracker can
+answer; a file that fails any of it is refused as a whole.
 """
 
 from __future__ import annotations
@@ -17,25 +17,28 @@ import re
 import warnings
 import zipfile
 import zlib
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Container, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import numpy as np
 
 from sst_graph.errors import CheckpointError, DataError
 from sst_graph.files import atomic_write_in_steps
 from sst_graph.files.checked_values import checked_camera
-from sst_graph.files.object_store import Block, Blocks, Node, class_name, restored, stored
+from sst_graph.files.object_store import Block, Blocks, Node, class_name, lay_out, restored, stored
 from sst_graph.files.reading import FileKind, parse_json, read_file
-from sst_graph.tracker.storage.resume import Setup, check_memory, check_setup
-from sst_graph.tracker.tracker import Tracker
+from sst_graph.tracker.answer import current
+from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
 from sst_graph.types import NO_PICTURE, CameraImage
 
+if TYPE_CHECKING:
+    from sst_graph.tracker.tracker import Tracker
+
 FORMAT = "sst-graph/tracker"
-VERSION = 18
+VERSION = 19
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -73,6 +76,7 @@ _PACKAGES = (
     "sst_graph.types",
 )
 """Where the classes are defined that a tracker is made of."""
+_TRACKER = "sst_graph.tracker.tracker:Tracker"
 
 
 class Saver:
@@ -118,19 +122,19 @@ class Saver:
     def save(self, tracker: Tracker) -> None:
         """Save a tracker as it is; the file is there after :meth:`finish`, or some frames later.
 
-        The tracker is consolidated (:meth:`Tracker.consolidate`), so that it and the one that is read back go
+        The tracker is consolidated (:func:`consolidate`), so that it and the one that is read back go
         on to the same estimates. It may change after the next :meth:`follow`, not before.
 
         Raises:
             OSError: an earlier one cannot be written; what stood there is untouched.
         """
         self.finish()
-        tracker.consolidate(self._blocks)
+        consolidate(tracker, self._blocks)
         self._saved = tracker
 
     def _store(self) -> None:
         """Store the tracker that was saved; a large file is still to be written."""
-        with _uncollected():
+        with _without_gc():
             node, rest, blocks = self._blocks.stored(self._saved)
         self._saved = None
         self._writing = atomic_write_in_steps(self._path, partial(_filling, node, rest, blocks))
@@ -149,29 +153,30 @@ class Saver:
             pass
 
 
-def save_checkpoint(tracker: Tracker, path: str | Path) -> None:
-    """Write a tracker; a file that exists is replaced in one step.
+def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
+    """Build iSAM2 and the odometry's map anew from what a checkpoint holds.
 
-    The tracker is consolidated first (:meth:`Tracker.consolidate`), so that it and the one that is read back
-    go on to the same estimates.
+    The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
 
-    Raises:
-        OSError: it cannot be written; what stood there is untouched.
+    Args:
+        laid_out: ids of values that have their memory layout already.
     """
-    with Saver(path) as saver:
-        saver.save(tracker)
+    lay_out(tracker, laid_out)
+    tracker.inputs.odometry.rebuild_map()
+    if tracker.estimate.smoother is not None:
+        tracker.estimate.smoother.relinearize()
 
 
 def _lasting(tracker: Tracker) -> Iterator[object]:
     """What never changes of what a tracker holds, most of it; the rest of that is small."""
-    yield from (features for _, features in tracker.window.scans)
-    yield from tracker.window.images
-    if tracker.smoother is not None:
-        yield from tracker.smoother.entries.values()
+    yield from (features for _, features in tracker.inputs.window.scans)
+    yield from tracker.inputs.window.images
+    if tracker.estimate.smoother is not None:
+        yield from tracker.estimate.smoother.entries.values()
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
+def _without_gc() -> Iterator[None]:
     """Without Python's search for circular garbage: so many lists at once would set it off for nothing."""
     collects = gc.isenabled()
     gc.disable()
@@ -229,8 +234,7 @@ def _portions(parts: Sequence[bytes]) -> Iterator[list[bytes]]:
 def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     """The tracker in a checkpoint, at the estimate it was saved with.
 
-    Whether it goes on with the drive that it was saved on,
-    :func:`sst_graph.tracker.storage.resume.frames_to_come` tells.
+    :func:`sst_graph.tracker.storage.resume.frames_to_come` checks that it goes on with its own drive.
 
     Args:
         setup: camera, settings and guess that it must have been made with; None for any.
@@ -254,9 +258,9 @@ def load_checkpoint(path: str | Path, setup: Setup | None = None) -> Tracker:
     # Numbers of a forged file overflow where those of a tracker do not: no warning of NumPy's is ours.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        _rehearse(_tracker(document, data, path), path)
+        _check_tracker(_tracker(document, data, path), path)
         tracker = _tracker(document, data, path)
-        tracker.starting.catch_up()
+        tracker.initializer.catch_up()
     if setup is not None:
         check_setup(tracker, setup, path)
     return tracker
@@ -268,25 +272,25 @@ def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tr
         tracker = restored(document.get("tracker"), data, checkpoint_classes(), blocks)
     except ValueError as error:
         raise CheckpointError(path, f"an incomplete checkpoint ({error})", "all of a tracker") from error
-    if not isinstance(tracker, Tracker):
+    if not isinstance(tracker, checkpoint_classes()[_TRACKER]):
         raise CheckpointError(path, f"a checkpoint of a {type(tracker).__name__}", "all of a tracker")
-    return tracker
+    return cast("Tracker", tracker)
 
 
-def _rehearse(tracker: Tracker, path: str | Path) -> None:
-    """Require a tracker that answers and takes its last frame once more: its parts go with each other.
+def _check_tracker(tracker: Tracker, path: str | Path) -> None:
+    """Require a tracker that answers and accepts its last frame once more: its parts are consistent.
 
     Raises:
         CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
     """
     try:
-        checked_camera(tracker.camera, "camera")
-        check_memory(tracker)
-        tracker.starting.catch_up()
-        tracker.current().to_dict()
-        tracker.consolidate()
+        checked_camera(tracker.inputs.camera, "camera")
+        check_inputs(tracker)
+        tracker.initializer.catch_up()
+        current(tracker).to_dict()
+        consolidate(tracker)
         _again(tracker)
-        tracker.current().to_dict()
+        current(tracker).to_dict()
         stored(tracker)
     except Exception as error:
         found = f"a tracker that does not answer ({type(error).__name__}: {error})"
@@ -295,7 +299,7 @@ def _rehearse(tracker: Tracker, path: str | Path) -> None:
 
 def _again(tracker: Tracker) -> None:
     """The last frame once more, a second later."""
-    scan, images = tracker.last_scan, tracker.window.images
+    scan, images = tracker.inputs.last_scan, tracker.inputs.window.images
     stamps = [one.stamp_ns for one in (scan, *images) if one is not None]
     if not stamps:
         return
@@ -355,7 +359,7 @@ def _bytes_of(file: zipfile.ZipFile, name: str, most: int) -> memoryview:
 
 
 def _digest(head: bytes | memoryview, data: bytes | memoryview) -> bytes:
-    """SHA-256 of both: a damaged or edited checkpoint is told from one as it was written."""
+    """SHA-256 of both: a damaged or edited checkpoint has another."""
     sum_ = hashlib.sha256(len(head).to_bytes(8, "little"))
     sum_.update(head)
     sum_.update(data)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 _FIRST = 3
-"""Scans and images, of each, by which a drive is known again."""
+"""Scans and images, of each, by which a drive is recognized."""
 
 
 @dataclass(frozen=True)
@@ -68,24 +68,25 @@ class FirstFrames:
 
     digests: dict[tuple[str, int], str] = field(default_factory=dict)
 
-    def take(self, data: Scan | CameraImage) -> None:
-        """Scans or images as they come, of which the first ones are remembered."""
+    def add(self, data: Scan | CameraImage) -> None:
+        """A scan or an image that was used; the first ones are remembered."""
         sensor = _sensor(data)
         if sum(name == sensor for name, _ in self.digests) < _FIRST:
             self.digests[sensor, data.stamp_ns] = _digest(data)
 
 
-def check_memory(tracker: Tracker) -> None:
-    """That what a tracker remembers of its making and its drive is what these functions compare.
+def check_inputs(tracker: Tracker) -> None:
+    """That a tracker's setup and inputs are what these functions compare.
 
     Raises:
         ValueError: it is not.
     """
-    setup, newest = tracker.setup, tracker.newest_ns
-    whole = isinstance(setup, Setup) and isinstance(tracker.first_frames, FirstFrames)
+    setup, inputs = tracker.setup, tracker.inputs
+    newest = inputs.scan_order.newest_ns
+    whole = isinstance(setup, Setup) and isinstance(inputs.first_frames, FirstFrames)
     whole = whole and (newest is None or isinstance(newest, int))
-    if not whole or (setup.camera, setup.config.estimating) != (tracker.camera, tracker.config):
-        raise ValueError("a memory of another tracker")
+    if not whole or (setup.camera, setup.config.estimating) != (inputs.camera, inputs.config):
+        raise ValueError("inputs of another tracker")
 
 
 def check_setup(tracker: Tracker, setup: Setup, place: str | Path) -> None:
@@ -96,7 +97,7 @@ def check_setup(tracker: Tracker, setup: Setup, place: str | Path) -> None:
     """
     if found := tracker.setup.differences(setup):
         some = "; ".join(found[:5]) + (f"; and {len(found) - 5} more" if len(found) > 5 else "")
-        raise DataError(place, some, "what the tracker was made with (or begin anew)")
+        raise DataError(place, some, "what the tracker was made with (or a new tracker)")
 
 
 def frames_to_come(tracker: Tracker, source: Source, place: str | Path) -> Iterator[Frame]:
@@ -108,28 +109,29 @@ def frames_to_come(tracker: Tracker, source: Source, place: str | Path) -> Itera
     Raises:
         DataError: the tracker was saved on another drive, or on other frames of it.
     """
-    known, frames, following = _Known(tracker), iter(source), list[Frame]()
+    comparison, frames, following = _DriveComparison(tracker), iter(source), list[Frame]()
+    newest_ns = tracker.inputs.scan_order.newest_ns
     for frame in frames:
         stamp_ns = _newest(frame)
-        if tracker.newest_ns is None or (stamp_ns is not None and stamp_ns > tracker.newest_ns):
+        if newest_ns is None or (stamp_ns is not None and stamp_ns > newest_ns):
             following.append(frame)
             break
-        known.compare(frame.scan, frame.image)
-    if why := known.contradiction():
+        comparison.compare(frame.scan, frame.image)
+    if why := comparison.difference():
         drive = "that of the drive it is resumed on"
         raise DataError(place, f"a tracker of another drive ({why} in {source.name})", drive)
     return chain(following, frames)
 
 
-class _Known:
-    """What a tracker remembers of its drive, against a drive's frames."""
+class _DriveComparison:
+    """A drive's frames against those that a tracker has used."""
 
     def __init__(self, tracker: Tracker) -> None:
-        self._camera, self._newest = tracker.camera, tracker.last_scan
-        self._digests = dict(tracker.first_frames.digests)
+        self._camera, self._newest = tracker.setup.camera, tracker.inputs.last_scan
+        self._digests = dict(tracker.inputs.first_frames.digests)
         if self._newest is not None:
             self._digests["scan", self._newest.stamp_ns] = _digest(self._newest)
-        self._masks = {image.stamp_ns: image.mask for image in tracker.window.images}
+        self._masks = {image.stamp_ns: image.mask for image in tracker.inputs.window.images}
         self._others: list[str] = []
 
     def compare(self, scan: Scan | None, image: CameraImage | None) -> None:
@@ -151,7 +153,7 @@ class _Known:
         if expected is not None and _digest(data) != expected:
             self._others.append(f"another {_sensor(data)} of {data.stamp_ns} ns")
 
-    def contradiction(self) -> str:
+    def difference(self) -> str:
         """What frames were other, or missing; empty where none was."""
         missing = [f"no {sensor} of {stamp_ns} ns" for sensor, stamp_ns in self._digests]
         return next(iter([*self._others, *missing]), "")

@@ -1,4 +1,4 @@
-"""The state of an object and of all that it holds, to be put back where an update fails half way."""
+"""The state of an object and of all that it holds, to be restored where an update fails half way."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _PACKAGES = ("sst_graph.",)
 
 
 class Snapshot:
-    """What an object holds, as it is now.
+    """What an object holds, as it is now; as a context, put back where the block fails.
 
     Lists, dictionaries, sets, deques and the package's own objects are recorded, one level each, wherever
     they are reached from; :meth:`restore` puts their contents back into the very same objects. All else
-    (arrays, poses, iSAM2, frozen dataclasses) is taken to be never changed in place, only replaced: what
-    holds state keeps to that. Objects of a class whose ``rolls_back`` is False stay as they have become.
+    (arrays, poses, iSAM2, frozen dataclasses) must never change in place, only be replaced. Objects of a
+    class whose ``rolls_back`` is False stay as they have become.
     """
 
     def __init__(self, root: object) -> None:
@@ -41,6 +41,13 @@ class Snapshot:
                 attributes = vars(value)
                 self._saved.append((attributes, dict(attributes)))
                 waiting.extend(attributes.values())
+
+    def __enter__(self) -> Snapshot:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            self.restore()
 
     def restore(self) -> None:
         """Put everything back."""

@@ -19,6 +19,9 @@ from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 
+EPOCH_S = 1.0
+"""One calibration is estimated for each epoch of this length; shorter ones cost more variables [s]."""
+
 
 @dataclass(frozen=True)
 class Found:

@@ -26,6 +26,8 @@ from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.window import Window
 from sst_graph.types import SemanticClass
 
+_MIN_MATCHES = 8
+"""Fewest matches of a scan that enters the graph: fewer hardly determine anything."""
 _SMOOTHED = 12
 """So many of the latest motions are smoothed anew with every scan."""
 
@@ -85,7 +87,7 @@ class WindowMatcher:
         stamps = self.window.stamps_ns()
         found = {}
         for number, pair in pairs.items():
-            if len(pair) >= self.config.min_frame_matches:
+            if len(pair) >= _MIN_MATCHES:
                 pair = pair if share == 1.0 else with_share(pair, share)
                 by_object = not self.config.drift.enabled
                 score = self._score(pair, number, point, share, by_object, self.held_names)
@@ -116,7 +118,7 @@ class WindowMatcher:
         part = replace(part, images=(self.window.images[position],))
         tracks, state = self._tracks(part, numbers), point.state(self.classes)
         pairs = associate([part], tracks, state, kernel, self.graph)
-        if not pairs or len(pairs[0]) < self.config.min_frame_matches:
+        if not pairs or len(pairs[0]) < _MIN_MATCHES:
             return None
         score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
         return Other(score.bent, middle_s, early)

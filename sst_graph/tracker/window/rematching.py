@@ -7,7 +7,6 @@ from collections.abc import Collection
 import numpy as np
 
 from sst_graph.covariance.cluster_robust import FloatArray
-from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.window.gaussian import core_steps
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -16,6 +15,14 @@ from sst_graph.tracker.window.whole_window import Settling
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
+_IN_TURN = 1
+"""Scans matched anew with each frame besides the newest, the most outdated first: each costs as much as the
+newest."""
+_MOST_IN_TURN = 4
+"""As many while the estimate moves."""
+_STALE_SIGMAS = 0.3
+"""Matches are outdated where the estimate has moved farther since, in standard deviations."""
+
 
 def scans_to_match(
     number: int,
@@ -23,7 +30,6 @@ def scans_to_match(
     smoother: WindowSmoother,
     entered: Collection[int],
     covariance: FloatArray,
-    config: TrackerConfig,
     settling: Settling | None = None,
 ) -> set[int]:
     """The newest, those still without a pair, those that leave next, and some in turn.
@@ -48,10 +54,10 @@ def scans_to_match(
         # No others: all of the window come in their turn, and to look below them costs as much.
         return chosen | set(leaving) | (set(turn or ()) & set(staleness))
     known = sorted(staleness, key=staleness.__getitem__, reverse=True)
-    stale = sum([value > config.stale_sigmas for value in staleness.values()])
-    some = known[: max(config.renew - len(leaving), stale)]
+    stale = sum([value > _STALE_SIGMAS for value in staleness.values()])
+    some = known[: max(_IN_TURN - len(leaving), stale)]
     wanted = [*_judged_anew(matcher, smoother), *some]
-    return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[: config.renew_most])
+    return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[:_MOST_IN_TURN])
 
 
 def _judged_anew(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:

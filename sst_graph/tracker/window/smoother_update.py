@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_graph.graph.elimination import scaled_inverse
 from sst_graph.graph.state import object_bias_key, twist_key
-from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
+from sst_graph.tracker.window.epochs import EPOCH_S, Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Point, with_room
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ class Change:
         """The epoch of a stamp; a new one where the last has lasted long enough."""
         smoother, last = self._smoother, self.epochs[-1]
         seconds = (stamp_ns - last.start_ns) * 1e-9
-        if not smoother.drift.enabled or seconds < smoother.drift.epoch_s:
+        if not smoother.drift.enabled or seconds < EPOCH_S:
             for epoch in reversed(self.epochs):
                 if stamp_ns >= epoch.start_ns:
                     return epoch.number

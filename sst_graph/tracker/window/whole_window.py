@@ -21,6 +21,8 @@ _RESTS_SIGMAS = 0.02
 """A whole step shorter than this is rest."""
 _INNER = 2
 """Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
+SCANS = 5
+"""Scans matched with each frame while the window is matched anew: more make these frames slower."""
 _PASSES = 2
 """How often a running tracker matches the whole window anew when it settles."""
 
@@ -110,9 +112,8 @@ class Settling:
         done: scans that were asked, or matched, in this pass.
     """
 
-    def __init__(self, matcher: WindowMatcher, scans: int) -> None:
-        """scans: that are matched with each frame."""
-        self._matcher, self._scans = matcher, scans
+    def __init__(self, matcher: WindowMatcher) -> None:
+        self._matcher = matcher
         self.passes = _PASSES
         never = matcher.config.calibration.undersides.use == "never"
         self.below = None if never else UndersideSupport()
@@ -135,7 +136,7 @@ class Settling:
         waiting = [number for number in numbers if number not in self.done]
         looking, below = self.below is not None, self.below
         # To look below is to match twice.
-        most = max(1, self._scans - fewer)
+        most = max(1, SCANS - fewer)
         some = waiting[: (most + 1) // 2 if looking else most]
         if below is not None:
             self.below = below.plus(self._matcher.support_below(point, some))

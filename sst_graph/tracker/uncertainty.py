@@ -1,4 +1,4 @@
-"""How well a running estimate is known."""
+"""Covariance of a running estimate."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
 from sst_graph.graph.elimination import scaled_inverse
-from sst_graph.tracker.monitor.alarm import Joint
+from sst_graph.tracker.monitor.statistic import EstimateCovariance
 from sst_graph.tracker.track_update import UNKNOWN_SIGMAS
 from sst_graph.tracker.window.smoother import WindowSmoother
 
@@ -19,29 +19,29 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Known:
-    """Covariance of an estimate, and what stands behind it.
+class Uncertainty:
+    """Covariance of an estimate, and what it rests on.
 
     Attributes:
         joint: cluster-robust covariance of all unknowns.
         inflation: how much larger it is than that of independent matches.
-        by_standing: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
-            object moves.
+        by_static: (7, 7) covariance of extrinsic and offset from static objects alone; None where no object
+            moves.
         steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
     """
 
-    joint: Joint
+    joint: EstimateCovariance
     inflation: float = 1.0
-    by_standing: FloatArray | None = None
+    by_static: FloatArray | None = None
     steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
-    def nothing(cls) -> Known:
+    def nothing(cls) -> Uncertainty:
         """Before there is an estimate."""
-        return cls(Joint(np.diag(np.square(UNKNOWN_SIGMAS)), (), len(UNKNOWN_SIGMAS)))
+        return cls(EstimateCovariance(np.diag(np.square(UNKNOWN_SIGMAS)), (), len(UNKNOWN_SIGMAS)))
 
     @classmethod
-    def of(cls, smoother: WindowSmoother) -> Known:
+    def of(cls, smoother: WindowSmoother) -> Uncertainty:
         """Of a smoother's estimate.
 
         Raises:
@@ -54,13 +54,14 @@ class Known:
         m = smoother.past.point.core_size
         share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
         inflation = max(1.0, float(share))
-        by_standing = None
-        alone = smoother.information_of_standing()
-        if alone is not None:
-            wider = scaled_inverse(alone)[:7, :7] - naive[:7, :7]
-            by_standing = matrix[:7, :7] + inflation * wider
+        by_static = None
+        static = smoother.information_of_standing()
+        if static is not None:
+            wider = scaled_inverse(static)[:7, :7] - naive[:7, :7]
+            by_static = matrix[:7, :7] + inflation * wider
         steps = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
-        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_standing, steps)
+        joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
+        return cls(joint, inflation, by_static, steps)
 
     @property
     def covariance(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The rhythm of stamps: jumps of a clock told from late, missing and jittering ones."""
+"""Intervals of stamps: jumps of a clock against late, missing and jittering stamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from streets import prepared_street
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.answer import Answer, Guess, result_of
 from sst_graph.drive.preparation import Drive
-from sst_graph.drive.stamp_intervals import Clocks, Jump, Rhythm, jumps_of
+from sst_graph.drive.stamp_intervals import FrameIntervals, Jump, StampMonitor, jumps_of
 
 CHI2 = 25.0
 PERIOD_NS = 100_000_000
@@ -32,15 +32,15 @@ def later(stamps: Stamps, start: int, milliseconds: float) -> Stamps:
 
 
 def jumps(stamps: Stamps) -> list[tuple[int, Jump]]:
-    """The jumps that a rhythm finds, each with the position of the stamp that made it certain."""
-    rhythm = Rhythm("image")
-    found = [(i, rhythm.take(int(stamp), (i, i), CHI2)) for i, stamp in enumerate(stamps)]
+    """The jumps of one sensor, each with the position of the stamp that made it certain."""
+    intervals = FrameIntervals("image")
+    found = [(i, intervals.add(int(stamp), (i, i), CHI2)) for i, stamp in enumerate(stamps)]
     return [(i, jump) for i, jump in found if jump is not None]
 
 
 @pytest.mark.parametrize("milliseconds", [-230.0, -200.0, -60.0, -30.0, -12.0, 12.0, 30.0, 45.0])
-def test_a_jump_is_told_with_its_place_and_size(milliseconds: float) -> None:
-    """Within three stamps; whole periods are not told but back."""
+def test_a_jump_is_found_with_its_place_and_size(milliseconds: float) -> None:
+    """Within three stamps; whole periods are found only backwards."""
     (at, jump), *others = jumps(later(steady(jitter_ms=0.2), 40, milliseconds))
     assert not others and jump.place == (40, 40) and at <= 42 and jump.chi2 > CHI2
     assert abs((1e3 * jump.seconds - milliseconds + 50.0) % 100.0 - 50.0) < 2.0
@@ -93,22 +93,22 @@ def test_another_rate_is_no_jump() -> None:
     assert not others and jump.seconds == pytest.approx(0.02, abs=1e-4)
 
 
-def test_a_sensor_that_begins_anew_after_a_gap_is_no_jump() -> None:
+def test_a_sensor_that_restarts_after_a_gap_is_no_jump() -> None:
     assert not jumps(later(steady(), 40, 1030.0))
 
 
-def test_without_a_rhythm_nothing_is_odd() -> None:
+def test_irregular_stamps_have_no_jumps() -> None:
     rng = np.random.default_rng(1)
     assert not jumps(np.cumsum(rng.integers(50, 150, 200)) * 1_000_000)
     assert not jumps(later(steady(), 8, 30.0))
 
 
 def together(images: Stamps, scans: Stamps) -> list[tuple[int, Jump]]:
-    """What both sensors' clocks tell, each image before the scan of its number."""
-    clocks, found = Clocks(CHI2), []
+    """The jumps of the offset of both sensors, each image before the scan of its number."""
+    monitor, found = StampMonitor(CHI2), []
     for i, (image, scan) in enumerate(zip(images.tolist(), scans.tolist(), strict=True)):
-        clocks.take_image(image, (i, i))
-        jump = clocks.take_scan(scan, (i + 1, i))
+        monitor.add_image(image, (i, i))
+        jump = monitor.add_scan(scan, (i + 1, i))
         found += [] if jump is None else [(i, jump)]
     return found
 

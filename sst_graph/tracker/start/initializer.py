@@ -15,31 +15,72 @@ from sst_graph.errors import SstGraphError
 from sst_graph.factors.errors import FactorError
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
-from sst_graph.tracker.start.solution import Guess, estimating_first, prior_belief
-from sst_graph.tracker.status import Known
+from sst_graph.tracker.start.solution import Guess, first_estimate_steps, prior_gaussian
+from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.tracker.window.epochs import Found
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.window import Window
 
-EXPECTED = (SstGraphError, FactorError, RuntimeError, ValueError, ArithmeticError, np.linalg.LinAlgError)
+NUMERICAL_ERRORS = (
+    SstGraphError,
+    FactorError,
+    RuntimeError,
+    ValueError,
+    ArithmeticError,
+    np.linalg.LinAlgError,
+)
 """Errors that numbers alone may lead to; others are errors of the program."""
+
+_WORK_PER_FRAME = 48
+"""Work on a start with each frame, in units of 1 to 4 ms: the estimate comes when all is done, some frames
+later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal answers."""
+_RESTART_SCANS = 8
+"""Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""
+_MAX_ATTEMPTS = 2
+"""Failed attempts near the last estimate after an alarm; then the search looks all around it."""
+_SUPPORT_WORK, _MATCH_WORK = 2, 1
+"""To check the lower edges of a scan, and to match one, in units of work."""
+
+
+def searched_scans(config: TrackerConfig) -> int:
+    """Latest scans of the window that a start may be made of: half of it, or twice what a start needs."""
+    return max(2 * config.start_scans, 2 * _RESTART_SCANS, config.window // 2)
 
 
 @dataclass(frozen=True)
-class Started:
-    """An estimate: the graph of some scans, how well it is known, and how many scans were matched for it."""
+class Restart:
+    """Why, and from where, the calibration is to be estimated anew.
+
+    Attributes:
+        guess: where the new start begins.
+        scans: how many of the latest scans it may use.
+        reason: a sentence.
+        alarm: the calibration has changed; False: the start so far was wrong.
+        chi2: statistic that shows it, if any.
+    """
+
+    guess: Guess
+    scans: int
+    reason: str
+    alarm: bool = False
+    chi2: float | None = None
+
+
+@dataclass(frozen=True)
+class Initialization:
+    """A first estimate: the graph of some scans, its uncertainty, and how many scans were matched for it."""
 
     smoother: WindowSmoother
-    known: Known
+    uncertainty: Uncertainty
     scans: int
 
 
 class _Run:
     """A first estimate as far as it has come.
 
-    It cannot be taken back; what it has done beyond what was asked for is not told before it is asked for.
+    It cannot be rolled back; what it has done beyond the work that was asked for is not given out before.
     """
 
     rolls_back = False
@@ -53,14 +94,14 @@ class _Run:
         """The answer, if it takes no more work than this in all (None: any).
 
         Raises:
-            EstimationError: it has none; or another of :data:`EXPECTED`.
+            EstimationError: it has none; or another of :data:`NUMERICAL_ERRORS`.
         """
         while self._answer is None and (work is None or self._done < work):
             try:
                 self._done += next(self._steps)
             except StopIteration as stop:
                 self._answer = stop.value
-            except EXPECTED as error:
+            except NUMERICAL_ERRORS as error:
                 self._answer = error
         if self._answer is None or (work is not None and self._done >= work):
             return None
@@ -70,7 +111,7 @@ class _Run:
 
 
 class Search:
-    """A first estimate that is being looked for.
+    """A batch solution of some scans, under way.
 
     Attributes:
         drive: the scans and images that it is made of, as they were when it began.
@@ -84,15 +125,15 @@ class Search:
         self.work = 0
         self._run: _Run | None = None
 
-    def go_on(self, work: int | None) -> Point | None:
+    def advance(self, work: int | None) -> Point | None:
         """Some more work (None: all that is left); the estimate, once it is there.
 
         Raises:
-            EstimationError: none was found; or another of :data:`EXPECTED`.
+            EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
         """
         if self._run is None:
             # A search that was stored is done again as far as it had come: the steps are the same.
-            self._run = _Run(estimating_first(self.drive, self.guess, self.config))
+            self._run = _Run(first_estimate_steps(self.drive, self.guess, self.config))
         self.work += work or 0
         return self._run.until(None if work is None else self.work)
 
@@ -101,54 +142,51 @@ class Search:
         return {**vars(self), "_run": None}
 
 
-_LOOK_WORK, _MATCH_WORK = 2, 1
-"""To look below a scan, and to match one, in units of work."""
+class InitialGraph:
+    """Matches of some scans at a first estimate, made some with each frame.
 
-
-class Entering:
-    """A graph of some scans at a first estimate, made of their matches some with each frame.
-
-    First the edges towards the ground are looked at, then each scan is matched.
+    First the lower edges are checked, then each scan is matched.
 
     Attributes:
         point: the estimate.
         chosen: numbers of the scans.
         waiting: those whose turn is still to come.
-        below: support of the edges towards the ground so far; None when it is known.
+        support: of the lower edges so far; None when it is known.
         found: matches so far, by scan.
     """
 
     def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
         self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
-        self.below = None if config.calibration.undersides.use == "never" else UndersideSupport()
+        self.support = None if config.calibration.undersides.use == "never" else UndersideSupport()
         self.found: dict[int, Found] = {}
 
     def advance(self, matcher: WindowMatcher, work: int | None) -> bool:
         """Some of it (None: all of this pass); whether all scans have been matched."""
-        below = self.below
-        each = _MATCH_WORK if below is None else _LOOK_WORK
+        support = self.support
+        each = _MATCH_WORK if support is None else _SUPPORT_WORK
         count = len(self.waiting) if work is None else max(1, work // each)
         some, self.waiting = self.waiting[:count], self.waiting[count:]
-        if below is None:
+        if support is None:
             self.found |= matcher.match(self.point, some)[0]
         else:
-            self.below = below.plus(matcher.support_below(self.point, some))
-        if self.below is not None and not self.waiting:
-            matcher.match_below(self.below)
-            self.below, self.waiting = None, self.chosen
+            self.support = support.plus(matcher.support_below(self.point, some))
+        if self.support is not None and not self.waiting:
+            matcher.match_below(self.support)
+            self.support, self.waiting = None, self.chosen
         return not self.waiting
 
 
-class Starting:
+class Initializer:
     """When a start is tried, and from where.
 
     Attributes:
         guess: where it begins.
-        waited: scans since the last attempt, or those kept when it began.
+        waited: scans since the last attempt, or those kept at the restart.
         attempts: how many have failed.
-        alarmed: an alarm went before, and nothing has been found since.
-        search: what is being looked for, if anything is.
-        entering: an estimate that was found, and the graph that is being made at it.
+        alarmed: an alarm went before, and no estimate has been found since.
+        search: the batch solution that is under way.
+        graph: the graph that is being made at a solution.
+        work_per_frame: done with each frame; None: all with one, which takes seconds.
     """
 
     def __init__(self, guess: Guess, config: TrackerConfig) -> None:
@@ -156,59 +194,61 @@ class Starting:
         self.waited = self.attempts = 0
         self.alarmed = False
         self.search: Search | None = None
-        self.entering: Entering | None = None
+        self.graph: InitialGraph | None = None
+        self.work_per_frame: int | None = _WORK_PER_FRAME
 
-    def begin(self, guess: Guess, scans: int) -> None:
+    def restart(self, guess: Guess, scans: int, alarmed: bool) -> None:
         """From a guess, with some scans that are there already."""
-        self.guess, self.waited, self.search, self.entering = guess, scans, None, None
+        self.guess, self.waited, self.search, self.graph = guess, scans, None, None
+        self.alarmed = self.alarmed or alarmed
 
     @property
     def under_way(self) -> bool:
         """Whether a start is being made."""
-        return self.search is not None or self.entering is not None
+        return self.search is not None or self.graph is not None
 
     @property
     def needed(self) -> int:
         """Scans that a start is made of, at least."""
-        return self.config.restart_scans if self.alarmed else self.config.start_scans
+        return _RESTART_SCANS if self.alarmed else self.config.start_scans
 
-    def work(self, matcher: WindowMatcher) -> Started | None:
+    def work(self, matcher: WindowMatcher) -> Initialization | None:
         """What is done with a scan that has come; an estimate, once it is there.
 
         Raises:
-            EstimationError: none was found; or another of :data:`EXPECTED`.
+            EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
         """
         if not self.under_way and self._due(matcher.window):
             self.search = self._search(matcher.window)
         if self.search is not None:
-            point = self.search.go_on(self.config.start_work or None)
+            point = self.search.advance(self.work_per_frame)
             if point is not None:
-                self._enter(matcher.window, point, self.search.numbers)
-            if self.config.start_work > 0:
+                self._begin_graph(matcher.window, point, self.search.numbers)
+            if self.work_per_frame is not None:
                 return None
-        return None if self.entering is None else self._entered(matcher, self.config.start_work or None)
+        return None if self.graph is None else self._made(matcher, self.work_per_frame)
 
-    def finish(self, matcher: WindowMatcher) -> Started | None:
+    def finish(self, matcher: WindowMatcher) -> Initialization | None:
         """All that is left to do, at the end of a drive; None where too few scans have come.
 
         Raises:
-            EstimationError: none was found; or another of :data:`EXPECTED`.
+            EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
         """
         window = matcher.window
-        if self.entering is None:
+        if self.graph is None:
             if self.search is None and (len(window.scans) < self.needed or not window.images):
                 return None
             search = self.search or self._search(window)
             try:
-                point = search.go_on(None)
-            except EXPECTED:
+                point = search.advance(None)
+            except NUMERICAL_ERRORS:
                 if search.drive.scans[-1] is window.scans[-1][1]:
                     raise
                 search = self._search(window)
-                point = search.go_on(None)
+                point = search.advance(None)
             assert point is not None
-            self._enter(window, point, search.numbers)
-        return self._entered(matcher, None)
+            self._begin_graph(window, point, search.numbers)
+        return self._made(matcher, None)
 
     def _due(self, window: Window) -> bool:
         """Whether a start is tried with the scan that has come."""
@@ -224,55 +264,53 @@ class Starting:
         drive = replace(drive, scans=scans, lidar_motions=motions)
         return Search(drive, numbers, self.guess, self.config)
 
-    def _enter(self, window: Window, point: Point, searched: Sequence[int]) -> None:
-        """Begin with a graph that goes on from an estimate.
+    def _begin_graph(self, window: Window, point: Point, searched: Sequence[int]) -> None:
+        """Begin with the graph of the scans that an estimate was made of.
 
-        It is made of the scans that the estimate is: it fits them. Scans that came meanwhile are new to it,
-        and enter as new scans do. All are taken at once where no work is saved.
+        Scans that came meanwhile enter later, as new scans do; all are taken at once where no work is spread.
 
         Args:
             searched: numbers of the scans that the estimate was made of.
         """
         numbers = [number for number, _ in window.scans]
         chosen = [number for number in numbers if number in searched]
-        if self.config.start_work == 0:
+        if self.work_per_frame is None:
             chosen = numbers
         elif len(chosen) < min(self.needed, len(searched)):
-            # A search was so long that its scans have left.
+            # The search took so long that its scans have left.
             chosen = numbers[-self.needed :]
-        self.search, self.entering = None, Entering(point, chosen, self.config)
+        self.search, self.graph = None, InitialGraph(point, chosen, self.config)
 
-    def _entered(self, matcher: WindowMatcher, work: int | None) -> Started | None:
-        """Some work on the graph (None: all that is left); the graph, once it is made."""
-        entering, window, config = self.entering, matcher.window, self.config
-        assert entering is not None
-        while not entering.advance(matcher, work):
+    def _made(self, matcher: WindowMatcher, work: int | None) -> Initialization | None:
+        """Some work on the graph (None: all that is left); the smoother, once the graph is made."""
+        initial, window, config = self.graph, matcher.window, self.config
+        assert initial is not None
+        while not initial.advance(matcher, work):
             if work is not None:
                 return None
-        graph, point = config.calibration.joint.graph, entering.point
-        prior = prior_belief(point, self.guess, matcher.classes, graph)
-        found = {scan: one for scan, one in entering.found.items() if scan >= window.first_scan}
+        graph, point = config.calibration.joint.graph, initial.point
+        prior = prior_gaussian(point, self.guess, matcher.classes, graph)
+        found = {scan: one for scan, one in initial.found.items() if scan >= window.first_scan}
         stamps = window.stamps_ns()
-        start_ns = min(stamps[scan] for scan in entering.chosen if scan in stamps)
+        start_ns = min(stamps[scan] for scan in initial.chosen if scan in stamps)
         smoother = WindowSmoother(prior, start_ns, matcher.classes, graph, config.drift)
         smoother.update(found, set(), window.first_scan, window.objects.live)
-        return Started(smoother, Known.of(smoother), len(entering.chosen))
+        return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen))
 
     def catch_up(self) -> None:
-        """Come as far with what is being looked for as one that was not stored has."""
+        """Do again what a search that was stored had done."""
         if self.search is not None:
-            with suppress(*EXPECTED):
-                self.search.go_on(0)
+            with suppress(*NUMERICAL_ERRORS):
+                self.search.advance(0)
 
     def failed(self) -> None:
-        """An attempt has failed; after some, the search begins anew."""
+        """An attempt has failed; after some, the search looks all around the guess."""
         self.attempts += 1
-        self.search = self.entering = None
-        if self.attempts >= self.config.start_attempts:
-            # The last estimate leads nowhere: look all around it.
+        self.search = self.graph = None
+        if self.attempts >= _MAX_ATTEMPTS:
             self.guess = Guess(self.guess.cTl, self.guess.offset_s)
 
     def succeeded(self) -> None:
         """There is an estimate."""
         self.alarmed, self.attempts, self.waited = False, 0, 0
-        self.search = self.entering = None
+        self.search = self.graph = None

@@ -1,4 +1,4 @@
-"""Steps among the frames of a start and right after it; what a tracker knows by what stands alone."""
+"""Steps among the frames of a start and right after it; what static objects alone determine."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.status import Known
+from sst_graph.tracker.answer import current
 from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.types import Frame
 
 KNOCK_DEG = 1.5
 
 
-def told(street: SimulatedDrive, frames: list[Frame], step: int | None) -> tuple[Tracker, list[TrackUpdate]]:
-    """A tracker, which starts with the eighth frame, and what it says where the camera is knocked at one."""
+def answers(
+    street: SimulatedDrive, frames: list[Frame], step: int | None
+) -> tuple[Tracker, list[TrackUpdate]]:
+    """A tracker, which starts with the eighth frame, and its answers where the camera is knocked at one."""
     tracker, updates = tracker_from_truth(street), []
     for frame in frames:
         assert frame.image is not None
@@ -33,22 +36,22 @@ def told(street: SimulatedDrive, frames: list[Frame], step: int | None) -> tuple
 def test_a_knock_during_or_after_a_start_is_not_averaged(
     street: SimulatedDrive, frames: list[Frame], step: int
 ) -> None:
-    """The start is given up within a dozen frames, not ok before; the next one is of the frames since."""
-    tracker, updates = told(street, frames, step)
-    given_up = [i for i, update in enumerate(updates) if "begins anew" in update.reason]
+    """The start is given up within some frames, not ok before; the next one is of the frames since."""
+    tracker, updates = answers(street, frames, step)
+    given_up = [i for i, update in enumerate(updates) if "estimated anew" in update.reason]
     assert given_up and step <= given_up[0] < step + 12 and len(given_up) <= 2
     assert not any(update.status == "ok" for update in updates[: given_up[0]])
     assert all(updates[i].status == "starting" and not updates[i].accepted for i in given_up)
     assert not any(update.alarm for update in updates)
-    assert tracker.started
+    assert tracker.estimate.exists
     turned = gtsam.Rot3.Ry(np.radians(KNOCK_DEG)) * street.truth.cTl.rotation()
-    off = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turned.between(tracker.point.cTl.rotation()))))
+    off = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(turned.between(tracker.estimate.point.cTl.rotation()))))
     assert off < 0.2
 
 
 def test_quiet_frames_contradict_no_start(street: SimulatedDrive, frames: list[Frame]) -> None:
-    _, updates = told(street, frames[:26], None)
-    assert not any("begins anew" in update.reason for update in updates)
+    _, updates = answers(street, frames[:26], None)
+    assert not any("estimated anew" in update.reason for update in updates)
     assert updates[7].accepted
 
 
@@ -57,40 +60,41 @@ def test_labels_that_always_contradict_are_no_way_without_end(
 ) -> None:
     """A limit that any frames are past: two starts are refused, the third stays."""
     tracker = tracker_from_truth(street)
-    tracker.trial.alarm = dataclasses.replace(tracker.config.alarm, start_chi2=0.1)
+    tracker.monitor.changes.start_threshold = 0.1
     updates = [tracker.add(frame) for frame in frames[:30]]
-    assert sum("begins anew" in update.reason for update in updates) == 2
-    assert tracker.started
+    assert sum("estimated anew" in update.reason for update in updates) == 2
+    assert tracker.estimate.exists
 
 
-def test_what_only_moving_objects_tell_is_not_called_known(
-    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Every object of one side passes for one that moves: the standing ones alone know less, and decide."""
-    tracker, _ = told(street, frames[:20], None)
-    assert tracker.smoother is not None
-    assert tracker.smoother.information_of_standing() is None and tracker.known.by_standing is None
-    # 1. One object's matches are taken for those of a moving one.
-    smoother = tracker.smoother
+def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, frames: list[Frame]) -> None:
+    """One object of each pair counts half as static: static ones alone determine less, and decide."""
+    tracker, _ = answers(street, frames[:20], None)
+    assert tracker.estimate.smoother is not None
+    assert (
+        tracker.estimate.smoother.information_of_standing() is None
+        and tracker.estimate.uncertainty.by_static is None
+    )
+    # 1. One object's matches count as those of a moving one.
+    smoother = tracker.estimate.smoother
     for scan, entry in smoother.entries.items():
         seen = sorted(entry.score.places)
         part = entry.score.belief.without(seen[:1])[0] if seen else entry.score.belief
         half = dataclasses.replace(part, information=0.5 * part.information)
         score = dataclasses.replace(entry.score, standing=half)
         smoother.entries[scan] = dataclasses.replace(entry, score=score)
-    alone, whole = smoother.information_of_standing(), Known.of(smoother)
-    assert alone is not None and whole.by_standing is not None
-    assert np.linalg.eigvalsh(whole.by_standing - whole.covariance[:7, :7])[0] > -1e-9
-    assert (np.diag(whole.by_standing) > 1.2 * np.diag(whole.covariance)[:7]).any()
-    # 2. What they cannot separate is not called known, though the whole covariance is small.
+    alone, whole = smoother.information_of_standing(), Uncertainty.of(smoother)
+    assert alone is not None and whole.by_static is not None
+    assert np.linalg.eigvalsh(whole.by_static - whole.covariance[:7, :7])[0] > -1e-9
+    assert (np.diag(whole.by_static) > 1.2 * np.diag(whole.covariance)[:7]).any()
+    # 2. What they cannot separate is weak, though the whole covariance is small.
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     joint = dataclasses.replace(whole.joint, matrix=whole.joint.matrix.copy())
     joint.matrix[:7, :], joint.matrix[:, :7] = 0.0, 0.0
     joint.matrix[:7, :7] = good
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
-    for by_standing, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
-        monkeypatch.setattr(tracker, "known", Known(joint, 1.0, by_standing))
-        update = tracker.current()
+    for by_static, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
+        tracker.estimate.uncertainty = Uncertainty(joint, 1.0, by_static)
+        update = current(tracker)
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)
     assert "by what stands alone" in update.weak_directions[0].sentence

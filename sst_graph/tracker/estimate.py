@@ -1,0 +1,265 @@
+"""The running estimate: the window's smoother, its covariance, and what is derived from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.assumption_tests import told_by
+from sst_graph.covariance.considered import Considered, considered
+from sst_graph.errors import EstimationError
+from sst_graph.graph.convergence import FULL_STEPS
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
+from sst_graph.tracker.assumption_tests import AssumptionTests
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.history import History, HistoryEntry
+from sst_graph.tracker.monitor.statistic import Estimate
+from sst_graph.tracker.start.initializer import Initialization
+from sst_graph.tracker.start.solution import Guess
+from sst_graph.tracker.uncertainty import Uncertainty
+from sst_graph.tracker.window.arrivals import Arrivals
+from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.rematching import scans_to_match
+from sst_graph.tracker.window.smoother import WindowSmoother
+from sst_graph.tracker.window.whole_window import Milestones, Settling, settle_window
+
+_LOG = logging.getLogger(__name__)
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FrameMatches:
+    """What was matched with a scan, at the estimate before it.
+
+    Attributes:
+        scan: its number.
+        chosen: numbers of the scans that were matched: this one, those without a pair yet, and some of the
+            window in turn.
+        found: their matches.
+        missing: those that have none.
+        waiting: those that were not in the graph before.
+    """
+
+    scan: int
+    chosen: frozenset[int]
+    found: Mapping[int, Found]
+    missing: frozenset[int]
+    waiting: tuple[int, ...]
+
+    @property
+    def new(self) -> list[int]:
+        """Scans that come into the graph with their first matches."""
+        return [scan for scan in self.waiting if scan in self.found]
+
+
+class OnlineEstimate:
+    """Extrinsic and time offset over the window and all that has left it.
+
+    Attributes:
+        guess: what holds while there is no estimate.
+        smoother: the graph of the window; None while there is no estimate.
+        uncertainty: covariance of the estimate.
+        tests: whether the data contradict what is assumed.
+        entered: scans that have had a pair.
+        schedule: when the whole window is relinearized.
+        relinearization: of the whole window, while one is under way.
+        information_log: what each scan contributed.
+        past_epochs: those that have left the window (drift mode).
+        starts: number of the start that the estimate comes from.
+    """
+
+    def __init__(self, matcher: WindowMatcher, config: TrackerConfig, guess: Guess) -> None:
+        self.matcher, self.config, self.guess = matcher, config, guess
+        self.smoother: WindowSmoother | None = None
+        self.uncertainty = Uncertainty.nothing()
+        self.tests = AssumptionTests(config.calibration.assumptions)
+        self.entered: deque[int] = deque(maxlen=4 * config.window)
+        self.schedule = Milestones(0, config.window, config.window)
+        self.relinearization: Settling | None = None
+        self.information_log = Arrivals()
+        self.past_epochs = History()
+        self.starts = 0
+
+    def begin(self, initialization: Initialization) -> None:
+        """Go on from a first estimate."""
+        smoother, window = initialization.smoother, self.matcher.window
+        self.smoother, self.uncertainty = smoother, initialization.uncertainty
+        self.tests.run(smoother)
+        self.starts += 1
+        soon = len(window.scans) + initialization.scans
+        self.schedule = Milestones(window.first_scan, soon, self.config.window)
+        self.entered.extend(smoother.entries)
+        self.information_log.restart()
+        self.information_log.take(window.next_scan - 1, self.reported_covariance())
+        _LOG.info("tracker: started over %d scans", initialization.scans)
+
+    def restart(self, guess: Guess) -> None:
+        """Give the estimate up."""
+        self.guess = guess
+        self.stop_relinearization()
+        self.smoother, self.uncertainty = None, Uncertainty.nothing()
+        self.tests.restart()
+        self.entered.clear()
+        self.past_epochs.cut()
+
+    # ------------------------------------------------------------------ what is known
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is an estimate beyond the guess."""
+        return self.smoother is not None
+
+    @property
+    def point(self) -> Point:
+        """The present estimate, or the guess."""
+        if self.smoother is not None:
+            return self.smoother.point
+        return self.guess.point(self.matcher.classes, self._names)
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """Assumptions whose parameters are estimated."""
+        return tuple(name for name, _ in self.config.calibration.assumptions.estimated)
+
+    @property
+    def guessed_point(self) -> Point | None:
+        """The guess as an estimate; None where nothing was known."""
+        return None if self.guess.cTl is None else self.guess.point(self.matcher.classes, self._names)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(m, m) of extrinsic [rad, m], time offset [s], mask biases [px] and estimated parameters; of the
+        first two only, and wide, before the start."""
+        return self.uncertainty.covariance
+
+    @property
+    def parameters(self) -> dict[str, tuple[float, float]]:
+        """Value and deviation of each estimated parameter, by its assumption; none before the start."""
+        if self.smoother is None:
+            return {}
+        sigmas = np.sqrt(np.diag(self.covariance))[self.point.parameter_columns]
+        return {
+            name: (value, float(sigma))
+            for (name, value), sigma in zip(self.point.nuisances.items(), sigmas, strict=True)
+        }
+
+    def reported_covariance(self) -> FloatArray:
+        """(7, 7) of the present estimate, with what assumptions that may be wrong add to it."""
+        return self.covariance[:7, :7] + self.considered().covariance(7)
+
+    def considered(self) -> Considered:
+        """How the present estimate depends on the assumptions that are not estimated beside it."""
+        beside = considered(self.uncertainty.steps, self.config.calibration.assumptions)
+        return told_by(beside, self.tests.findings)
+
+    def for_comparison(self) -> Estimate:
+        """The running estimate as frames are compared with it."""
+        assert self.smoother is not None
+        return Estimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
+
+    def history(self) -> list[HistoryEntry]:
+        """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
+        if self.smoother is None:
+            return []
+        entries = self.past_epochs.smoothed(self.smoother)
+        beside = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
+
+    # ------------------------------------------------------------------ a frame
+
+    def match(self, scan: int) -> FrameMatches:
+        """Match the newest scan, those that wait for an image, those about to leave, and some in turn."""
+        smoother = self.smoother
+        assert smoother is not None
+        chosen = scans_to_match(
+            scan, self.matcher, smoother, self.entered, self.covariance, self.relinearization
+        )
+        sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
+        found, missing = self.matcher.match(smoother.point, chosen, None, self._share, sigma_s)
+        waiting = [n for n in chosen if n not in smoother.entries and n not in self.entered]
+        return FrameMatches(scan, frozenset(chosen), found, frozenset(missing), tuple(waiting))
+
+    def update(self, matches: FrameMatches) -> None:
+        """Put matches into the graph, and estimate.
+
+        Raises:
+            EstimationError: it fails; the estimate is to be rolled back.
+        """
+        smoother, window, new = self.smoother, self.matcher.window, matches.new
+        assert smoother is not None
+        # 1. The graph, with scans that have left the window as a linear factor.
+        if new or not matches.missing <= {matches.scan}:
+            smoother.update(matches.found, set(matches.missing), window.first_scan, window.objects.live)
+            window.dynamics.changed_scans -= matches.chosen
+        self.entered.extend(new)
+        # 2. Now and then the whole window is matched and linearized anew, some scans with each frame.
+        self._schedule_relinearization(matches.scan)
+        # 3. Covariance, and what the scan contributed to it.
+        self.uncertainty = Uncertainty.of(smoother)
+        if new:
+            self.information_log.take(matches.scan, self.reported_covariance())
+        # 4. Do the data contradict what is assumed?
+        self.tests.update(matches.scan, smoother)
+        self.past_epochs.take(smoother)
+
+    def begin_relinearization(self) -> None:
+        """Match the window anew with the frames to come; no scan leaves meanwhile if none has yet."""
+        window = self.matcher.window
+        window.dynamics.test_all()
+        self.relinearization = Settling(self.matcher)
+        window.held = window.first_scan == self.schedule.first
+
+    def stop_relinearization(self) -> None:
+        """Leave a relinearization of the window, if there is one, as it is."""
+        self.relinearization, self.matcher.window.held = None, False
+
+    def _schedule_relinearization(self, scan: int) -> None:
+        if self.relinearization is not None and self.relinearization.ended:
+            # What came meanwhile has been matched, too.
+            self.schedule.reached(scan)
+            self.stop_relinearization()
+        elif self.relinearization is None and not self.config.drift.enabled and self.schedule.reached(scan):
+            self.begin_relinearization()
+
+    @property
+    def _share(self) -> float:
+        """Factor on the weights of matches.
+
+        In drift mode matches count as little as their clusters allow, so that the walk has its share.
+        """
+        return 1.0 / self.uncertainty.inflation if self.config.drift.enabled else 1.0
+
+    # ------------------------------------------------------------------ the whole window
+
+    def optimize(self, max_iterations: int) -> bool | None:
+        """Solve the whole window as the batch does; whether it converged, None where that failed.
+
+        It has converged where the last whole step was below 0.02 standard deviations.
+        """
+        smoother, window = self.smoother, self.matcher.window
+        if smoother is None:
+            return None
+        self.stop_relinearization()
+        window.dynamics.test_all()
+        self.matcher.look_below(smoother.point)
+        live = window.objects.live
+        try:
+            converged = settle_window(
+                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, FULL_STEPS, live, self._share
+            )
+            self.uncertainty = Uncertainty.of(smoother)
+            self.tests.run(smoother)
+        except EstimationError as error:
+            _LOG.warning("tracker: the window as a whole could not be solved: %s", error)
+            return None
+        self.entered.extend(set(smoother.entries) - set(self.entered))
+        return converged

@@ -1,0 +1,132 @@
+"""What comes from the sensors: checked, measured and kept."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from typing import Any
+
+from sst_graph.drive.preparation import image_features, scan_features
+from sst_graph.drive.stamp_intervals import Jump, StampMonitor
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.odometry.lidar import LidarOdometry
+from sst_graph.tracker.admission import StampOrder, check_lateness
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.estimate import OnlineEstimate
+from sst_graph.tracker.storage.resume import FirstFrames
+from sst_graph.tracker.window.window import Window
+from sst_graph.types import CameraImage, Scan
+from sst_graph.validation import checked_image, checked_scan
+
+_MAX_IMAGES = 600
+"""Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
+_MAX_FAILURES = 10
+"""After so many scans or images in a row that could not be used, what is kept is the likely reason."""
+_SEARCH_MARGIN_S = 1.0
+"""Images farther from a scan are kept, too, until the time offset is known [s]."""
+
+
+class SensorInputs:
+    """The latest scans and images, the LiDAR's motion, and the stamps of both sensors.
+
+    Attributes:
+        camera: of the images.
+        window: latest scans and images, reduced to what matching needs.
+        odometry: of the LiDAR.
+        stamps: intervals of both sensors' stamps.
+        image_order, scan_order: which stamps may come next.
+        first_frames: by which a drive is recognized when a tracker is resumed.
+        last_scan: the newest scan.
+        failures: why scans or images in a row could not be used.
+    """
+
+    def __init__(self, camera: PinholeCamera, config: TrackerConfig, searched_scans: int) -> None:
+        """searched_scans: latest scans that a start may be made of."""
+        self.camera, self.config = camera, config
+        self.window = Window(camera, config.window, searched_scans)
+        self.image_order, self.scan_order = StampOrder("image", True), StampOrder("scan", False)
+        self.first_frames = FirstFrames()
+        self.last_scan: Scan | None = None
+        self.failures: deque[str] = deque(maxlen=_MAX_FAILURES)
+        self._restart_motion()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what failed."""
+        return {**vars(self), "failures": deque(maxlen=_MAX_FAILURES)}
+
+    def restart(self) -> None:
+        """Forget scans, images and motion so far."""
+        self._restart_motion()
+        self.window.restart()
+
+    def _restart_motion(self) -> None:
+        self.odometry = LidarOdometry(self.config.calibration.prepare.lidar_odometry)
+        self.stamps = StampMonitor(self.config.alarm.chi2)
+
+    def check_image(self, image: CameraImage) -> tuple[CameraImage, int]:
+        """The image as it may be used, and by how much its clock was set, 0 if it was not [ns].
+
+        Raises:
+            DataError: it cannot be used.
+        """
+        checked = checked_image(image, self.camera)
+        return checked, self.image_order.check(checked.stamp_ns)
+
+    def check_scan(self, scan: Scan) -> tuple[Scan, int]:
+        """The scan as it may be used, and by how much its clock was set, 0 if it was not [ns].
+
+        Raises:
+            DataError: it cannot be used.
+        """
+        checked = checked_scan(scan)
+        return checked, self.scan_order.check(checked.stamp_ns)
+
+    def add_image(self, image: CameraImage, clock_step_ns: int, estimate: OnlineEstimate) -> None:
+        """Put a checked image's contours into the window.
+
+        Raises:
+            DataError: it comes too late.
+        """
+        if clock_step_ns:
+            self.window.forget_images_before(self.window.next_image)
+        check_lateness(image, self.window, estimate.point.offset_s, self.config.late_s)
+        self.image_order.add(image.stamp_ns, clock_step_ns != 0)
+        self.stamps.add_image(image.stamp_ns, self.window.place)
+        calibration = self.config.calibration
+        features = image_features(
+            self.window.next_image, image, calibration.classes, calibration.prepare.picture.use
+        )
+        self.window.add_image(features)
+        self._forget_images(estimate)
+        self.first_frames.add(image)
+
+    def add_scan(self, scan: Scan, clock_step_ns: int, estimate: OnlineEstimate) -> Jump | None:
+        """Put a checked scan's boundary points and motion into the window; a jump of the stamps, if any."""
+        self.scan_order.add(scan.stamp_ns, clock_step_ns != 0)
+        if clock_step_ns:
+            self.restart()
+        jump = self.stamps.add_scan(scan.stamp_ns, self.window.place)
+        calibration = self.config.calibration
+        prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
+        used = calibration.undersides.use != "never"
+        features = scan_features(
+            self.window.next_scan, scan, calibration.classes, prepare, with_lower_edges=used
+        )
+        self.window.add_scan(features, self.odometry.add(scan))
+        self.last_scan = scan
+        self._forget_images(estimate)
+        self.first_frames.add(scan)
+        self.failures.clear()
+        alarm = self.config.alarm
+        return jump if alarm.enabled and alarm.stamps else None
+
+    def failed(self, why: str) -> bool:
+        """Note why a scan or an image could not be used; whether that has gone on for too long."""
+        self.failures.append(why)
+        return len(self.failures) == self.failures.maxlen
+
+    def _forget_images(self, estimate: OnlineEstimate) -> None:
+        """Keep no more images than scans may meet that are there, or still come."""
+        margin_s = self.config.late_s + max(0.0, estimate.point.offset_s)
+        margin_s += 0.0 if estimate.exists else _SEARCH_MARGIN_S
+        self.window.forget_images(round(1e9 * margin_s), _MAX_IMAGES)

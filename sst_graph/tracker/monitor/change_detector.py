@@ -1,0 +1,337 @@
+"""Has the calibration changed? New frames, and those of a start, against an estimate made before or of them.
+
+One test serves both: chi-squared of the frames' scores at the estimate, under a kernel wide enough for a step
+to stay in sight (:mod:`sst_graph.tracker.monitor.statistic`). A start is checked with parts of its own
+frames; from then on each new frame is checked before it is used.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.monitor.confirmation import (
+    DETECTABLE_OFFSET_S,
+    DETECTABLE_TURN_RAD,
+    Confirmation,
+    steps,
+)
+from sst_graph.tracker.monitor.statistic import (
+    CONFIRMATIONS,
+    FRAMES,
+    ChangeStatistic,
+    Estimate,
+    EstimateCovariance,
+)
+from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.matcher import WindowMatcher
+
+_KERNEL = RobustKernel("geman_mcclure", 12.0)
+"""Kernel of the comparison [px]: wide enough for a turn of the camera by 1 degree to stay in sight."""
+_LEAST_SHARE_OF_OTHERS = 0.2
+"""Share of the statistic that must remain without any one object: labels of one car may err for a while."""
+_SINGLE_OBJECT_FACTOR = 4.0
+"""A single object is believed after FRAMES + CONFIRMATIONS frames at this many times the threshold."""
+_MAX_PENDING_FRAMES = 20
+"""Frames in a row past the threshold after which a suspected change is given up: the estimate has followed
+the objects by then, whether they were right or not."""
+_LOST_FRAMES = 8
+"""Frames in a row, but for one, in which next to nothing in view meets the image's labels: the step is larger
+than matches reach."""
+_LOST_SHARE = 0.12
+"""Share of the boundary points in view that is next to nothing."""
+_LEAST_IN_VIEW = 16
+"""Boundary points of an object in view; of fewer, none may meet a contour by chance."""
+_START_CHI2 = 15.0
+"""A start is refused where the statistic of some of its own frames is larger. These frames are part of the
+estimate, so the statistic is well below chi-squared's where they are of one calibration."""
+_WARM_UP_SCANS = 15
+"""Scans after a start in which a contradiction gives up the start and is no alarm."""
+_MAX_REFUSED_STARTS = 2
+"""Starts in a row that are refused because frames contradict them: labels may err as much."""
+_CONFIRM_SPEED_MPS = 3.0
+"""Slower than this a jump of the clock can hardly be seen: such time does not count [m/s]."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """An estimate as it was before some frames were used.
+
+    Attributes:
+        point, covariance: the estimate.
+        scan: number of the first scan that it does not know.
+    """
+
+    point: Point
+    covariance: EstimateCovariance
+    scan: int
+
+
+@dataclass(frozen=True)
+class Change:
+    """The calibration has changed.
+
+    Attributes:
+        near: estimate from before the change.
+        scans: how many of the latest scans are surely from after it.
+        far: the labels have left what ought to be in view: the new calibration may be anywhere.
+    """
+
+    near: Point
+    scans: int
+    far: bool
+
+
+class ChangeDetector:
+    """Compares frames with estimates that were made before them.
+
+    From the first frame past the threshold on, the estimate from before the frames compared is kept as the
+    reference, and all frames since are compared with it: the running estimate uses them, and would follow a
+    step before enough is seen of it.
+
+    Attributes:
+        statistic: of the latest frames.
+        scans: the latest frames that were compared.
+        reference: the estimate from before a suspected change, while there is one.
+        suspected_change: why the statistic is past its threshold without an alarm; empty where it is not.
+        confirmation: when frames last confirmed the estimate.
+        start_unconfirmed: no frames that came after the start have been found to agree with its own.
+        refused_starts: starts in a row that frames contradicted.
+        max_pending: frames in a row past the threshold after which a suspected change is given up.
+        start_threshold: of the statistic of a start's own frames.
+        warm_up_scans: after a start, in which a contradiction gives up the start.
+    """
+
+    def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
+        self.matcher, self.config = matcher, config.alarm
+        sigma_px = config.calibration.joint.graph.object_bias_sigma_px
+        self.statistic = ChangeStatistic(config.alarm.chi2, sigma_px)
+        self.start_threshold, self.warm_up_scans = _START_CHI2, _WARM_UP_SCANS
+        self.max_pending = _MAX_PENDING_FRAMES
+        self.scans: deque[int] = deque(maxlen=_MAX_PENDING_FRAMES)
+        self.reference: Reference | None = None
+        self.suspected_change = ""
+        self.confirmation = Confirmation()
+        self.start_unconfirmed, self.refused_starts = False, 0
+        self._first_recheck = config.start_scans // 2
+        self._start_scan, self._recheck_after = 0, self._first_recheck
+        self._before: deque[Reference] = deque(maxlen=FRAMES)
+        self._unmatched: deque[tuple[bool, frozenset[int]]] = deque(maxlen=_LOST_FRAMES)
+        self._moving: set[int] = set()
+
+    def restart(self) -> None:
+        """Forget the frames: the calibration is estimated anew."""
+        self.statistic.restart()
+        self.scans.clear()
+        self._before.clear()
+        self._unmatched.clear()
+        self.reference, self.suspected_change = None, ""
+
+    # ------------------------------------------------------------------ a start
+
+    def begin(self, scan: int) -> None:
+        """An estimate begins, which its own frames have confirmed; the scan of this number comes next."""
+        self.restart()
+        self.confirmation.begin()
+        self._start_scan, self._recheck_after = scan, self._first_recheck
+        self.start_unconfirmed = self.config.enabled
+
+    def check_start(self, scans: Sequence[int], estimate: Estimate) -> str:
+        """In what way frames contradict the estimate that was made of them; empty where they do not.
+
+        Where the calibration changed among the frames of a start, or where the start was wrong, its estimate
+        lies between two or beside all, with a covariance that knows of neither.
+
+        Args:
+            scans: numbers of the scans in the estimate.
+        """
+        if not self.config.enabled or self.refused_starts >= _MAX_REFUSED_STARTS:
+            return ""
+        value = self._disagreement(scans, estimate, self.matcher.window.dynamics.recently_moving())
+        if value <= self.start_threshold:
+            return ""
+        self.refused_starts += 1
+        return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated anew"
+
+    def recheck_start(self, scan: int, scans: Sequence[int], estimate: Estimate) -> None:
+        """The same when half as many frames again have come, and then each time after twice as many.
+
+        Labels that err for a while contradict a start as a step does, so it is no longer given up; but until
+        its frames agree, the status is not ``ok``.
+        """
+        if self.start_unconfirmed and scan - self._start_scan >= self._recheck_after:
+            self._recheck_after *= 2
+            self._confirm_start(scans, estimate, self._moving, self.start_threshold)
+
+    def check_start_at_end(self, scans: Sequence[int], estimate: Estimate) -> None:
+        """At the end of a drive, the same of all frames in the graph for a start that no frame came after.
+
+        They are more, in more parts, than a start is made of: new frames' threshold holds.
+        """
+        self._confirm_start(scans, estimate, self.matcher.window.dynamics.recently_moving(), self.config.chi2)
+
+    def start_is_over(self, scan: int) -> bool:
+        """Whether a contradiction is a change of the calibration from this scan on, not a wrong start."""
+        return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
+
+    def _confirm_start(
+        self, scans: Sequence[int], estimate: Estimate, moving: Collection[int], threshold: float
+    ) -> None:
+        if self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= threshold:
+            self.refused_starts, self.start_unconfirmed = 0, False
+
+    def _disagreement(self, scans: Sequence[int], estimate: Estimate, moving: Collection[int]) -> float:
+        """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
+
+        The parts are its first ones, its last ones, and any few in a row.
+        """
+        pairs = self.matcher.pairs_at(estimate.point, sorted(scans), _KERNEL)
+        scores = [
+            self.matcher.scores_of({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
+        ]
+        n = len(scores)
+        cuts = range(2, n - 1)
+        parts = {
+            *((0, k) for k in cuts),
+            *((k, n) for k in cuts),
+            *((k, k + FRAMES) for k in range(n - FRAMES + 1)),
+        }
+        found = [[score for own in scores[a:b] for score in own] for a, b in parts]
+        return max((self._value(some, estimate) for some in found if some), default=0.0)
+
+    # ------------------------------------------------------------------ new frames
+
+    def check(self, waiting: Sequence[int], matches: Mapping[int, int], estimate: Estimate) -> float | None:
+        """The statistic of the latest frames with some new ones; None while there are too few.
+
+        Args:
+            waiting: numbers of scans that have had no match yet; those that have an image and were not
+                compared before are compared.
+            matches: how many matches scans have under the narrow kernel.
+            estimate: made without them.
+        """
+        if not self.config.enabled:
+            return None
+        seconds, speed_mps = self.matcher.window.latest_step()
+        self.confirmation.wait(seconds, speed_mps > _CONFIRM_SPEED_MPS)
+        # Objects that moved lately are left out: one that starts or stops may pass for one that is static.
+        self._moving = set(self.matcher.window.dynamics.recently_moving())
+        new = [scan for scan in waiting if scan not in self.scans]
+        if not new:
+            return None
+        # 1. Scans that have an image: does what ought to be in view meet its labels?
+        views = self.matcher.in_view(estimate.point, new, self._moving)
+        self._note_unmatched(views, matches)
+        if not views:
+            return None
+        # 2. Their statistic, against the reference or the running estimate.
+        self.scans.extend(views)
+        self._before.append(Reference(estimate.point, estimate.covariance, min(views)))
+        against = self.reference or self._before[-1]
+        scores = self.matcher.scores(against.point, list(views), _KERNEL, self._moving)
+        value = self.statistic.add(scores, against.covariance, estimate.model)
+        # 3. Keep a reference, or give it up.
+        if self.statistic.exceeded > self.max_pending:
+            self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
+            self.restart()
+        elif not self.statistic.exceeded:
+            self.reference = None
+        elif self.reference is None:
+            self.reference = self._before[0]
+        # 4. Which steps would they have shown?
+        if value is not None and not self.statistic.exceeded and not self.far:
+            self._confirm(estimate)
+        return value
+
+    def change(self, estimate: Estimate) -> Change | None:
+        """The change that the frames so far make certain; what they only suggest is noted.
+
+        Args:
+            estimate: the running one.
+        """
+        self.suspected_change = ""
+        if self.lost:
+            return Change(estimate.point, _LOST_FRAMES, self.far)
+        if self.statistic.confirmed:
+            if self.reference is not None and self._contradicted(self.reference, estimate):
+                return Change(self.reference.point, self.statistic.exceeded, self.far)
+            self.suspected_change = "a single object contradicts the calibration: a step, or wrong labels"
+        elif self.far:
+            self.suspected_change = "what ought to be in view does not meet the image's labels"
+        return None
+
+    @property
+    def lost(self) -> bool:
+        """Whether the image's labels have left what ought to be in view, of two objects or more."""
+        objects = frozenset[int]().union(*(tracks for unmet, tracks in self._unmatched if unmet))
+        return self._is_unmatched(_LOST_FRAMES) and len(objects) > 1
+
+    @property
+    def far(self) -> bool:
+        """Whether the latest frames do not meet the image's labels: a change is a large one then."""
+        return self._is_unmatched(CONFIRMATIONS)
+
+    def before(self, scan: int) -> Point | None:
+        """The latest estimate that was made without a scan, among those from before the latest frames."""
+        known = [before for before in (self.reference, *self._before) if before is not None]
+        earlier = [before for before in known if before.scan <= scan]
+        return earlier[-1].point if earlier else known[0].point if known else None
+
+    def _note_unmatched(self, views: Mapping[int, Mapping[int, int]], matches: Mapping[int, int]) -> None:
+        """views: boundary points in view, by scan and track."""
+        for scan, counts in views.items():
+            large = frozenset(track for track, count in counts.items() if count >= _LEAST_IN_VIEW)
+            if large:
+                self._unmatched.append((matches.get(scan, 0) < _LOST_SHARE * sum(counts.values()), large))
+
+    def _is_unmatched(self, frames: int) -> bool:
+        """Whether so many of the latest frames, but for one of them, do not meet the labels."""
+        latest = [unmet for unmet, _ in self._unmatched][-frames:]
+        return len(latest) == frames and sum(latest) >= frames - 1
+
+    def _confirm(self, estimate: Estimate) -> None:
+        """The latest frames agree with the estimate: note which steps they would have shown."""
+        comparison = self.statistic.latest
+        if unreliable := self.confirmation.unreliable:
+            latest = list(self.scans)[-FRAMES:]
+            scores = self.matcher.scores(estimate.point, latest, _KERNEL, {*unreliable, *self._moving})
+            comparison = None
+            if scores:
+                comparison = self.statistic.compare(scores, estimate.covariance, estimate.model)
+                if self.statistic.normalized(comparison) > self.config.chi2:
+                    return
+        if comparison is not None:
+            tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
+            self.confirmation.add(self.statistic.detectable(comparison, tried))
+
+    def _contradicted(self, reference: Reference, estimate: Estimate) -> bool:
+        """Whether all frames since the reference contradict it.
+
+        They must do so with any one object left out, too. Where a single object contradicts, its labels may
+        err for a while: with one in view, or one that weighs far more than the others, it must do so for
+        longer and much more clearly.
+        """
+        scans = [scan for scan in self.scans if scan >= reference.scan]
+        pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
+        against = Estimate(reference.point, reference.covariance, estimate.model)
+
+        def value(*without: int) -> float:
+            return self._value(
+                self.matcher.scores_of(pairs, reference.point, {*without, *self._moving}), against
+            )
+
+        # A step shows more clearly with every frame; labels whose errors last do not.
+        more = len(scans) / (FRAMES + CONFIRMATIONS)
+        whole, threshold = value(), self.config.chi2 * max(1.0, more)
+        if more >= 1.0 and whole > _SINGLE_OBJECT_FACTOR * threshold:
+            return True
+        least = max(threshold, _LEAST_SHARE_OF_OTHERS * whole)
+        objects = self.matcher.objects_of(scans) - self._moving
+        return whole > least and all(value(track) > least for track in objects)
+
+    def _value(self, scores: Collection[PairScore], estimate: Estimate) -> float:
+        return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))

@@ -1,0 +1,69 @@
+"""What watches a running estimate."""
+
+from __future__ import annotations
+
+from functools import partial
+
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
+from sst_graph.tracker.monitor.adoption import Adoption
+from sst_graph.tracker.monitor.change_detector import ChangeDetector
+from sst_graph.tracker.start.initializer import Restart
+from sst_graph.tracker.start.solution import Guess
+from sst_graph.tracker.window.matcher import WindowMatcher
+
+
+class Monitor:
+    """Change detection, and which calibration to use.
+
+    Attributes:
+        changes: whether the calibration has changed.
+        adoption: the calibration in use, validated on held-out frames.
+    """
+
+    def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
+        self.matcher = matcher
+        self.changes = ChangeDetector(matcher, config)
+        self.adoption = Adoption()
+
+    def begin(self, scan: int) -> None:
+        """An estimate begins; the scan of this number comes next."""
+        self.changes.begin(scan)
+        self.adoption.restart()
+
+    def restart(self) -> None:
+        """The calibration is estimated anew."""
+        self.changes.restart()
+        self.adoption.restart()
+
+    def check(self, matches: FrameMatches, estimate: OnlineEstimate) -> tuple[float | None, Restart | None]:
+        """Compare new frames, before they are used, with the estimate and with the calibration in use.
+
+        Returns:
+            Statistic of the change test, and from where to begin again if the calibration has changed.
+        """
+        counts = {scan: len(matches.found[scan].pair) for scan in matches.new}
+        chi2 = self.changes.check(sorted(matches.waiting), counts, estimate.for_comparison())
+        change = self.changes.change(estimate.for_comparison())
+        if change is not None:
+            if self.changes.start_is_over(matches.scan):
+                near = Guess(change.near.cTl, change.near.offset_s, search=change.far)
+                return chi2, Restart(near, change.scans, "the calibration has changed", True, chi2)
+            self.changes.refused_starts += 1
+            near = Guess(estimate.point.cTl, estimate.point.offset_s)
+            why = "new frames contradict the start: it is estimated anew"
+            return chi2, Restart(near, change.scans, why)
+        if matches.new:
+            cost = partial(self.matcher.cost, chosen=matches.new)
+            self.adoption.add_held_out(cost, estimate.point, estimate.guessed_point)
+        return chi2, None
+
+    def recheck_start(self, scan: int, estimate: OnlineEstimate) -> None:
+        """Now and then: do the frames since the start agree with it?"""
+        assert estimate.smoother is not None
+        self.changes.recheck_start(scan, list(estimate.smoother.entries), estimate.for_comparison())
+
+    def check_start_at_end(self, estimate: OnlineEstimate) -> None:
+        """At the end of a drive: do the frames of a start that no frame came after agree with it?"""
+        assert estimate.smoother is not None
+        self.changes.check_start_at_end(list(estimate.smoother.entries), estimate.for_comparison())

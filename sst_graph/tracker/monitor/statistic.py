@@ -1,0 +1,209 @@
+"""Chi-squared of frames against an estimate that was made without them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.window.gaussian import Point
+
+FloatArray = NDArray[np.float64]
+
+FRAMES = 4
+"""New frames that are compared together: fewer hardly show a turn, more delay the alarm."""
+CONFIRMATIONS = 3
+"""Frames in a row past the threshold that make a change certain."""
+_LEAST_INFORMATION = 1.0
+"""Added to the score's variance [1/rad^2, 1/m^2, 1/s^2, 1/px^2]: at standstill the score of the time offset
+is rounding over rounding, and frames that determine a direction worse than 1 rad, m, s or px do not count."""
+_USUAL_FRAMES = 300
+"""Quiet frames from which the usual size of the statistic is taken: real labels err more than the model."""
+_LEAST_USUAL_FRAMES = 10
+"""Quiet frames before the statistic is scaled by its usual size."""
+
+
+@dataclass(frozen=True)
+class EstimateCovariance:
+    """Covariance of the estimate.
+
+    Attributes:
+        matrix: (n, n) over [extrinsic, offset, biases, object biases].
+        tracks: of the objects.
+        core_size: unknowns before the objects' biases.
+    """
+
+    matrix: FloatArray
+    tracks: tuple[int, ...]
+    core_size: int
+
+    def with_objects(self, places: Mapping[int, int], sigma_px: float) -> FloatArray:
+        """(m, m) covariance of [extrinsic, offset, biases, and the biases of these objects].
+
+        Args:
+            places: place of its class's bias by the object's track.
+            sigma_px: standard deviation of a new object's bias from its class's [px].
+        """
+        source, extra = list(range(self.core_size)), [0.0] * self.core_size
+        for track, place in places.items():
+            known = track in self.tracks
+            source.append(self.core_size + self.tracks.index(track) if known else 7 + place)
+            extra.append(0.0 if known else sigma_px**2)
+        return np.asarray(self.matrix[np.ix_(source, source)] + np.diag(extra))
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate that frames are compared with.
+
+    Attributes:
+        point: the estimate.
+        covariance: of it.
+        model: variances of residuals, for the frames' scores.
+    """
+
+    point: Point
+    covariance: EstimateCovariance
+    model: ErrorModel
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Scores of frames at an estimate that was made without them.
+
+    Where nothing has changed, the gradient g of the frames' cost is zero-mean with variance M + H P H', so
+
+        T = g' (M + H P H')^-1 g
+
+    follows chi-squared over the unknowns, however little the frames determine.
+
+    Attributes:
+        gradient: g (n,) by extrinsic, offset and biases, at the estimate.
+        jacobian: H (n, m) of g by these and by the biases of the objects seen.
+        noise: M (n, n) variance of g by the matches, cluster-robust.
+        prior: P (m, m) covariance of the estimate.
+    """
+
+    gradient: FloatArray
+    jacobian: FloatArray
+    noise: FloatArray
+    prior: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        scores: Collection[PairScore],
+        covariance: EstimateCovariance,
+        model: ErrorModel,
+        object_sigma_px: float,
+    ) -> Comparison:
+        """object_sigma_px: standard deviation of a new object's mask bias from its class's [px]."""
+        n = covariance.core_size
+        places = {track: place for score in scores for track, place in score.places.items()}
+        order = list(places)
+        H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
+        by_side: dict[int, FloatArray] = {}
+        for score in scores:
+            own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
+            H[:, own] += score.belief.information[:n]
+            g += score.belief.vector[:n]
+            M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
+            for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
+                by_side[side] = by_side[side] + row if side in by_side else row
+        if by_side:
+            rows = np.stack(list(by_side.values()))
+            M += model.side * (rows.T @ rows)
+        return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), covariance.with_objects(places, object_sigma_px))
+
+    def chi2(self) -> float:
+        """T of the frames."""
+        return _squared(self.gradient, self.noise + self.jacobian @ self.prior @ self.jacobian.T)
+
+    def chi2_of(self, steps: FloatArray) -> FloatArray:
+        """(k,) T that steps (7, k) of extrinsic and offset would make, were the estimate exact."""
+        biases = self.prior.copy()
+        biases[:7], biases[:, :7] = 0.0, 0.0
+        variance = self.noise + self.jacobian @ biases @ self.jacobian.T
+        return np.array([_squared(gradient, variance) for gradient in (self.jacobian[:, :7] @ steps).T])
+
+
+class ChangeStatistic:
+    """T of the latest frames, divided by its usual size on these data.
+
+    Attributes:
+        threshold: beyond it, frames contradict the estimate.
+        object_sigma_px: standard deviation of a new object's mask bias from its class's [px].
+        recent: scores of the latest frames.
+        usual: T of earlier quiet frames.
+        exceeded: frames in a row past the threshold.
+        latest: the latest comparison; None before one.
+    """
+
+    def __init__(self, threshold: float, object_sigma_px: float = 0.0) -> None:
+        self.threshold, self.object_sigma_px = threshold, object_sigma_px
+        self.recent: deque[PairScore] = deque(maxlen=FRAMES)
+        self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
+        self.exceeded = 0
+        self.latest: Comparison | None = None
+
+    def restart(self) -> None:
+        """Forget the frames, not their usual size: a new calibration begins."""
+        self.recent.clear()
+        self.latest = None
+        self.exceeded = 0
+
+    def add(
+        self, scores: Sequence[PairScore], covariance: EstimateCovariance, model: ErrorModel
+    ) -> float | None:
+        """The statistic with new frames' scores; None while there are too few."""
+        self.recent.extend(scores)
+        if not scores or len(self.recent) < FRAMES:
+            return None
+        self.latest = self.compare(self.recent, covariance, model)
+        T = self.latest.chi2()
+        value = T / self._scale(covariance.core_size)
+        if value > self.threshold:
+            self.exceeded += 1
+        else:
+            self.exceeded = 0
+            self.usual.append(T)
+        return value
+
+    def compare(
+        self, scores: Collection[PairScore], covariance: EstimateCovariance, model: ErrorModel
+    ) -> Comparison:
+        """Scores of any frames against an estimate."""
+        return Comparison.of(scores, covariance, model, self.object_sigma_px)
+
+    def normalized(self, comparison: Comparison) -> float:
+        """T over its usual size."""
+        return comparison.chi2() / self._scale(len(comparison.gradient))
+
+    def detectable(self, comparison: Comparison, steps: FloatArray) -> NDArray[np.bool_]:
+        """(k,) which steps (7, k) of extrinsic and offset would be past the threshold."""
+        least = self.threshold * self._scale(len(comparison.gradient))
+        return np.asarray(comparison.chi2_of(steps) > least)
+
+    @property
+    def confirmed(self) -> bool:
+        """Past the threshold often enough in a row."""
+        return self.exceeded >= CONFIRMATIONS
+
+    def _scale(self, freedom: int) -> float:
+        """How much larger than chi-squared's the usual 90th percentile is; at least 1."""
+        if len(self.usual) < _LEAST_USUAL_FRAMES:
+            return 1.0
+        expected = freedom + 1.28 * float(np.sqrt(2.0 * freedom))
+        return max(1.0, float(np.quantile(self.usual, 0.9)) / expected)
+
+
+def _squared(gradient: FloatArray, variance: FloatArray) -> float:
+    """g' V^-1 g, scaled so that units do not matter."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(variance), 1e-30))
+    scaled = variance * np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
+    return float((scale * gradient) @ np.linalg.solve(scaled, scale * gradient))
