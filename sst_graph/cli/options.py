@@ -127,7 +127,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
     )
     calibrate.add_argument(
-        "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
+        "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)
