@@ -99,7 +99,7 @@ def clock_set(frames: Sequence[Frame], first: int, milliseconds: float) -> list[
 def contradictions_of(source: Source, start: State) -> Contradictions:
     """What the default settings find in a drive, its joint solution sought from ``start``."""
     config = CalibrationConfig()
-    joint = replace(config.joint, graph=replace(config.joint.graph, undersides=tuple(config.classes)))
+    joint = replace(config.joint, graph=replace(config.joint.graph, lower_edges=tuple(config.classes)))
     drives = prepare_drives([source], config)
     objects = [object_tracks(drive) for drive in drives]
     tracks = Tracks(drives, objects)

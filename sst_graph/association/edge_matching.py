@@ -51,13 +51,13 @@ class MatchConfig(Settings):
         mask_sigma_px: deviation of a mask's contour from the object's [px].
         side_sigma_px: error that all matches on one side of one object in one image share [px]; it
             bounds what a side may claim, however many points it has.
-        underside_sigma_px: the same of an object's edge towards the ground [px].
+        lower_edge_sigma_px: the same of an object's edge towards the ground [px].
         top_edges: use boundaries towards the ring above.
     """
 
     mask_sigma_px: float = setting(1.0, at_least=0.01, at_most=100.0)
     side_sigma_px: float = setting(0.7, at_least=0.0, at_most=100.0)
-    underside_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
+    lower_edge_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
     top_edges: bool = True
 
 
@@ -426,7 +426,7 @@ def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
 def side_weights(owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
     sigma^2 / n."""
-    shared_px = np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px)
+    shared_px = np.where(sides == BOTTOM, config.lower_edge_sigma_px, config.side_sigma_px)
     numbers = owners * SIDES + sides
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
     return np.asarray(1.0 / (1.0 + information * shared_px**2))

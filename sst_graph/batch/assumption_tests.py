@@ -247,7 +247,7 @@ def few_objects(objects: int, threshold: float) -> float:
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
 
 
-def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
+def with_test_results(considered: Considered, findings: Sequence[Finding]) -> Considered:
     """What is considered, with the deviations of the parameters that the data leave open."""
     evidence = {
         f.assumption.name: Evidence(
@@ -263,7 +263,7 @@ def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
     return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
 
 
-def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
     """The reason that the data contradict assumptions: the most likely one, and which others would do.
 
     Args:

@@ -89,9 +89,7 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument(
         "--time-offset", type=float, metavar="S", help=f"true time offset in seconds, of either sign: {SIGN}"
     )
-    simulate.add_argument(
-        "--delay", dest="time_offset", type=float, help=argparse.SUPPRESS
-    )
+    simulate.add_argument("--delay", dest="time_offset", type=float, help=argparse.SUPPRESS)
     motions = "mixed, standing, constant, stop_and_go, no_stop, turning, there_and_back"
     simulate.add_argument("--motion", metavar="NAME", help=motions)
     simulate.add_argument("--label-noise", type=float, metavar="LEVEL", help="0: exact, 1: usual, 2: poor")
@@ -131,7 +129,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
     )
     calibrate.add_argument(
-        "--delay-per-drive", action="store_true", default=None, help="one time offset for each drive"
+        "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sst_graph.export.formats import FORMATS, ExportOptions, export_text
 from sst_graph.export.marginal import (
-    DELAY,
     EXTRINSIC,
+    TIME_OFFSET,
     CalibrationMarginal,
     fuse_graphs,
     fuse_marginals,
@@ -15,7 +15,7 @@ from sst_graph.export.marginal import (
 )
 
 __all__ = [
-    "DELAY",
+    "TIME_OFFSET",
     "EXTRINSIC",
     "FORMATS",
     "CalibrationMarginal",

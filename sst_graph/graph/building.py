@@ -24,11 +24,11 @@ from sst_graph.graph.state import (
     EXTRINSIC,
     State,
     bias_key,
+    lower_edge_track,
     nuisance_key,
     object_bias_key,
     time_offset_key,
     twist_key,
-    underside_track,
 )
 from sst_graph.types import SemanticClass
 
@@ -185,7 +185,7 @@ def _add_biases(
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))
     for drive, c, track in objects:
         key = object_bias_key(drive, track)
-        sigma_px = LOWER_EDGE_BIAS_SIGMA_PX if track == underside_track(c) else config.object_bias_sigma_px
+        sigma_px = LOWER_EDGE_BIAS_SIGMA_PX if track == lower_edge_track(c) else config.object_bias_sigma_px
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_px)
         graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))
         values.insert(key, np.array([state.object_bias_px(drive, track, c)]))

@@ -37,7 +37,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
-from sst_graph.graph.state import State, underside_track
+from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import (
     DynamicObject,
     dynamic_object_weights,
@@ -62,7 +62,7 @@ class GraphConfig(Settings):
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
             of a class the same bias.
         time_offset_sigma_s: prior deviation of the time offset from the guess [s].
-        undersides: classes whose edges towards the ground are matched too; chosen by
+        lower_edges: classes whose edges towards the ground are matched too; chosen by
             :mod:`sst_graph.batch.lower_edges`.
         estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
             the settings of the assumptions.
@@ -72,7 +72,7 @@ class GraphConfig(Settings):
     bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
     object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
     time_offset_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
-    undersides: tuple[SemanticClass, ...] = internal(())
+    lower_edges: tuple[SemanticClass, ...] = internal(())
     estimate: tuple[str, ...] = internal(())
 
     def __post_init__(self) -> None:
@@ -146,7 +146,9 @@ class Tracks:
         found = zip(drives, objects, strict=True) if objects is not None else ()
         self._dynamic = [_by_scan(find_dynamic_objects(drive, tracks)) for drive, tracks in found]
 
-    def with_objects(self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]) -> Tracks:
+    def with_objects(
+        self, objects: Mapping[ObjectId, int], dynamic: Mapping[ObjectId, DynamicObject]
+    ) -> Tracks:
         """The same twists of one drive, with other object tracks and dynamic objects."""
         other = Tracks([])
         other._tracks, other.objects, other._dynamic = self._tracks, [objects], [_by_scan(dynamic)]
@@ -212,7 +214,7 @@ class DriveEdges:
         groups = [
             (k, c, points)
             for k, scan in enumerate(drive.scans)
-            for c, points in outlines(scan, config.undersides).items()
+            for c, points in outlines(scan, config.lower_edges).items()
             if len(points)
         ]
         if not groups:
@@ -446,12 +448,12 @@ class DriveMatches:
 
     @cached_property
     def tracks(self) -> IntArray | None:
-        """(m,) track whose mask bias each match has: its object's or the undersides' of its class; None where
+        """(m,) track whose mask bias each match has: its object's or the lower edges' of its class; None where
         objects share their class's."""
         own = self.outlines.own_tracks
         if own is None:
             return None
-        below = np.repeat([underside_track(c) for c in self.group_classes], self.counts)
+        below = np.repeat([lower_edge_track(c) for c in self.group_classes], self.counts)
         return np.where(self.found.sides == BOTTOM, below, own[self.points])
 
     @property

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from sst_graph.inspect.budget_words import budget_lines, estimated_lines
+from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 from sst_graph.metrics import (
     CalibrationErrors,
     euler_angles_deg,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from sst_graph.batch.assumption_tests import contradiction_of
+from sst_graph.batch.assumption_tests import contradiction_sentence
 from sst_graph.covariance.observability import open_directions
 from sst_graph.result import WeakDirection
 from sst_graph.tracker.track_update import TrackStatus, TrackUpdate
@@ -27,7 +27,7 @@ def answer(
     """
     estimate, changes = tracker.estimate, tracker.monitor.changes
     point, covariance = estimate.point, estimate.reported_covariance()
-    confirmation, contradictions = changes.confirmation, contradiction_of(estimate.tests.findings)
+    confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.tests.findings)
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
     if estimate.exists:

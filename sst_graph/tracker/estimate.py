@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.assumption_tests import told_by
+from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.covariance.considered import Considered, considered
 from sst_graph.errors import EstimationError
 from sst_graph.graph.convergence import FULL_STEPS
@@ -159,7 +159,7 @@ class OnlineEstimate:
     def considered(self) -> Considered:
         """How the present estimate depends on the assumptions that are not estimated beside it."""
         beside = considered(self.uncertainty.steps, self.config.calibration.assumptions)
-        return told_by(beside, self.tests.findings)
+        return with_test_results(beside, self.tests.findings)
 
     def for_comparison(self) -> Estimate:
         """The running estimate as frames are compared with it."""

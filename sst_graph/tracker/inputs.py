@@ -108,7 +108,7 @@ class SensorInputs:
         jump = self.stamps.add_scan(scan.stamp_ns, self.window.place)
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
-        used = calibration.undersides.use != "never"
+        used = calibration.lower_edges.use != "never"
         features = scan_features(
             self.window.next_scan, scan, calibration.classes, prepare, with_lower_edges=used
         )

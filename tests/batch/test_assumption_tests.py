@@ -9,6 +9,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from sst_graph.inspect.budget_text import budget_lines
 from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
@@ -24,7 +25,6 @@ from sst_graph.experiments.wrong_drives import with_focal
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
-from sst_graph.inspect.budget_words import budget_lines
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 

@@ -8,6 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from sst_graph.inspect.inspection_text import inspection_text
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -15,7 +16,6 @@ from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.inspection_words import inspection_text
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.tracker.window.arrivals import Arrivals
 

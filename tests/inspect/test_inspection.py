@@ -8,6 +8,12 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from sst_graph.inspect.inspection_text import (
+    correlation_sentence,
+    frame_list,
+    inspection_text,
+    short,
+)
 
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.factors.camera import PinholeCamera
@@ -23,12 +29,6 @@ from sst_graph.inspect.inspection import (
     telling_frames,
     to_dict,
     weakest_direction,
-)
-from sst_graph.inspect.inspection_words import (
-    correlation_sentence,
-    frame_list,
-    inspection_text,
-    short,
 )
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 

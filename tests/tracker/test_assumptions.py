@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
-from sst_graph.batch.assumption_tests import told_by
+from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, consider
@@ -114,7 +114,7 @@ def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> 
         graph, values, pairs, state, [settled.inputs.window.objects_of(list(entries))[0]]
     )
     plain = consider(robust, pairs, values, state, settled.setup.config.calibration.assumptions)
-    expected = told_by(plain, settled.estimate.tests.findings)
+    expected = with_test_results(plain, settled.estimate.tests.findings)
     found = settled.estimate.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
     scale = np.sqrt(np.diag(settled.estimate.covariance)[:7])
@@ -246,7 +246,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     tracks = object_tracks(drive)
     joint = dataclasses.replace(
         config.joint,
-        graph=dataclasses.replace(config.joint.graph, undersides=estimating.matcher.graph.undersides),
+        graph=dataclasses.replace(config.joint.graph, lower_edges=estimating.matcher.graph.lower_edges),
     )
     start = State(bent.truth.cTl, (0.04,))
     solution = solve_joint(JointProblem([drive], Tracks([drive], [tracks]), joint), start)

@@ -184,10 +184,10 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     assert resumed.estimate.point.cTl.equals(kept.estimate.point.cTl, 1e-12)
     assert resumed.estimate.point.offset_s == kept.estimate.point.offset_s
     np.testing.assert_allclose(resumed.estimate.covariance, kept.estimate.covariance, rtol=1e-12)
-    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.undersides
+    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.lower_edges
     for (_, a), (_, b) in zip(resumed.inputs.window.scans, kept.inputs.window.scans, strict=True):
-        assert {c: len(points) for c, points in a.undersides.items()} == {
-            c: len(points) for c, points in b.undersides.items()
+        assert {c: len(points) for c, points in a.lower_edges.items()} == {
+            c: len(points) for c, points in b.lower_edges.items()
         }
     for frame in frames[20:]:
         kept.add(frame)

@@ -265,7 +265,7 @@ def prior_gaussian(
 ) -> Gaussian:
     """The batch's own weak priors around the guess, linearized at a point.
 
-    A class's mask bias is around 0, that of its undersides around the class's; an estimated parameter of an
+    A class's mask bias is around 0, that of its lower edges around the class's; an estimated parameter of an
     assumption is around 0.
     """
     estimated = dict(named_sigmas(config.estimate))
