@@ -101,7 +101,7 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
     """What the default settings find in a drive, its joint solution sought from ``start``."""
     config = CalibrationConfig()
     joint = replace(
-        narrowed(config.joint), graph=replace(config.joint.graph, undersides=tuple(config.classes))
+        narrowed(config.joint), graph=replace(config.joint.graph, lower_edges=tuple(config.classes))
     )
     drives = prepare_drives([source], config)
     objects = [object_tracks(drive) for drive in drives]

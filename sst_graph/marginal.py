@@ -34,7 +34,7 @@ MAX_INFORMATION = 1e24
 
 EXTRINSIC = int(gtsam.symbol("E", 0))
 """Default key of the extrinsic cTl (Pose3)."""
-DELAY = int(gtsam.symbol("D", 0))
+TIME_OFFSET = int(gtsam.symbol("D", 0))
 """Default key of the time offset (``Vector(1)``)."""
 
 _ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
@@ -57,7 +57,7 @@ class CalibrationMarginal(ByValue):
     vector: FloatArray
     constant: float = 0.0
 
-    def factor(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> gtsam.LinearContainerFactor:
+    def factor(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.LinearContainerFactor:
         """The cost as a factor on the given keys; it pickles and serializes, and needs gtsam only."""
         L, g = self.information, self.vector
         hessian = gtsam.HessianFactor(
@@ -65,7 +65,7 @@ class CalibrationMarginal(ByValue):
         )
         return gtsam.LinearContainerFactor(hessian, self.point(E_key, D_key))
 
-    def point(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> gtsam.Values:
+    def point(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> gtsam.Values:
         """The linearization point as values."""
         values = gtsam.Values()
         values.insert(E_key, self.cTl)
@@ -103,7 +103,7 @@ class CalibrationMarginal(ByValue):
         """Whether both are linearized at the very same point."""
         return self.offset_s == other.offset_s and self.cTl.equals(other.cTl, 0.0)
 
-    def to_json(self, E_key: int = EXTRINSIC, D_key: int = DELAY) -> str:
+    def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:
         """The marginal as documented in docs/export.md."""
         document = {
             "format": FORMAT,

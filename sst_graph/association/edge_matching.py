@@ -44,7 +44,7 @@ class MatchConfig(Settings):
         mask_sigma_px: deviation of a mask's contour from the object's [px].
         side_sigma_px: error that all matches on one side of one object in one image share [px]; it
             bounds what a side may claim, however many points it has.
-        underside_sigma_px: the same of an object's edge towards the ground [px].
+        lower_edge_sigma_px: the same of an object's edge towards the ground [px].
         gate: farthest match, in units of the kernel's scale.
         min_cosine: least agreement between the contour's normal and the way out of the object.
         min_object_share: an object of whose boundary in view less than this share finds a match is left out.
@@ -53,7 +53,7 @@ class MatchConfig(Settings):
 
     mask_sigma_px: float = setting(1.0, at_least=0.01, at_most=100.0)
     side_sigma_px: float = setting(0.7, at_least=0.0, at_most=100.0)
-    underside_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
+    lower_edge_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
     gate: float = setting(3.0, at_least=0.1, at_most=100.0)
     min_cosine: float = setting(0.5, at_least=0.0, less_than=1.0)
     min_object_share: float = setting(0.1, at_least=0.0, at_most=1.0)
@@ -376,7 +376,7 @@ def _shared_weights(
 ) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
     sigma^2 / n."""
-    shared_px = np.where(sides == BOTTOM, config.underside_sigma_px, config.side_sigma_px)
+    shared_px = np.where(sides == BOTTOM, config.lower_edge_sigma_px, config.side_sigma_px)
     numbers = owners * SIDES + sides
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
     return np.asarray(1.0 / (1.0 + information * shared_px**2))

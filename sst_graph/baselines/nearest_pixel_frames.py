@@ -23,9 +23,9 @@ from sst_graph.types import SemanticClass
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
 
-DELAY = time_offset_key(0)
+TIME_OFFSET = time_offset_key(0)
 
-DELAY_SIGMA_S = 1.0
+TIME_OFFSET_SIGMA_S = 1.0
 """Prior deviation of the time offset where nothing measures it [s]."""
 REST_SIGMAS = np.repeat([1.0, 3.0], 3)
 """Deviations [rad, m] that only keep the covariance of an unseen direction finite."""
@@ -172,18 +172,20 @@ def step_once(
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for frame, alignments in frame_alignments(frames, at, pixel_weight, max_px):
-        graph.add(frame_factor(alignments, EXTRINSIC, DELAY if offset_free else at.offset_s, frame.c_twist))
+        graph.add(
+            frame_factor(alignments, EXTRINSIC, TIME_OFFSET if offset_free else at.offset_s, frame.c_twist)
+        )
     values.insert(EXTRINSIC, at.cTl)
     if beta is not None:
         graph.add(beta)
     if offset_free:
-        graph.add(time_offset_prior(DELAY, at.offset_s, DELAY_SIGMA_S))
-        values.insert(DELAY, np.array([at.offset_s]))
+        graph.add(time_offset_prior(TIME_OFFSET, at.offset_s, TIME_OFFSET_SIGMA_S))
+        values.insert(TIME_OFFSET, np.array([at.offset_s]))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, _single_step())
     optimizer.iterate()
     moved = optimizer.values()
     return Calibration(
-        moved.atPose3(EXTRINSIC), float(moved.atVector(DELAY)[0]) if offset_free else at.offset_s
+        moved.atPose3(EXTRINSIC), float(moved.atVector(TIME_OFFSET)[0]) if offset_free else at.offset_s
     )
 
 
@@ -206,17 +208,17 @@ def frozen_covariance(
     matched = frame_alignments(frames, at, pixel_weight, max_px)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(EXTRINSIC, at.cTl)
-    values.insert(DELAY, np.array([at.offset_s]))
+    values.insert(TIME_OFFSET, np.array([at.offset_s]))
     fitted = gtsam.NonlinearFactorGraph()
     for frame, alignments in matched:
-        fitted.add(frame_factor(alignments, EXTRINSIC, DELAY, frame.c_twist))
+        fitted.add(frame_factor(alignments, EXTRINSIC, TIME_OFFSET, frame.c_twist))
     rows = sum(2.0 * float(np.sum(a.weights)) for _, alignments in matched for a in alignments)
     mean_square = max(2.0 * fitted.error(values) / rows, 1e-6)
     for frame, alignments in matched:
         scaled = [replace(a, weights=np.asarray(a.weights) / mean_square) for a in alignments]
-        graph.add(frame_factor(scaled, EXTRINSIC, DELAY, frame.c_twist))
-    graph.add(time_offset_prior(DELAY, at.offset_s, DELAY_SIGMA_S))
+        graph.add(frame_factor(scaled, EXTRINSIC, TIME_OFFSET, frame.c_twist))
+    graph.add(time_offset_prior(TIME_OFFSET, at.offset_s, TIME_OFFSET_SIGMA_S))
     rest = gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, at.cTl, rest))
-    covariance = marginal_covariance(graph, values, Unknowns((EXTRINSIC, DELAY)))
+    covariance = marginal_covariance(graph, values, Unknowns((EXTRINSIC, TIME_OFFSET)))
     return 0.5 * (covariance + covariance.T)

@@ -16,7 +16,7 @@ from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
-class ChallengeConfig(Settings):
+class SecondSearchConfig(Settings):
     """When an answer is believed.
 
     Attributes:
@@ -37,7 +37,7 @@ class Challenge:
     answer: float
     best: float
 
-    def doubts(self, config: ChallengeConfig) -> list[str]:
+    def doubts(self, config: SecondSearchConfig) -> list[str]:
         """Why the answer is not to be believed, in sentences; none for one that stands."""
         found = []
         if self.answer < self.start:

@@ -189,9 +189,7 @@ class LinearProblem:
             self.state,
             cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
             offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
-            nuisances={
-                name: value for name, value in self.state.nuisances.items() if name not in self.values
-            }
+            nuisances={name: value for name, value in self.state.nuisances.items() if name not in self.values}
             | {finding.assumption.name: finding.value},
         )
 
@@ -249,7 +247,7 @@ def few_objects(objects: int, threshold: float) -> float:
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
 
 
-def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
+def with_test_results(considered: Considered, findings: Sequence[Finding]) -> Considered:
     """What is considered, with the deviations of the parameters that the data leave open."""
     evidence = {
         f.assumption.name: Evidence(
@@ -265,7 +263,7 @@ def told_by(considered: Considered, findings: Sequence[Finding]) -> Considered:
     return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
 
 
-def contradiction_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
     """The reason that the data contradict assumptions: the most likely one, and which others would do.
 
     Args:

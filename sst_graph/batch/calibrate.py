@@ -16,15 +16,15 @@ from sst_graph.batch.assumption_tests import (
     SolvedProblem,
     assumption_report,
     check_assumptions,
-    contradiction_of,
+    contradiction_sentence,
     estimated_report,
-    told_by,
+    with_test_results,
 )
 from sst_graph.batch.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.lower_edges import WithUndersides, with_undersides, without_undersides
+from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges, without_lower_edges
 from sst_graph.batch.motion_answer import answer_motion
 from sst_graph.batch.motion_factor import Labels, WithMotion, with_motion
 from sst_graph.batch.parts import Parts
@@ -107,8 +107,8 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
-    if config.method != "joint" or config.undersides.use == "never":
-        prepare = without_undersides(prepare)
+    if config.method != "joint" or config.lower_edges.use == "never":
+        prepare = without_lower_edges(prepare)
     depth = config.method in _NEED_DEPTH
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
@@ -147,16 +147,16 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
     if not config.classes:
         raise ConfigError("classes: found none, expected one or more")
     names = [source.name for source in sources]
-    if len(set(names)) < len(names) and config.delay_per_drive:
-        raise ConfigError(f"delay_per_drive needs drives of different names, found {names}")
-    if config.delay_per_drive and config.method != "joint":
-        raise ConfigError(f"delay_per_drive needs method joint, found {config.method}")
-    if config.delay_per_drive and config.use_motion == "always":
-        raise ConfigError("use_motion always knows one time offset only: leave out delay_per_drive")
+    if len(set(names)) < len(names) and config.time_offset_per_drive:
+        raise ConfigError(f"time_offset_per_drive needs drives of different names, found {names}")
+    if config.time_offset_per_drive and config.method != "joint":
+        raise ConfigError(f"time_offset_per_drive needs method joint, found {config.method}")
+    if config.time_offset_per_drive and config.use_motion == "always":
+        raise ConfigError("use_motion always knows one time offset only: leave out time_offset_per_drive")
 
 
 def _may_hear_motion(config: CalibrationConfig) -> bool:
-    return config.method == "joint" and config.use_motion != "never" and not config.delay_per_drive
+    return config.method == "joint" and config.use_motion != "never" and not config.time_offset_per_drive
 
 
 def answer_joint(
@@ -178,7 +178,7 @@ def answer_joint(
     evidence["concentration"] = concentration(finals[0], drives, tracks, config.joint)
     # 3. Edges towards the ground, where the labels agree about them.
     best = rivals(finals, guess.cTl, guess.offset_s, config.start)
-    below = with_undersides(drives, tracks, best, config.joint, config.undersides, progress)
+    below = with_lower_edges(drives, tracks, best, config.joint, config.lower_edges, progress)
     config, finals = replace(config, joint=below.joint), below.solutions
     solution = finals[0]
     # 4. Do the drives agree, and the stretches of each?
@@ -186,7 +186,7 @@ def answer_joint(
     contradictions = find_contradictions(parts, config.contradictions)
     # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
-    covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
+    covariance, by_static_objects = robust.matrix, standing_covariance(robust, solution.pairs)
     labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
     heard = _hear_motion(drives, tracks, labels, guess, config, progress)
     if heard.solution is not solution:
@@ -194,13 +194,13 @@ def answer_joint(
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
-            by_standing = standing_covariance(robust, solution.pairs)
+            by_static_objects = standing_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
     problem = SolvedProblem(drives, tracks, objects, solution, config.joint, centre)
     findings = check_assumptions(problem, config.assumptions)
-    considered = told_by(consider(robust, *frozen, config.assumptions), findings)
+    considered = with_test_results(consider(robust, *frozen, config.assumptions), findings)
     size = 6 + len(solution.state.offsets_s)
     motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
     parts_of_sigma = budget(covariance, motion, considered)
@@ -213,16 +213,16 @@ def answer_joint(
         sweeps.covariance,
         _frames_used(drives, solution),
         remarks=(*_remarks(drives), *heard.remarks),
-        by_standing=by_standing[:7, :7],
+        by_static_objects=by_static_objects[:7, :7],
         doubts=(
-            *contradiction_of(findings),
+            *contradiction_sentence(findings),
             *_doubts(solution, finals, covariance, evidence, guess, config),
             *contradictions.sentences,
             *heard.doubts,
             *sweeps.doubts,
         ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
-        by_drive=_by_drive(drives, solution, covariance, by_standing, config),
+        by_drive=_by_drive(drives, solution, covariance, by_static_objects, config),
         diagnostics={
             **evidence,
             "start_score": contest.score,
@@ -237,7 +237,7 @@ def answer_joint(
 
 
 def _numbers(
-    drives: Sequence[Drive], solution: JointSolution, below: WithUndersides, robust: RobustCovariance
+    drives: Sequence[Drive], solution: JointSolution, below: WithLowerEdges, robust: RobustCovariance
 ) -> dict[str, Any]:
     """JSON-able numbers about a joint solution."""
     model = robust.model
@@ -248,8 +248,8 @@ def _numbers(
         "mask_bias_px": {
             f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
         },
-        "underside_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
-        "undersides": [c.name.lower() for c in below.joint.graph.undersides],
+        "lower_edge_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
+        "lower_edges": [c.name.lower() for c in below.joint.graph.lower_edges],
         "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
         FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
     }
@@ -297,7 +297,7 @@ def _finals(
     Raises:
         EstimationError: none of them leads anywhere.
     """
-    clocks = len(drives) if config.delay_per_drive else 1
+    clocks = len(drives) if config.time_offset_per_drive else 1
     joint = narrowed(config.joint) if config.start.enabled else config.joint
     starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in contest.finalists]
     centred = [(start, prior_centre(start, guess.cTl, guess.offset_s)) for start in starts]
@@ -395,14 +395,14 @@ def _by_drive(
     drives: Sequence[Drive],
     solution: JointSolution,
     covariance: FloatArray,
-    by_standing: FloatArray,
+    by_static_objects: FloatArray,
     config: CalibrationConfig,
 ) -> tuple[DriveKnowledge, ...]:
     """What is known of the extrinsic and each drive's own offset, where drives have one each."""
     found = []
     for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
         own = [*range(6), 6 + number]
-        block, standing = covariance[np.ix_(own, own)], by_standing[np.ix_(own, own)]
+        block, standing = covariance[np.ix_(own, own)], by_static_objects[np.ix_(own, own)]
         block = block + _beside_matches(solution, float(block[6, 6]), config)
         found.append(DriveKnowledge(drives[number].name, block, standing))
     return tuple(found)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from sst_graph.baselines.second_search import ChallengeConfig
+from sst_graph.baselines.second_search import SecondSearchConfig
 from sst_graph.baselines.semalign import SemAlignConfig
 from sst_graph.baselines.sst_calib import PaperConfig
 from sst_graph.batch.contradictions import ContradictionConfig
-from sst_graph.batch.lower_edges import UndersideConfig
+from sst_graph.batch.lower_edges import LowerEdgesConfig
 from sst_graph.config import Settings
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.observability import ObservabilityConfig
@@ -34,7 +34,7 @@ class CalibrationConfig(Settings):
             ``semalign`` (sampled starts, points to pixels), ``motion`` (LiDAR odometry
             against visual odometry).
         classes: semantic classes to align.
-        delay_per_drive: each drive has a time offset of its own, instead of one for all.
+        time_offset_per_drive: each drive has a time offset of its own, instead of one for all.
         use_motion: whether method joint also hears what camera and LiDAR motion say (hand-eye), as a factor
             and as a check. ``auto``: where the labels alone tell all seven unknowns (a direction that only
             the motion tells stays reported as unobservable), and the points of a scan share one time (a
@@ -43,7 +43,7 @@ class CalibrationConfig(Settings):
         prepare: what is taken from every frame.
         start: the search for a start.
         joint: the outer and inner loop.
-        undersides: when method joint matches edges towards the ground.
+        lower_edges: when method joint matches edges towards the ground.
         paper: both stages of the paper.
         semalign: sampled starts.
         motion: hand-eye calibration.
@@ -61,17 +61,17 @@ class CalibrationConfig(Settings):
 
     method: Method = "joint"
     classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
-    delay_per_drive: bool = False
+    time_offset_per_drive: bool = False
     use_motion: UseMotion = "auto"
     sweep: SweepConfig = field(default_factory=SweepConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
     joint: JointConfig = field(default_factory=JointConfig)
-    undersides: UndersideConfig = field(default_factory=UndersideConfig)
+    lower_edges: LowerEdgesConfig = field(default_factory=LowerEdgesConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
-    challenge: ChallengeConfig = field(default_factory=ChallengeConfig)
+    challenge: SecondSearchConfig = field(default_factory=SecondSearchConfig)
     assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

@@ -2,7 +2,7 @@
 
 They tell roll and height better than any other edge. But some labels end an object at its body, others
 at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Nothing but
-the data tells which: where the two sorts of labels agree, most undersides lie within the narrow kernel of
+the data tells which: where the two sorts of labels agree, most lower edges lie within the narrow kernel of
 the last iterations; where they do not, distances are spread as widely as a kernel can see.
 """
 
@@ -30,7 +30,7 @@ from sst_graph.types import SemanticClass
 
 
 @dataclass(frozen=True)
-class UndersideConfig(Settings):
+class LowerEdgesConfig(Settings):
     """When edges towards the ground are matched.
 
     Attributes:
@@ -47,19 +47,19 @@ class UndersideConfig(Settings):
     kernel_px: tuple[float, ...] = setting((5.0, 4.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100))
 
 
-def without_undersides(prepare: PrepareConfig) -> PrepareConfig:
+def without_lower_edges(prepare: PrepareConfig) -> PrepareConfig:
     """Settings for those who never match edges towards the ground: they are not looked for."""
     return replace(prepare, boundary=replace(prepare.boundary, bottom_edges=False))
 
 
 @dataclass(frozen=True)
-class WithUndersides:
-    """Joint solutions after their undersides were looked at.
+class WithLowerEdges:
+    """Joint solutions after their lower edges were looked at.
 
     Attributes:
         solutions: with them among the matches, or as they were; the one that agrees best first.
         joint: settings that lead to it.
-        concentration: of the undersides of each class that has any.
+        concentration: of the lower edges of each class that has any.
     """
 
     solutions: Sequence[JointSolution]
@@ -67,14 +67,14 @@ class WithUndersides:
     concentration: Mapping[SemanticClass, float] = field(default_factory=dict)
 
 
-def with_undersides(
+def with_lower_edges(
     drives: Sequence[Drive],
     tracks: Tracks,
     finals: Sequence[tuple[JointSolution, State]],
     joint: JointConfig,
-    config: UndersideConfig,
+    config: LowerEdgesConfig,
     progress: Progress | None = None,
-) -> WithUndersides:
+) -> WithLowerEdges:
     """Joint solutions with the edges towards the ground, of classes whose labels agree about them.
 
     Args:
@@ -84,27 +84,27 @@ def with_undersides(
         EstimationError: too few matches at any step.
     """
     solutions = [solution for solution, _ in finals]
-    chosen, concentration = agreed_undersides(drives, tracks, solutions[0].state, joint, config)
+    chosen, concentration = agreed_lower_edges(drives, tracks, solutions[0].state, joint, config)
     if not chosen:
-        return WithUndersides(solutions, joint, concentration)
-    joint = replace(joint, graph=replace(joint.graph, undersides=chosen))
+        return WithLowerEdges(solutions, joint, concentration)
+    joint = replace(joint, graph=replace(joint.graph, lower_edges=chosen))
     last = replace(joint, kernel_px=config.kernel_px)
     fuller = solve_all(drives, [(one.state, centre) for one, centre in finals], last, tracks, progress)
-    return WithUndersides(fuller, joint, concentration)
+    return WithLowerEdges(fuller, joint, concentration)
 
 
-def agreed_undersides(
-    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: UndersideConfig
+def agreed_lower_edges(
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: LowerEdgesConfig
 ) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
     """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
     if config.use == "never":
         return (), {}
-    return underside_support(drives, tracks, state, joint).agreed(config)
+    return lower_edge_support(drives, tracks, state, joint).agreed(config)
 
 
 @dataclass(frozen=True)
-class UndersideSupport:
-    """Support of each class's undersides: the matches, each counted by its robust weight.
+class LowerEdgeSupport:
+    """Support of each class's lower edges: the matches, each counted by its robust weight.
 
     Attributes:
         narrow, wide: under the last kernel and under a wide one.
@@ -113,11 +113,13 @@ class UndersideSupport:
     narrow: Mapping[SemanticClass, float] = field(default_factory=dict)
     wide: Mapping[SemanticClass, float] = field(default_factory=dict)
 
-    def plus(self, other: UndersideSupport) -> UndersideSupport:
+    def plus(self, other: LowerEdgeSupport) -> LowerEdgeSupport:
         """That of these scans and others."""
-        return UndersideSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
+        return LowerEdgeSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
 
-    def agreed(self, config: UndersideConfig) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
+    def agreed(
+        self, config: LowerEdgesConfig
+    ) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
         """Classes whose labels agree, and the share of the wide support that remains under the last kernel.
 
         Classes with too little support under the last kernel are left out.
@@ -135,12 +137,12 @@ def _summed(a: Mapping[SemanticClass, float], b: Mapping[SemanticClass, float]) 
     return {c: a.get(c, 0.0) + b.get(c, 0.0) for c in {*a, *b}}
 
 
-def underside_support(
+def lower_edge_support(
     drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig
-) -> UndersideSupport:
-    """Support of the undersides of some scans at a state."""
-    classes = {c for drive in drives for scan in drive.scans for c in scan.undersides}
-    graph = replace(joint.graph, undersides=tuple(sorted(classes)))
+) -> LowerEdgeSupport:
+    """Support of the lower edges of some scans at a state."""
+    classes = {c for drive in drives for scan in drive.scans for c in scan.lower_edges}
+    graph = replace(joint.graph, lower_edges=tuple(sorted(classes)))
     outlines = outlines_of(drives, tracks, graph)
     narrow, wide = (
         support_of(
@@ -150,4 +152,4 @@ def underside_support(
         )
         for scale in CONCENTRATION_SCALES
     )
-    return UndersideSupport(narrow, wide)
+    return LowerEdgeSupport(narrow, wide)

@@ -99,14 +99,14 @@ def with_motion(
             said = _of_stretch(drives, worst, state)
             return WithMotion(solution, diagnostics={"left_out": said, **facts}, remarks=(said,))
     # 3. Silhouettes once more, the motion among the factors.
-    belief = belief_factor(motion.state, motion.covariance)
+    belief = gaussian_factor(motion.state, motion.covariance)
     last_scale = replace(config.joint, kernel_px=config.joint.kernel_px[-1:])
     fused = solve_joint(drives, state, last_scale, progress, guess, tracks, belief)
     inflation = apart / len(step) if apart > _UNLIKELY_CHI2 else 1.0
     return WithMotion(fused, inflation=inflation, diagnostics={"fused": True, **facts})
 
 
-def belief_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:
+def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:
     """[Log(E_0^-1 E); D - D_0] with a (7, 7) covariance, linear about the state (E_0, D_0)."""
     root = np.linalg.inv(np.linalg.cholesky(covariance))
     unit = gtsam.noiseModel.Unit.Create(7)

@@ -189,7 +189,7 @@ def with_points(drive: Drive, M: FloatArray) -> Drive:
 
     def scan(s: ScanFeatures) -> ScanFeatures:
         edges = {c: replace(b, lPs=moved(b.lPs), outward=moved(b.outward)) for c, b in s.boundaries.items()}
-        return replace(s, boundaries=edges, undersides={}, lPs=moved(s.lPs))
+        return replace(s, boundaries=edges, lower_edges={}, lPs=moved(s.lPs))
 
     def motion(pose: gtsam.Pose3) -> gtsam.Pose3:
         return gtsam.Pose3(gtsam.Rot3.ClosestTo(M @ pose.rotation().matrix() @ M.T), M @ pose.translation())

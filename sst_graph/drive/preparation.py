@@ -69,7 +69,7 @@ class ScanFeatures:
         lPs, classes, offsets_s: (n, 3), (n,), (n,) a sample of its labelled points [m], [s].
         depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
             features are not tracked [m], [s].
-        undersides: boundary points of each class towards the ground, of objects that have others too.
+        lower_edges: boundary points of each class towards the ground, of objects that have others too.
     """
 
     stored_apart: ClassVar[bool] = True
@@ -82,7 +82,7 @@ class ScanFeatures:
     offsets_s: FloatArray
     depth_lPs: NDArray[np.float32]
     depth_offsets_s: NDArray[np.float32]
-    undersides: dict[SemanticClass, Boundaries] = field(default_factory=dict)
+    lower_edges: dict[SemanticClass, Boundaries] = field(default_factory=dict)
 
     def on(self, shelf: Shelf) -> ScanFeatures:
         """The same with its points on a shelf, in the precision of the scan's."""
@@ -308,7 +308,7 @@ def scan_features(
     if depth and config.use_visual_odometry:
         near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < 60.0)
         deep = near[:: max(1, len(scan.points) // 30_000)]
-    boundaries, undersides = apart(find_boundaries(scan, classes, config.boundary))
+    boundaries, lower_edges = apart(find_boundaries(scan, classes, config.boundary))
     return ScanFeatures(
         index,
         scan.stamp_ns,
@@ -318,7 +318,7 @@ def scan_features(
         offsets[chosen].astype(np.float64),
         scan.points[deep],
         offsets[deep],
-        undersides,
+        lower_edges,
     )
 
 
@@ -326,27 +326,27 @@ def apart(
     found: dict[SemanticClass, Boundaries],
 ) -> tuple[dict[SemanticClass, Boundaries], dict[SemanticClass, Boundaries]]:
     """Boundary points, and apart from them those towards the ground."""
-    boundaries, undersides = {}, {}
+    boundaries, lower_edges = {}, {}
     for c, points in found.items():
         down = points.edges == Edge.BOTTOM
         boundaries[c] = points.take(np.flatnonzero(~down))
         known = np.isin(points.objects, boundaries[c].objects)
-        undersides[c] = points.take(np.flatnonzero(down & known))
+        lower_edges[c] = points.take(np.flatnonzero(down & known))
     return (
         {c: points for c, points in boundaries.items() if len(points)},
-        {c: points for c, points in undersides.items() if len(points)},
+        {c: points for c, points in lower_edges.items() if len(points)},
     )
 
 
-def outlines(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
+def outlines(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
     """A scan's boundary points, of some classes with those towards the ground."""
-    some = {c: scan.undersides[c] for c in undersides if c in scan.undersides}
+    some = {c: scan.lower_edges[c] for c in lower_edges if c in scan.lower_edges}
     return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
-def outline_size(scan: ScanFeatures, undersides: Collection[SemanticClass]) -> int:
+def outline_size(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> int:
     """Number of the points of :func:`outlines`."""
-    below = sum(len(points) for c, points in scan.undersides.items() if c in undersides)
+    below = sum(len(points) for c, points in scan.lower_edges.items() if c in lower_edges)
     return below + sum(map(len, scan.boundaries.values()))
 
 

@@ -21,8 +21,8 @@ from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import PrepareConfig, Progress, prepare_drive
 from sst_graph.experiments.slam_graph import (
-    DELAY,
     EXTRINSIC,
+    TIME_OFFSET,
     CameraGraphConfig,
     pose_graph,
     pose_key,
@@ -157,7 +157,7 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     # 3. Both in one graph.
     start = alone.T_camera_lidar, alone.time_offset_s
     both = with_camera(graph, slam, drive, start, source.nominal, config.camera)
-    found = both.atPose3(EXTRINSIC), float(both.atVector(DELAY)[0])
+    found = both.atPose3(EXTRINSIC), float(both.atVector(TIME_OFFSET)[0])
     errors = {
         "odometry": trajectory_errors(odometry, source),
         "SLAM alone": trajectory_errors(slam, source),

@@ -29,7 +29,7 @@ from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
-EXTRINSIC, DELAY, BIAS = (int(gtsam.symbol(letter, 0)) for letter in "EDB")
+EXTRINSIC, TIME_OFFSET, BIAS = (int(gtsam.symbol(letter, 0)) for letter in "EDB")
 """Keys of the extrinsic, the time offset and the vehicles' common mask bias."""
 VEHICLE = SemanticClass.VEHICLE
 
@@ -111,7 +111,7 @@ def with_camera(
     tracks = object_tracks(drive)
     values = gtsam.Values(poses)
     values.insert(EXTRINSIC, start[0])
-    values.insert(DELAY, np.array([start[1]]))
+    values.insert(TIME_OFFSET, np.array([start[1]]))
     values.insert(BIAS, np.zeros(1))
     for kernel_px in config.kernel_px:
         places = _places(drive, values)
@@ -153,7 +153,7 @@ def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
         RelativeMotion(stamps[k], stamps[k + 1], a.between(b), np.eye(6))
         for k, (a, b) in enumerate(itertools.pairwise(poses))
     ]
-    track, offset_ns = TwistTrack(motions), round(1e9 * float(values.atVector(DELAY)[0]))
+    track, offset_ns = TwistTrack(motions), round(1e9 * float(values.atVector(TIME_OFFSET)[0]))
     places = []
     for stamp_ns in drive.image_stamps_ns:
         true_ns = stamp_ns + offset_ns
@@ -168,7 +168,7 @@ def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
 def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config: CameraGraphConfig) -> None:
     noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([config.nominal_rad, config.nominal_m], 3))
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, nominal, noise))
-    graph.add(time_offset_prior(DELAY, 0.0, config.delay_sigma_s))
+    graph.add(time_offset_prior(TIME_OFFSET, 0.0, config.delay_sigma_s))
     graph.add(time_offset_prior(BIAS, 0.0, config.bias_sigma_px))
 
 
@@ -189,7 +189,7 @@ def _add_silhouettes(
             image,
             drive.camera,
             values.atPose3(EXTRINSIC),
-            float(values.atVector(DELAY)[0]),
+            float(values.atVector(TIME_OFFSET)[0]),
             place.twist,
             l_acceleration=place.acceleration,
             biases_px={VEHICLE: float(values.atVector(BIAS)[0])},
@@ -209,7 +209,7 @@ def _add_silhouettes(
                 b.X_a,
                 b.X_b,
                 EXTRINSIC,
-                DELAY,
+                TIME_OFFSET,
                 b.seconds,
                 biases_px=GroupedBias(tuple(objects), groups),
                 image_after_middle_s=place.image_after_middle_s,
@@ -247,7 +247,7 @@ def _add_visual_odometry(
     config: CameraGraphConfig,
 ) -> None:
     """Motions of the camera, metric by the depth that the present calibration gives to its features."""
-    cTl, offset_s = values.atPose3(EXTRINSIC), float(values.atVector(DELAY)[0])
+    cTl, offset_s = values.atPose3(EXTRINSIC), float(values.atVector(TIME_OFFSET)[0])
 
     def depth(position: int) -> FloatArray:
         place = places[position]
@@ -265,7 +265,7 @@ def _add_visual_odometry(
                     first.between,
                     second.between,
                     EXTRINSIC,
-                    DELAY,
+                    TIME_OFFSET,
                     motion.aTb,
                     motion.covariance + between,
                 )

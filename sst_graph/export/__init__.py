@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from sst_graph.export.formats import FORMATS, ExportOptions, export_text
 from sst_graph.export.marginal import (
-    DELAY,
     EXTRINSIC,
+    TIME_OFFSET,
     CalibrationMarginal,
     fuse_graphs,
     fuse_marginals,
@@ -15,9 +15,9 @@ from sst_graph.export.marginal import (
 )
 
 __all__ = [
-    "DELAY",
     "EXTRINSIC",
     "FORMATS",
+    "TIME_OFFSET",
     "CalibrationMarginal",
     "ExportOptions",
     "export_text",

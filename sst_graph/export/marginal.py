@@ -18,15 +18,15 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import EstimationError
 from sst_graph.export.agreement import SIGNIFICANCE, check_agreement
-from sst_graph.marginal import DELAY, EXTRINSIC, FORMAT, VERSION, CalibrationMarginal, read_marginal
+from sst_graph.marginal import EXTRINSIC, FORMAT, TIME_OFFSET, VERSION, CalibrationMarginal, read_marginal
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
 
 __all__ = [
-    "DELAY",
     "EXTRINSIC",
     "FORMAT",
+    "TIME_OFFSET",
     "VERSION",
     "CalibrationMarginal",
     "fuse_graphs",
@@ -57,7 +57,7 @@ def marginal_of_graph(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     E_key: int = EXTRINSIC,
-    D_key: int = DELAY,
+    D_key: int = TIME_OFFSET,
     *,
     at: tuple[gtsam.Pose3, float] | None = None,
 ) -> CalibrationMarginal:
@@ -123,7 +123,7 @@ def _others_at(
 def fuse_graphs(
     graphs: Sequence[tuple[gtsam.NonlinearFactorGraph, gtsam.Values]],
     E_key: int = EXTRINSIC,
-    D_key: int = DELAY,
+    D_key: int = TIME_OFFSET,
     *,
     tolerance_sigmas: float = 1e-4,
     max_rounds: int = 20,

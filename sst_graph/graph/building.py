@@ -24,11 +24,11 @@ from sst_graph.graph.state import (
     EXTRINSIC,
     State,
     bias_key,
+    lower_edge_track,
     nuisance_key,
     object_bias_key,
     time_offset_key,
     twist_key,
-    underside_track,
 )
 from sst_graph.types import SemanticClass
 
@@ -174,7 +174,7 @@ def _add_biases(
     for drive, c, track in objects:
         key = object_bias_key(drive, track)
         sigma_px = (
-            config.underside_bias_sigma_px if track == underside_track(c) else config.object_bias_sigma_px
+            config.lower_edge_bias_sigma_px if track == lower_edge_track(c) else config.object_bias_sigma_px
         )
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma_px)
         graph.add(gtsam.BetweenFactorVector(bias_key(drive, c), key, np.zeros(1), noise))

@@ -37,7 +37,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
-from sst_graph.graph.state import State, underside_track
+from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.tracks import (
     Mover,
     ObjectId,
@@ -61,13 +61,13 @@ class GraphConfig(Settings):
 
     Attributes:
         match: how boundary points meet contours.
-        undersides: classes whose edges towards the ground are matched too. They sharpen roll and height where
-            both sides label the underside alike; hand-drawn outlines often cover the gap above the ground.
+        lower_edges: classes whose edges towards the ground are matched too. They sharpen roll and height
+            where both sides label the lower edge alike; hand-drawn outlines often cover the gap above the ground.
         max_interval_periods: farthest pair in true time, in image periods.
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
             of a class the same bias.
-        underside_bias_sigma_px: deviation of the mask bias that the undersides of a class share from the
+        lower_edge_bias_sigma_px: deviation of the mask bias that the lower edges of a class share from the
             class's, where objects have biases of their own [px].
         delay_sigma_s: prior deviation of the time offset from the guess [s].
         rest_sigma_rad: prior deviation of the extrinsic's rotation from the guess [rad].
@@ -79,11 +79,11 @@ class GraphConfig(Settings):
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
-    undersides: tuple[SemanticClass, ...] = ()
+    lower_edges: tuple[SemanticClass, ...] = ()
     max_interval_periods: float = setting(1.0, at_least=0.01, at_most=20.0)
     bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
     object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
-    underside_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
+    lower_edge_bias_sigma_px: float = setting(2.0, at_least=0.001, at_most=1000.0)
     delay_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
     rest_sigma_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
     rest_sigma_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
@@ -222,7 +222,7 @@ class DriveOutlines:
         groups = [
             (k, c, points)
             for k, scan in enumerate(drive.scans)
-            for c, points in outlines(scan, config.undersides).items()
+            for c, points in outlines(scan, config.lower_edges).items()
             if len(points)
         ]
         if not groups:
@@ -434,12 +434,14 @@ class DriveMatches:
 
     @cached_property
     def tracks(self) -> IntArray | None:
-        """(m,) track whose mask bias each match has: its object's or the undersides' of its class; None where
-        objects share their class's."""
+        """(m,) track whose mask bias each match has: its object's or the lower edges' of its class.
+
+        None where objects share their class's.
+        """
         own = self.outlines.own_tracks
         if own is None:
             return None
-        below = np.repeat([underside_track(c) for c in self.group_classes], self.counts)
+        below = np.repeat([lower_edge_track(c) for c in self.group_classes], self.counts)
         return np.where(self.found.sides == BOTTOM, below, own[self.points])
 
     @property

@@ -32,8 +32,8 @@ def bias_key(drive: int, semantic_class: SemanticClass) -> int:
     return int(gtsam.symbol("B", drive * 256 + int(semantic_class)))
 
 
-def underside_track(semantic_class: SemanticClass) -> int:
-    """Stands for the undersides of a class among the tracks of its objects: they share a mask bias."""
+def lower_edge_track(semantic_class: SemanticClass) -> int:
+    """Stands for the lower edges of a class among the tracks of its objects: they share a mask bias."""
     return _IMAGES_PER_DRIVE - 256 + int(semantic_class)
 
 

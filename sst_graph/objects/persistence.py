@@ -162,7 +162,7 @@ class _Places:
         names: list[ObjectName] = []
         outlines, trees = {}, {}
         for c in [c for c in MOVABLE_CLASSES if c in scan.boundaries]:
-            edges = [scan.boundaries[c], *([scan.undersides[c]] if c in scan.undersides else [])]
+            edges = [scan.boundaries[c], *([scan.lower_edges[c]] if c in scan.lower_edges else [])]
             lPs = np.concatenate([part.lPs for part in edges])
             objects = np.concatenate([part.objects for part in edges])
             names += [(c, int(n)) for n in np.unique(objects)]

@@ -11,8 +11,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.assumption_tests import contradiction_of, told_by
-from sst_graph.batch.lower_edges import without_undersides
+from sst_graph.batch.assumption_tests import contradiction_sentence, with_test_results
+from sst_graph.batch.lower_edges import without_lower_edges
 from sst_graph.covariance.considered import Considered, considered
 from sst_graph.covariance.observability import open_directions
 from sst_graph.drive.preparation import ScanFeatures, image_features, scan_features
@@ -114,7 +114,7 @@ class Tracking:
     def considered(self) -> Considered:
         """How the present estimate follows the assumptions that are not estimated beside it."""
         beside = considered(self.known.steps, self.config.calibration.assumptions)
-        return told_by(beside, self.tests.findings)
+        return with_test_results(beside, self.tests.findings)
 
     @property
     def estimated_names(self) -> tuple[str, ...]:
@@ -165,8 +165,8 @@ class Tracking:
     def _features(self, scan: Scan) -> tuple[ScanFeatures, RelativeMotion | None]:
         """What is kept of a scan, and the motion that led to it."""
         prepare = dataclasses.replace(self.config.calibration.prepare, use_visual_odometry=False)
-        if self.config.calibration.undersides.use == "never":
-            prepare = without_undersides(prepare)
+        if self.config.calibration.lower_edges.use == "never":
+            prepare = without_lower_edges(prepare)
         features = scan_features(self.window.next_scan, scan, self.classes, prepare)
         motion = self.odometry.add(scan)
         self.last_scan = scan
@@ -341,9 +341,9 @@ class Tracking:
         covariance = self.reported()
         status: TrackStatus = "alarm" if self.starting.alarmed else "starting"
         weak: tuple[WeakDirection, ...] = ()
-        since, contradictions = self.watch.confirmation, contradiction_of(self.tests.findings)
+        since, contradictions = self.watch.confirmation, contradiction_sentence(self.tests.findings)
         if self.smoother is not None:
-            weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
+            weak = open_directions(covariance, self.known.by_static_objects, point.cTl, config.observability)
             late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
             status = "contradicted" if contradictions else status

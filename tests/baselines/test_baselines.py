@@ -20,7 +20,7 @@ from sst_graph.baselines.nearest_pixel_frames import (
     spread,
     step_once,
 )
-from sst_graph.baselines.second_search import Challenge, ChallengeConfig
+from sst_graph.baselines.second_search import Challenge, SecondSearchConfig
 from sst_graph.baselines.semalign import SemAlignConfig, sampled_poses, truncated_distances
 from sst_graph.baselines.sst_calib import PaperConfig, camera_motions, velocity_at
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
@@ -178,8 +178,8 @@ def test_without_a_stop(drive: Drive, truth: GroundTruth) -> None:
 
 
 def test_a_delay_for_each_drive_is_for_joint_only(street: Path) -> None:
-    settings = dataclasses.replace(config_of("paper"), delay_per_drive=True)
-    with pytest.raises(ConfigError, match="delay_per_drive needs method joint, found paper"):
+    settings = dataclasses.replace(config_of("paper"), time_offset_per_drive=True)
+    with pytest.raises(ConfigError, match="time_offset_per_drive needs method joint, found paper"):
         calibrate(open_source(street), gtsam.Pose3(), settings)
 
 
@@ -246,7 +246,7 @@ def test_truncated_distances_by_hand(drive: Drive) -> None:
     [((0.05, 0.12, 0.13), 0), ((0.05, 0.10, 0.13), 1), ((0.12, 0.11, 0.115), 1), ((0.0, -0.1, -0.05), 2)],
 )
 def test_a_second_opinion(scores: tuple[float, float, float], doubts: int) -> None:
-    assert len(Challenge(*scores).doubts(ChallengeConfig())) == doubts
+    assert len(Challenge(*scores).doubts(SecondSearchConfig())) == doubts
 
 
 def test_spread() -> None:

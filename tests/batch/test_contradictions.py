@@ -174,7 +174,7 @@ def test_no_check_no_contradiction() -> None:
 
 @pytest.mark.parametrize("own_offsets", ["false", "true"])
 def test_drives_of_two_rigs(own_offsets: str) -> None:
-    config = with_overrides(CONFIG, [f"delay_per_drive={own_offsets}"])
+    config = with_overrides(CONFIG, [f"time_offset_per_drive={own_offsets}"])
     frames = frames_of()
     two = [Edited(street(), frames[:12], "a"), Edited(street(), knocked(frames[12:], 0, 1.1), "b")]
     result = calibrated(two, config)
@@ -193,7 +193,7 @@ def test_drives_of_one_rig() -> None:
 
 def test_the_offset_of_every_drive_counts() -> None:
     """A standing drive cannot tell its own time offset, whichever drive comes first."""
-    config = with_overrides(CONFIG, ["delay_per_drive=true"])
+    config = with_overrides(CONFIG, ["time_offset_per_drive=true"])
     moving = Edited(street(), frames_of()[:12], "moving")
     standing = Edited(street("standing", 12), frames_of("standing", 12)[:4], "standing")
     for order in ([moving, standing], [standing, moving]):

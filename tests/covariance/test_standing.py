@@ -76,8 +76,12 @@ def test_where_nothing_moves_it_is_the_whole_one() -> None:
 def test_what_only_moving_objects_tell_is_not_called_known() -> None:
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
-    for by_standing, status in ((None, "ok"), (good, "ok"), (good + np.outer(step, step), "unobservable")):
-        answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_standing=by_standing)
+    for by_static_objects, status in (
+        (None, "ok"),
+        (good, "ok"),
+        (good + np.outer(step, step), "unobservable"),
+    ):
+        answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_static_objects=by_static_objects)
         result = result_of(answer, [prepared_street()], Guess(gtsam.Pose3()), CalibrationConfig())
         assert result.status == status
     assert "by what stands alone" in result.reasons[0] and len(result.weak_directions) == 1

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.export import DELAY, EXTRINSIC, CalibrationMarginal
+from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal
 
 SOURCE = Path(__file__).resolve().parents[2] / "examples" / "marginal_reader.cpp"
 INCLUDES = [Path("/usr/include"), Path("/usr/local/include")]
@@ -48,7 +48,7 @@ def test_cpp_reads_the_same_cost(reader: Path, tmp_path: Path) -> None:
         cTl, offset_s = marginal.cTl.retract(d[:6]), marginal.offset_s + d[6]
         values = gtsam.Values()
         values.insert(EXTRINSIC, cTl)
-        values.insert(DELAY, np.array([offset_s]))
+        values.insert(TIME_OFFSET, np.array([offset_s]))
         costs.append(factor.error(values))
         steps.append([*gtsam.Pose3.Logmap(marginal.cTl.between(cTl)), offset_s - marginal.offset_s])
         lines.append(" ".join(repr(float(x)) for x in [*cTl.matrix()[:3].ravel(), offset_s]))

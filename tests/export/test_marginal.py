@@ -16,8 +16,8 @@ import pytest
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.errors import ContradictionError, DataError, EstimationError
 from sst_graph.export import (
-    DELAY,
     EXTRINSIC,
+    TIME_OFFSET,
     CalibrationMarginal,
     fuse_graphs,
     fuse_marginals,
@@ -56,7 +56,7 @@ def drive(seed: int, frames: int = 6) -> tuple[gtsam.NonlinearFactorGraph, gtsam
     rng = np.random.default_rng(seed)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(EXTRINSIC, TRUE.retract(np.full(6, 0.01)))
-    values.insert(DELAY, np.array([OFFSET_S + 0.01]))
+    values.insert(TIME_OFFSET, np.array([OFFSET_S + 0.01]))
     bias = gtsam.symbol("B", seed)
     values.insert(bias, np.zeros(1))
     graph.add(time_offset_prior(bias, 0.0, 3.0))
@@ -73,7 +73,7 @@ def drive(seed: int, frames: int = 6) -> tuple[gtsam.NonlinearFactorGraph, gtsam
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.01, 0.1], 3))
         graph.add(gtsam.PriorFactorVector(key, twist, noise))
         values.insert(key, twist)
-        graph.add(frame_factor([seen], EXTRINSIC, DELAY, key, bias))
+        graph.add(frame_factor([seen], EXTRINSIC, TIME_OFFSET, key, bias))
     return graph, values
 
 
@@ -89,7 +89,7 @@ def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gts
         dim = 6 if chr(gtsam.Symbol(key).chr()) in "EV" else 1
         at[key], step = step[:dim], step[dim:]
     cTl = values.atPose3(EXTRINSIC).retract(at[EXTRINSIC])
-    return cTl, float(values.atVector(DELAY)[0] + at[DELAY][0])
+    return cTl, float(values.atVector(TIME_OFFSET)[0] + at[TIME_OFFSET][0])
 
 
 def in_sigmas(found: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> float:
@@ -108,7 +108,7 @@ def test_the_marginal_of_a_result_is_its_robust_covariance() -> None:
     np.testing.assert_allclose(
         marginals.marginalCovariance(EXTRINSIC), covariance(3)[:6, :6], rtol=1e-6, atol=1e-12
     )
-    assert marginals.marginalCovariance(DELAY).item() == pytest.approx(covariance(3)[6, 6], rel=1e-6)
+    assert marginals.marginalCovariance(TIME_OFFSET).item() == pytest.approx(covariance(3)[6, 6], rel=1e-6)
 
 
 def test_the_error_is_the_documented_quadratic() -> None:
@@ -116,7 +116,7 @@ def test_the_error_is_the_documented_quadratic() -> None:
     d = np.random.default_rng(0).normal(size=7) * 0.01
     values = gtsam.Values()
     values.insert(EXTRINSIC, found.cTl * gtsam.Pose3.Expmap(d[:6]))
-    values.insert(DELAY, np.array([found.offset_s + d[6]]))
+    values.insert(TIME_OFFSET, np.array([found.offset_s + d[6]]))
     expected = 0.5 * d @ found.information @ d - found.vector @ d + 0.5 * found.constant
     assert found.factor().error(values) == pytest.approx(expected, rel=1e-6)
 
@@ -163,7 +163,7 @@ def test_reads_back_in_a_fresh_process_without_us(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     values = gtsam.Values()
     values.insert(EXTRINSIC, found.cTl.retract(np.full(6, 0.01)))
-    values.insert(DELAY, np.array([found.offset_s + 0.01]))
+    values.insert(TIME_OFFSET, np.array([found.offset_s + 0.01]))
     assert json.loads(done.stdout) == pytest.approx([found.factor().error(values)] * 3, rel=1e-9)
 
 
@@ -225,14 +225,14 @@ def test_reads_a_file(tmp_path: Path) -> None:
 
 def test_fusing_two_drives_equals_the_joint_batch() -> None:
     drives = [drive(1), drive(2)]
-    fused = fuse_marginals([marginal_of_graph(g, v, EXTRINSIC, DELAY) for g, v in drives])
+    fused = fuse_marginals([marginal_of_graph(g, v, EXTRINSIC, TIME_OFFSET) for g, v in drives])
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for one, start in drives:
         graph.push_back(one)
         values.insert_or_assign(start)
     cTl, offset_s = solved(graph, values)
     assert in_sigmas(fused, cTl, offset_s) < 1e-3
-    joint = marginal_of_graph(graph, values, EXTRINSIC, DELAY)
+    joint = marginal_of_graph(graph, values, EXTRINSIC, TIME_OFFSET)
     # the fused one is written about its own optimum
     J = np.eye(7)
     J[:6, :6] = gtsam.Pose3.LogmapDerivative(joint.cTl.localCoordinates(fused.cTl))
@@ -272,7 +272,7 @@ def test_a_stored_marginal_follows_the_second_drive() -> None:
         graph = gtsam.NonlinearFactorGraph(two)
         graph.add(stored.factor())
         found = _optimum(graph, start)
-        point = found.atPose3(EXTRINSIC), float(found.atVector(DELAY)[0])
+        point = found.atPose3(EXTRINSIC), float(found.atVector(TIME_OFFSET)[0])
         both = marginal_of_graph(graph, found)
         distances.append(in_sigmas(both, *answer))
     assert 1e-3 < distances[0] < 0.03 and distances[-1] < 1e-3
@@ -321,18 +321,18 @@ def _batch(
         graph.push_back(one)
         values.insert_or_assign(start)
     batch = _optimum(graph, values)
-    return batch.atPose3(EXTRINSIC), float(batch.atVector(DELAY)[0])
+    return batch.atPose3(EXTRINSIC), float(batch.atVector(TIME_OFFSET)[0])
 
 
 def test_another_point_moves_the_expansion_and_not_the_cost() -> None:
     graph, start = drive(9, 8)
     best = _optimum(graph, start)
-    there = best.atPose3(EXTRINSIC).retract(np.full(6, 1e-4)), float(best.atVector(DELAY)[0]) + 1e-4
+    there = best.atPose3(EXTRINSIC).retract(np.full(6, 1e-4)), float(best.atVector(TIME_OFFSET)[0]) + 1e-4
     about = marginal_of_graph(graph, best, at=there)
     assert about.cTl.equals(there[0], 1e-9) and about.offset_s == pytest.approx(there[1], abs=1e-12)
-    assert in_sigmas(about, best.atPose3(EXTRINSIC), float(best.atVector(DELAY)[0])) < 2e-3
+    assert in_sigmas(about, best.atPose3(EXTRINSIC), float(best.atVector(TIME_OFFSET)[0])) < 2e-3
     alone = fuse_graphs([(graph, start)])[0]
-    assert in_sigmas(alone, best.atPose3(EXTRINSIC), float(best.atVector(DELAY)[0])) < 1e-3
+    assert in_sigmas(alone, best.atPose3(EXTRINSIC), float(best.atVector(TIME_OFFSET)[0])) < 1e-3
 
 
 def _optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values) -> gtsam.Values:
@@ -349,7 +349,7 @@ def test_fusion_is_that_of_gtsam_on_the_factors() -> None:
         graph.add(part.factor())
     found = gtsam.LevenbergMarquardtOptimizer(graph, parts[0].point()).optimize()
     fused = fuse_marginals(parts)
-    assert in_sigmas(fused, found.atPose3(EXTRINSIC), float(found.atVector(DELAY)[0])) < 0.02
+    assert in_sigmas(fused, found.atPose3(EXTRINSIC), float(found.atVector(TIME_OFFSET)[0])) < 0.02
     alone = min(np.sqrt(np.diag(part.covariance())).tolist() for part in parts)
     assert (np.sqrt(np.diag(fused.covariance())) < alone).all()
 
@@ -361,11 +361,11 @@ def test_refuses_what_is_not_determined() -> None:
     with pytest.raises(EstimationError, match="information"):
         flat.best()
     graph, values = drive(1, 2)
-    graph.add(gtsam.PriorFactorVector(DELAY, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1.0)))
+    graph.add(gtsam.PriorFactorVector(TIME_OFFSET, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1.0)))
     values.insert(99, np.zeros(1))
     graph.add(gtsam.PriorFactorVector(99, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 1e300)))
     with pytest.raises(EstimationError, match="to eliminate"):
-        marginal_of_graph(graph, values, EXTRINSIC, DELAY)
+        marginal_of_graph(graph, values, EXTRINSIC, TIME_OFFSET)
 
 
 def knocked(found: CalibrationMarginal, column: int, size: float) -> CalibrationMarginal:

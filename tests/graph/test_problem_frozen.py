@@ -23,7 +23,7 @@ from sst_graph.types import SemanticClass
 VEHICLE = SemanticClass.VEHICLE
 KERNEL = RobustKernel("geman_mcclure", 5.0)
 L_TWIST = np.array([0.02, -0.03, 0.2, 5.0, 0.3, -0.1])
-PLAIN = GraphConfig(undersides=(VEHICLE,))
+PLAIN = GraphConfig(lower_edges=(VEHICLE,))
 FREE = replace(PLAIN, estimate=("focal", "range_scale", "skew=0.001"))
 
 
@@ -40,9 +40,9 @@ def moving(rolling: bool) -> Drive:
     def timed(scan: ScanFeatures) -> ScanFeatures:
         both = [
             {c: replace(b, offsets_s=0.05 * np.arctan2(b.lPs[:, 1], b.lPs[:, 0])) for c, b in own.items()}
-            for own in (scan.boundaries, scan.undersides)
+            for own in (scan.boundaries, scan.lower_edges)
         ]
-        return replace(scan, boundaries=both[0], undersides=both[1])
+        return replace(scan, boundaries=both[0], lower_edges=both[1])
 
     scans = tuple(timed(scan) for scan in drive.scans) if rolling else drive.scans
     return replace(drive, scans=scans, lidar_motions=tuple(motions))

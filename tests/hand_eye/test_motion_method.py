@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
-from sst_graph.batch.motion_factor import belief_factor
+from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
@@ -219,7 +219,7 @@ def test_a_rival_is_another_solution_that_fits_alike() -> None:
 def test_belief_by_hand() -> None:
     """At the state it costs nothing; half of the squared whitened step beside it."""
     covariance = np.diag(np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3, 0.005]) ** 2)
-    factor = belief_factor(State(TRUE, (OFFSET_S,)), covariance)
+    factor = gaussian_factor(State(TRUE, (OFFSET_S,)), covariance)
     values = gtsam.Values()
     values.insert(EXTRINSIC, TRUE.retract(np.array([0.0, 0.0, 0.0, 0.1, 0.0, 0.0])))
     values.insert(time_offset_key(), np.array([OFFSET_S + 0.01]))
@@ -279,6 +279,6 @@ def test_the_joint_method_hears_the_motion(street: Path) -> None:
 
 
 def test_one_clock_only(street: Path) -> None:
-    settings = dataclasses.replace(CalibrationConfig(), use_motion="always", delay_per_drive=True)
+    settings = dataclasses.replace(CalibrationConfig(), use_motion="always", time_offset_per_drive=True)
     with pytest.raises(ConfigError, match="use_motion"):
         calibrate(open_source(street), None, settings)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
-from sst_graph.batch.assumption_tests import told_by
+from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, consider
@@ -113,7 +113,7 @@ def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> 
     graph, values = joint_graph(pairs, state, settled.matcher.graph, guess)
     robust = robust_covariance(graph, values, pairs, state, [settled.window.objects_of(list(entries))[0]])
     plain = consider(robust, pairs, values, state, settled.config.calibration.assumptions)
-    expected = told_by(plain, settled.tests.findings)
+    expected = with_test_results(plain, settled.tests.findings)
     found = settled.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
     scale = np.sqrt(np.diag(settled.covariance)[:7])
@@ -245,7 +245,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     tracks = object_tracks(drive)
     joint = dataclasses.replace(
         config.joint,
-        graph=dataclasses.replace(config.joint.graph, undersides=estimating.matcher.graph.undersides),
+        graph=dataclasses.replace(config.joint.graph, lower_edges=estimating.matcher.graph.lower_edges),
     )
     start = State(bent.truth.cTl, (0.04,))
     solution = solve_joint([drive], start, joint, tracks=Tracks([drive], [tracks]))
@@ -263,9 +263,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
 
-def test_a_checkpoint_holds_what_is_estimated(
-    leaving: Tracker, bent: KeptDrive, tmp_path: Path
-) -> None:
+def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive, tmp_path: Path) -> None:
     assert leaving.smoother is not None and leaving.smoother.sums.recent
     save_checkpoint(leaving, tmp_path / "tracker")
     again = load_checkpoint(tmp_path / "tracker")

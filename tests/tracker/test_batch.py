@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.batch.lower_edges import with_undersides
+from sst_graph.batch.lower_edges import with_lower_edges
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.graph.building import Tracks, tracked_objects
 from sst_graph.graph.outer_loop import solve_joint
-from sst_graph.graph.state import State, underside_track
+from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.tracks import moving_objects, object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass
@@ -55,8 +55,8 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     start = State(street.truth.cTl, (0.04,))
     plain = solve_joint([drive], start, joint)
     twists = Tracks([drive], [object_tracks(drive)] if by_object else None)
-    below = with_undersides([drive], twists, [(plain, start)], joint, calibration.undersides)
-    assert tracker.matcher.graph.undersides == below.joint.graph.undersides == calibration.classes
+    below = with_lower_edges([drive], twists, [(plain, start)], joint, calibration.lower_edges)
+    assert tracker.matcher.graph.lower_edges == below.joint.graph.lower_edges == calibration.classes
     solution = below.solutions[0]
     state = solution.state
     turn = gtsam.Pose3.Logmap(tracker.point.cTl.between(state.cTl))
@@ -77,7 +77,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
         assert (other.speed_mps, other.unknown_mps) == pytest.approx((mover.speed_mps, mover.unknown_mps))
     assert any(mover.velocity is not None for mover in moving.values())
     ours = dict(zip(tracker.point.tracks, tracker.point.object_biases_px, strict=True))
-    shared = underside_track(SemanticClass.VEHICLE)
+    shared = lower_edge_track(SemanticClass.VEHICLE)
     assert tracker.point.biases_px[1] == pytest.approx(state.object_biases_px[0, shared], abs=0.2)
     matched = {track for _, _, track in tracked_objects(solution.pairs)} - {shared}
     theirs = {track: state.object_biases_px[0, track] for track in matched}

@@ -11,7 +11,7 @@ from streets import EARLY_START, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.errors import EstimationError
-from sst_graph.export import DELAY, EXTRINSIC, fuse_marginals
+from sst_graph.export import EXTRINSIC, TIME_OFFSET, fuse_marginals
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.marginal import TrackedMarginal, increment, seen_from
 from sst_graph.types import Frame
@@ -75,10 +75,10 @@ def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMargin
     assert update.covariance is not None
     sigmas = np.sqrt(np.diag(update.covariance))
     step = gtsam.Pose3.Logmap(update.T_camera_lidar.between(values.atPose3(EXTRINSIC)))
-    step = np.append(step, values.atVector(DELAY)[0] - update.time_offset_s)
+    step = np.append(step, values.atVector(TIME_OFFSET)[0] - update.time_offset_s)
     assert np.abs(step / sigmas).max() < 1e-3
     # Told twice it would be too sure; told in parts it is not.
-    variance = gtsam.Marginals(graph, values).marginalCovariance(DELAY)[0, 0]
+    variance = gtsam.Marginals(graph, values).marginalCovariance(TIME_OFFSET)[0, 0]
     assert variance == pytest.approx(sigmas[6] ** 2, rel=1e-3)
 
 

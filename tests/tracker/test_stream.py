@@ -182,10 +182,10 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     assert resumed.point.cTl.equals(kept.point.cTl, 1e-12)
     assert resumed.point.offset_s == kept.point.offset_s
     np.testing.assert_allclose(resumed.covariance, kept.covariance, rtol=1e-12)
-    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.undersides
+    assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.lower_edges
     for (_, a), (_, b) in zip(resumed.window.scans, kept.window.scans, strict=True):
-        assert {c: len(points) for c, points in a.undersides.items()} == {
-            c: len(points) for c, points in b.undersides.items()
+        assert {c: len(points) for c, points in a.lower_edges.items()} == {
+            c: len(points) for c, points in b.lower_edges.items()
         }
     for frame in frames[20:]:
         kept.add(frame)

@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     flags = {
         "method": args.method,
         "classes": chosen_classes(args.classes),
-        "delay_per_drive": args.delay_per_drive,
+        "time_offset_per_drive": args.time_offset_per_drive,
         "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(CalibrationConfig(), args, flags)

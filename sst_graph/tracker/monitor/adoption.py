@@ -70,7 +70,7 @@ def held_out_cost(
     A point that finds no contour costs as much as the farthest match.
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
-    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.undersides)) for pair in pairs]
+    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
     return mean_cost(counted, point, classes, kernel, config)
 
 

@@ -248,7 +248,7 @@ def prior_belief(
 ) -> Gaussian:
     """The batch's own weak priors around the guess, linearized at a point.
 
-    A class's mask bias is around 0, that of its undersides around the class's; an estimated parameter of an
+    A class's mask bias is around 0, that of its lower edges around the class's; an estimated parameter of an
     assumption is around 0.
     """
     estimated = dict(named_sigmas(config.estimate))
@@ -256,7 +256,7 @@ def prior_belief(
     k = len(classes)
     sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
     information = np.diag(1.0 / np.square(sigmas))
-    tie, biases = config.underside_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
+    tie, biases = config.lower_edge_bias_sigma_px**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
     information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
     centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
     return Gaussian(point, information, information @ point.local(centre))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sst_graph.batch.lower_edges import UndersideSupport
+from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import SstGraphError
 from sst_graph.factors.errors import FactorError
@@ -120,7 +120,7 @@ class Entering:
 
     def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
         self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
-        self.below = None if config.calibration.undersides.use == "never" else UndersideSupport()
+        self.below = None if config.calibration.lower_edges.use == "never" else LowerEdgeSupport()
         self.found: dict[int, Found] = {}
 
     def advance(self, matcher: WindowMatcher, work: int | None) -> bool:

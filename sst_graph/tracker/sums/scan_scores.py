@@ -17,7 +17,7 @@ from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
 from sst_graph.graph.building import GraphConfig, PairMatches
 from sst_graph.graph.nuisances import columns_beside
-from sst_graph.graph.state import underside_track
+from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.tracker.sums.object_sums import ObjectBeliefs
 from sst_graph.tracker.window.gaussian import Gaussian, Point
@@ -91,7 +91,7 @@ class PairScore:
     standing: Gaussian | None = None
 
     @property
-    def by_standing(self) -> Gaussian:
+    def by_static_objects(self) -> Gaussian:
         """The belief by objects that stand alone."""
         return self.belief if self.standing is None else self.standing
 
@@ -163,11 +163,11 @@ def score_pair(
         ObjectBeliefs.of(J[:, :n], r, roots, track, point) if by_object else None,
         weight,
         bend,
-        _by_standing(pair, point, A[:, known], motion[np.ix_(known, known)]),
+        _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
 
 
-def _by_standing(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
+def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
     """The information of matches of objects that stand; the vector is not of interest."""
     moves = moving_matches(pair)
     if not moves.any():
@@ -218,7 +218,7 @@ def _rows(
             names, groups = pair.biased[c]
             below = 7 + len(classes) + place
             known = {track: point.core_size + k for k, track in enumerate(point.tracks)}
-            columns = np.array([below if t == underside_track(c) else known[t] for t in names])[groups]
+            columns = np.array([below if t == lower_edge_track(c) else known[t] for t in names])[groups]
             values = np.concatenate([point.biases_px, point.parameters, point.object_biases_px])
             biases = values[columns - 7]
         at = point.cTl, point.offset_s, pair.motion.c_twist

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.factors import custom_factor
 from sst_graph.graph.elimination import scaled_inverse
-from sst_graph.graph.state import State, underside_track
+from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -28,7 +28,7 @@ class Point:
     Attributes:
         cTl: extrinsic.
         offset_s: time offset [s].
-        biases_px: (2 c,) mask bias of each class, then that of each class's undersides [px].
+        biases_px: (2 c,) mask bias of each class, then that of each class's lower edges [px].
         tracks: objects with a mask bias of their own, by the number of their track.
         object_biases_px: (k,) those biases [px].
         names: assumptions whose parameters are estimated.
@@ -124,7 +124,7 @@ class Point:
         """As the state that matches are made at."""
         of_class, below = np.split(self.biases_px, 2)
         biases = {(0, c): float(bias) for c, bias in zip(classes, of_class, strict=True)}
-        shared = {(0, underside_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
+        shared = {(0, lower_edge_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
         return State(self.cTl, (self.offset_s,), biases, shared, self.nuisances)
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import held_at_zero
-from sst_graph.batch.lower_edges import UndersideSupport, underside_support
+from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
 from sst_graph.drive.preparation import Drive, outline_size, outlines
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
@@ -48,19 +48,19 @@ class WindowMatcher:
 
     def look_below(self, point: Point) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree about them."""
-        if self.config.calibration.undersides.use != "never":
+        if self.config.calibration.lower_edges.use != "never":
             self.match_below(self.support_below(point, None))
 
-    def support_below(self, point: Point, chosen: Collection[int] | None) -> UndersideSupport:
+    def support_below(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
         """What the edges towards the ground of some scans (None: all) say about their labels at a point."""
         drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         tracks, state = self._tracks(drive, numbers), point.state(self.classes)
-        return underside_support([drive], tracks, state, self.config.calibration.joint)
+        return lower_edge_support([drive], tracks, state, self.config.calibration.joint)
 
-    def match_below(self, support: UndersideSupport) -> None:
+    def match_below(self, support: LowerEdgeSupport) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree as this support says."""
-        chosen, _ = support.agreed(self.config.calibration.undersides)
-        self.graph = replace(self.config.calibration.joint.graph, undersides=chosen)
+        chosen, _ = support.agreed(self.config.calibration.lower_edges)
+        self.graph = replace(self.config.calibration.joint.graph, lower_edges=chosen)
 
     def match(
         self,
@@ -158,7 +158,7 @@ class WindowMatcher:
         for pair in pair_by_time(part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, limit):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
-            for c, points in outlines(part.scans[pair.scan], self.graph.undersides).items():
+            for c, points in outlines(part.scans[pair.scan], self.graph.lower_edges).items():
                 if c in contours:
                     cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
                     inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
@@ -197,7 +197,7 @@ class WindowMatcher:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:
             pairs, _ = self._pairs(point, chosen, self.kernel)
-        scans, below = dict(self.window.scans), self.graph.undersides
+        scans, below = dict(self.window.scans), self.graph.lower_edges
         counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
         return mean_cost(counted, point, self.classes, self.kernel, self.graph)
 

@@ -22,11 +22,11 @@ from sst_graph.graph.building import GraphConfig, motion_factor, silhouettes_fac
 from sst_graph.graph.elimination import scaled_inverse
 from sst_graph.graph.state import (
     bias_key,
+    lower_edge_track,
     nuisance_key,
     object_bias_key,
     time_offset_key,
     twist_key,
-    underside_track,
 )
 from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.sums.score_sums import ScoreSums
@@ -116,7 +116,7 @@ class WindowSmoother:
     def keys(self, epoch: int, tracks: Sequence[int] = ()) -> list[int]:
         """Keys of [E, D, biases..., parameters..., biases of some objects...] of an epoch."""
         biases = [bias_key(0, c) for c in self.classes]
-        biases += [object_bias_key(0, underside_track(c)) for c in self.classes]
+        biases += [object_bias_key(0, lower_edge_track(c)) for c in self.classes]
         parameters = [nuisance_key(name) for name in self.prior.point.names]
         objects = [object_bias_key(0, track) for track in tracks]
         return [int(gtsam.symbol("E", epoch)), time_offset_key(epoch), *biases, *parameters, *objects]
@@ -286,7 +286,10 @@ class WindowSmoother:
 
     def information_of_standing(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
-        alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
+        alone, beliefs = (
+            self.alone,
+            {scan: entry.score.by_static_objects for scan, entry in self.entries.items()},
+        )
         moves = any(entry.score.standing is not None for entry in self.entries.values())
         if not moves and np.array_equal(alone.information, self.past.without_held().information):
             return None

@@ -109,7 +109,7 @@ class Change:
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
             self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.score.bent)
-            self.alone = self.alone.plus(entry.score.by_standing)
+            self.alone = self.alone.plus(entry.score.by_static_objects)
             if entry.other is not None:
                 self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
             columns = self.past.point.columns(belief.point.tracks, belief.held)

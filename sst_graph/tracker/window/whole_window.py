@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.batch.lower_edges import UndersideSupport
+from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -114,8 +114,8 @@ class Settling:
         """scans: that are matched with each frame."""
         self._matcher, self._scans = matcher, scans
         self.passes = _PASSES
-        never = matcher.config.calibration.undersides.use == "never"
-        self.below = None if never else UndersideSupport()
+        never = matcher.config.calibration.lower_edges.use == "never"
+        self.below = None if never else LowerEdgeSupport()
         self.done: set[int] = set()
 
     @property

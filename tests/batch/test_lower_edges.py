@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
-from sst_graph.batch.lower_edges import UndersideConfig, underside_support, with_undersides
+from sst_graph.batch.lower_edges import LowerEdgesConfig, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.building import Tracks, associate
@@ -20,7 +20,7 @@ from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT = replace(narrowed(JointConfig()), min_matches=10)
-CONFIG = UndersideConfig(min_support=10.0)
+CONFIG = LowerEdgesConfig(min_support=10.0)
 
 
 @cache
@@ -47,7 +47,7 @@ def solved(drive: Drive) -> tuple[JointSolution, State]:
 def test_edges_towards_the_ground_are_kept_apart() -> None:
     for scan in prepared_street().scans:
         assert Edge.BOTTOM not in scan.boundaries[VEHICLE].edges
-        below = scan.undersides[VEHICLE]
+        below = scan.lower_edges[VEHICLE]
         assert len(below) > 20 and (below.edges == Edge.BOTTOM).all()
         assert np.isin(below.objects, scan.boundaries[VEHICLE].objects).all()
 
@@ -59,7 +59,7 @@ def test_matched_where_they_are_asked_for() -> None:
         solved(drive)[0].pairs[0].matches[VEHICLE].alignment.kernel,
     )
     without = associate([drive], tracks, state, kernel, JOINT.graph)
-    graph = replace(JOINT.graph, undersides=(VEHICLE,))
+    graph = replace(JOINT.graph, lower_edges=(VEHICLE,))
     for few, many in zip(without, associate([drive], tracks, state, kernel, graph), strict=True):
         assert not (few.matches[VEHICLE].sides == 3).any()
         assert (many.matches[VEHICLE].sides == 3).sum() > 10
@@ -68,8 +68,8 @@ def test_matched_where_they_are_asked_for() -> None:
 
 def test_used_where_the_labels_agree() -> None:
     drive = street()
-    below = with_undersides([drive], Tracks([drive]), [solved(drive)], JOINT, CONFIG)
-    assert below.joint.graph.undersides == (VEHICLE,)
+    below = with_lower_edges([drive], Tracks([drive]), [solved(drive)], JOINT, CONFIG)
+    assert below.joint.graph.lower_edges == (VEHICLE,)
     assert below.concentration[VEHICLE] > CONFIG.min_concentration
     truth = standing_street().truth.cTl
     off = [
@@ -85,11 +85,11 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
     one, centre = solved(drive)
     config = replace(CONFIG, use=use)
     tracks = Tracks([drive])
-    shares = underside_support([drive], tracks, one.state, JOINT).agreed(config)[1]
+    shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(config)[1]
     assert shares[VEHICLE] < CONFIG.min_concentration
-    below = with_undersides([drive], tracks, [(one, centre)], JOINT, config)
+    below = with_lower_edges([drive], tracks, [(one, centre)], JOINT, config)
     if use == "always":
-        assert below.joint.graph.undersides == (VEHICLE,)
+        assert below.joint.graph.lower_edges == (VEHICLE,)
     else:
         assert below.solutions[0] is one and below.joint == JOINT
 
@@ -97,5 +97,5 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
 def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
-    config = UndersideConfig(min_support=1e6)
-    assert underside_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}
+    config = LowerEdgesConfig(min_support=1e6)
+    assert lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}
