@@ -62,7 +62,7 @@ class GraphConfig(Settings):
     Attributes:
         match: how boundary points meet contours.
         lower_edges: classes whose edges towards the ground are matched too. They sharpen roll and height
-            where both sides label the lower edge alike; hand-drawn outlines often cover the gap above the ground.
+            where both sides label them alike; hand-drawn outlines often cover the gap above the ground.
         max_interval_periods: farthest pair in true time, in image periods.
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object

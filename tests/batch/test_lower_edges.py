@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
-from sst_graph.batch.lower_edges import LowerEdgesConfig, lower_edge_support, with_lower_edges
+from sst_graph.batch.config import LowerEdgesConfig
+from sst_graph.batch.lower_edges import lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.building import Tracks, associate
@@ -20,7 +21,7 @@ from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT = replace(narrowed(JointConfig()), min_matches=10)
-CONFIG = LowerEdgesConfig(min_support=10.0)
+CONFIG = LowerEdgesConfig()
 
 
 @cache
@@ -97,5 +98,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
 def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
-    config = LowerEdgesConfig(min_support=1e6)
-    assert lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}
+    assert (
+        lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(CONFIG, min_support=1e6)[1]
+        == {}
+    )
