@@ -2,7 +2,7 @@
 
 Where the print is silent: frames are those of equal stamps, spread over the drive; the time offset starts
 at the guess; camera velocity comes from visual odometry with LiDAR depth, computed anew every few
-steps because the depth depends on extrinsic and offset; a re-match is followed by one Levenberg-Marquardt step.
+steps because the depth depends on extrinsic and offset; one Levenberg-Marquardt step follows each match.
 """
 
 from __future__ import annotations

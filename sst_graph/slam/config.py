@@ -8,8 +8,7 @@ from sst_graph.config import Settings, setting
 from sst_graph.covariance.observability import ObservabilityConfig
 
 NARROWING = 0.7
-"""From one scale of the kernel to the next: steps so small that matches of one scale are still found under the
-next."""
+"""From one scale of the kernel to the next: the next matches lie within the last kernel."""
 CALM = 0.1
 """The kernel is narrowed when a round has moved the matched points by less than this share of it (RMS)."""
 

@@ -40,7 +40,7 @@ Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
 
 
 _REMATCH_PX = 0.3
-"""A term is matched again when the estimate has moved its points by more (RMS) [px]: a tenth of the last kernel."""
+"""A term is matched again when the estimate has moved its points by more (RMS) [px]."""
 _ROUNDS = 2
 """Most rounds of matching an update: bounds its time; the next update goes on."""
 _KNOWN = 0.5
@@ -59,7 +59,7 @@ class IncrementalUpdate:
         covariance: (7, 7) cluster-robust, of extrinsic and offset, once the kernel has its last scale; until
             then the solver's marginal, proximal prior included.
         kernel_px: scale of the kernel [px].
-        converged: the kernel has its last scale, without the proximal prior, and no term needs matching again.
+        converged: the kernel has its last scale, the proximal prior is gone, no term needs matching.
         rematched: how many factors were swapped.
         waiting: terms that have no factor, and why.
         warnings: what may be wrong.
@@ -189,7 +189,7 @@ class IncrementalTerms:
         return found, least
 
     def _swap(self, estimate: gtsam.Values) -> int:
-        """Match terms again that need it; new factors in, old ones and the old proximal prior out, in one update."""
+        """Match terms that need it; new factors in, old ones and the old proximal prior out, at once."""
         changed = [placed for placed in self._terms if self._needs_matching(placed, estimate)]
         graph, owners, removed = gtsam.NonlinearFactorGraph(), list[_Placed | None](), list[int]()
         for placed in changed:

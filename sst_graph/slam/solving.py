@@ -1,10 +1,10 @@
 """Matching again while a graph is solved: Levenberg-Marquardt, and what all solvers share.
 
-The loop solves with frozen matches, matches again at the solution, and narrows the robust kernel wherever a round has moved the matched points little beside it
-(deterministic annealing, as in robust ICP). While the kernel is wide, what the matches hardly determine is held
-by a *proximal* prior on extrinsic and offset about the present estimate, whose sigmas are a kernel's width
-in the image: matches inform no farther than they reach. It follows the estimate, so it adds no bias, and it
-is removed at the end.
+The loop solves with frozen matches, matches again at the solution, and narrows the robust kernel
+wherever a round has moved the matched points little beside it (deterministic annealing, as in robust ICP).
+While the kernel is wide, what the matches hardly determine is held by a *proximal* prior on extrinsic and
+offset about the present estimate, whose sigmas are a kernel's width in the image: matches inform no farther
+than they reach. It follows the estimate, so it adds no bias, and it is removed at the end.
 
 The covariance of extrinsic and offset is cluster-robust (:mod:`sst_graph.slam.covariance`), and the factors
 are scaled down by its mean ratio to what they claim, so that the marginals of the graph itself have the same
@@ -41,8 +41,8 @@ from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings
 FloatArray = NDArray[np.float64]
 
 _STEP_PX = 0.1
-"""At the last scale, a round that moves the matched points by less (RMS) ends the loop [px]: matches that come
-and go in turn move them by a few hundredths for ever."""
+"""At the last scale, a round that moves the matched points by less (RMS) ends the loop [px]: matches
+that come and go in turn move them by a few hundredths for ever."""
 _INNER_ITERATIONS = 4
 """Most Levenberg-Marquardt iterations on frozen matches: more would only be undone by the next matches."""
 

@@ -12,7 +12,7 @@ import pytest
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.graph import HandEyeTerm
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.inspection_words import inspection_text

@@ -13,7 +13,6 @@ from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.frame_information import KEY, FrameInformation, to_document
 from sst_graph.inspect.inspection import (
-    InspectConfig,
     camera_sigmas,
     correlation_matrix,
     inspect_result,
@@ -145,7 +144,7 @@ def test_two_digits(value: float, text: str) -> None:
 
 def test_the_text_of_a_result_with_frames() -> None:
     covariance = np.diag(SIGMAS**2)
-    text = inspection_text(inspect_result(result_of(covariance, FRAMES), InspectConfig(next_frames=7)))
+    text = inspection_text(inspect_result(result_of(covariance, FRAMES), next_frames=7))
     lines = text.splitlines()
     (lidar,) = [line for line in lines if line.startswith("rotation about the LiDAR")]
     (camera,) = [line for line in lines if line.startswith("rotation about the camera")]
