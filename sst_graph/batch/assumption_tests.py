@@ -56,7 +56,7 @@ _MOST_AT_LAST_SCALE = 4
 
 @dataclass(frozen=True)
 class Finding:
-    """What the data say of one assumption's parameter while all other assumptions hold.
+    """The estimate of one assumption's parameter while all other assumptions hold.
 
     Attributes:
         assumption: which.
@@ -116,7 +116,7 @@ class SolvedProblem:
 
 @dataclass(frozen=True)
 class ExaminedAssumptions:
-    """The assumptions of a joint estimate: what the data say of them, and what they add to the covariance.
+    """The assumptions of a joint estimate: tests against the data, and what they add to the covariance.
 
     Attributes:
         findings: of the tests, the most contradicted first.
@@ -145,7 +145,7 @@ def examine_assumptions(problem: JointProblem, estimate: Estimate) -> ExaminedAs
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
-    """What the data say of every assumption that the matches test, the most contradicted first."""
+    """Test every assumption that the matches can test; the most contradicted first."""
     if not config.test:
         return ()
     estimated = dict(named_sigmas(problem.problem.config.joint.graph.estimate))
@@ -301,7 +301,7 @@ def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
 
 
 def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
-    """JSON-able: what each assumption adds to the covariance, and what the data say of it.
+    """JSON-able: what each assumption adds to the covariance, and the test of it.
 
     By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the answer
     [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.

@@ -123,7 +123,7 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
     if config.time_offset_per_drive and config.method != "joint":
         raise ConfigError(f"time_offset_per_drive needs method joint, found {config.method}")
     if config.time_offset_per_drive and config.use_motion == "always":
-        raise ConfigError("use_motion always knows one time offset only: leave out time_offset_per_drive")
+        raise ConfigError("use_motion=always has one time offset only: leave out time_offset_per_drive")
 
 
 def answer_joint(

@@ -1,8 +1,8 @@
 """Edges towards the ground: matched only where image and LiDAR labels mean the same by them.
 
-They tell roll and height better than any other edge. But some labels end an object at its body, others
-at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Nothing but
-the data tells which: where the two sorts of labels agree, most lower edges lie within the narrow kernel of
+They determine roll and height better than any other edge. But some labels end an object at its body, others
+at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Only the
+data show which: where the two sorts of labels agree, most lower edges lie within the narrow kernel of
 the last iterations; where they do not, distances are spread as widely as a kernel can see.
 """
 

@@ -138,7 +138,7 @@ class HandEyeTerm:
 
 
 def hand_eye_terms(pairs: Sequence[MotionPair], state: State) -> tuple[list[HandEyeTerm], NoiseScales]:
-    """A factor for every pair, and the scales at which half of the residuals are as small as they claim.
+    """A factor for every pair, and the scales at which half of the residuals are within their sigmas.
 
     The factors' noise is scaled so; robust weights are frozen at the state.
     """
@@ -184,7 +184,7 @@ def state_values(state: State) -> gtsam.Values:
 
 
 def _term(pair: MotionPair, state: State) -> HandEyeTerm:
-    """The factor of a pair, with the noise that the odometry claims."""
+    """The factor of a pair, with the noise that the odometry states."""
     step, motion = pair.lidar, pair.camera.motion
     predicted = state.cTl * step.aTb * state.cTl.inverse()
     length = float(np.linalg.norm(predicted.translation()))

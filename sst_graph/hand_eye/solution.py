@@ -76,7 +76,7 @@ class MotionSolution:
         state: the estimate.
         centre: of the priors.
         terms: its factors, under the noise that the residuals have.
-        scales: that noise, in multiples of what odometry claims.
+        scales: that noise, in multiples of what odometry states.
         covariance: (7, 7).
         cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
         outer_iterations: done.

@@ -1,6 +1,6 @@
-"""What methods other than the joint one can say of each frame, as it stands in ``calibration.json``.
+"""Information gained by frame, of methods other than the joint one, as it stands in ``calibration.json``.
 
-Under ``diagnostics.information_gained``: the tracker tells what each scan brought as it came, the hand-eye
+Under ``diagnostics.information_gained``: for the tracker what each scan added when it came, for the hand-eye
 method what each pair of motions adds to the others. Both are less than
 :mod:`sst_graph.inspect.frame_information`: no view is kept, so what to record next cannot be predicted.
 """
@@ -46,7 +46,7 @@ class Gain:
 
 @dataclass(frozen=True)
 class Gained:
-    """All of them, in their order; ``kind`` tells what bits and values mean."""
+    """All of them, in their order; ``kind`` says what bits and values mean."""
 
     kind: Kind
     gains: tuple[Gain, ...]
@@ -84,7 +84,7 @@ def to_document(gained: Gained) -> dict[str, Any]:
 
 
 def gained_of(result: CalibrationResult) -> Gained | None:
-    """What a result says of each frame, or None.
+    """Information gained by frame in a result, or None.
 
     Raises:
         DataError: the entry is there, and is not such columns.

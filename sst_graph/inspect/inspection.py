@@ -28,7 +28,7 @@ HUMAN: FloatArray = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
 """(7,) from SI to :data:`UNITS`."""
 
 RANGES_M = (5.0, 20.0, 50.0)
-"""Ranges for which the error in the image is told [m]."""
+"""Ranges for which the error in the image is given [m]."""
 
 
 STRONG = 0.6
@@ -87,11 +87,11 @@ class Inspection:
         correlation: (7, 7).
         strong: the strongest correlations, strongest first.
         weakest: the direction known worst, measured in the limits, also where it is within them.
-        frames: what each frame brought; empty where the result does not tell.
+        frames: what each frame brought; empty where the result has none.
         redundant: positions in ``frames`` of those that each could be left out ...
         redundant_share: ... without any sigma growing by more than this share.
         plan: what to record next, or None without ``frames``.
-        gained: what else the result says of each frame, or None.
+        gained: other information by frame in the result, or None.
     """
 
     result: CalibrationResult

@@ -25,7 +25,7 @@ from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run,
 from sst_graph.experiments.wrong_drives import with_focal
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, nuisance_key
-from sst_graph.inspect.budget_words import budget_lines
+from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.result import CalibrationResult
 
 CONFIG = with_overrides(

@@ -15,7 +15,7 @@ from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
-from sst_graph.inspect.inspection_words import inspection_text
+from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.tracker.window.arrivals import Arrivals
 
@@ -102,7 +102,7 @@ def test_the_tracker_s_scans_in_words_and_in_json() -> None:
 @pytest.mark.parametrize("method", ["paper", "static", "semalign", "track", "joint"])
 def test_where_nothing_can_be_said_it_says_why(method: str) -> None:
     text = inspection_text(inspect_result(_result(method)))
-    assert f"cannot be told for this result of method {method}: " in text
+    assert f"is not known for this result of method {method}: " in text
     assert ("independent" in text) == (method in ("paper", "static", "semalign"))
 
 

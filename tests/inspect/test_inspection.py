@@ -23,7 +23,7 @@ from sst_graph.inspect.inspection import (
     to_dict,
     weakest_direction,
 )
-from sst_graph.inspect.inspection_words import (
+from sst_graph.inspect.inspection_text import (
     correlation_sentence,
     frame_list,
     inspection_text,
@@ -165,7 +165,7 @@ def test_the_text_without_frames_says_so() -> None:
         drive_offsets=(DriveOffset("a/00", 0.05, 0.001), DriveOffset("b/00", -0.02, 0.002)),
     )
     text = inspection_text(inspect_result(result))
-    assert "what each frame brought cannot be told" in text
+    assert "what each frame brought is not known" in text
     assert "reason       it moved on" in text and "b/00: -20.00 ms, sigma 2.0 ms" in text
 
 

@@ -13,7 +13,7 @@ from sst_graph.cli.reading import reading_words
 from sst_graph.errors import ConfigError
 from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.inspect.inspection import Inspection, inspect_result, to_dict
-from sst_graph.inspect.inspection_words import inspection_text
+from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.viz.inspection import inspection_plots
 
 PLOTS = OutputKind("folder of plots")

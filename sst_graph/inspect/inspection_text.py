@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.inspect.budget_words import budget_lines
+from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.inspect.frame_information import FrameInformation
-from sst_graph.inspect.gained_words import MOST_FRAMES, SHORT, gained_lines, short
+from sst_graph.inspect.gained_text import MOST_FRAMES, SHORT, gained_lines, short
 from sst_graph.inspect.inspection import (
     HUMAN,
     NAMES,
