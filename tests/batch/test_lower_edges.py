@@ -10,7 +10,7 @@ import pytest
 from streets import prepared_street, standing_street
 
 from sst_graph.batch.config import LowerEdgesConfig
-from sst_graph.batch.lower_edges import lower_edge_support, with_lower_edges
+from sst_graph.batch.lower_edges import MIN_CONCENTRATION, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.building import Tracks, associate
@@ -71,7 +71,7 @@ def test_used_where_the_labels_agree() -> None:
     drive = street()
     below = with_lower_edges([drive], Tracks([drive]), [solved(drive)], JOINT, CONFIG)
     assert below.joint.graph.lower_edges == (VEHICLE,)
-    assert below.concentration[VEHICLE] > CONFIG.min_concentration
+    assert below.concentration[VEHICLE] > MIN_CONCENTRATION
     truth = standing_street().truth.cTl
     off = [
         np.linalg.norm(truth.localCoordinates(s.state.cTl)[:3])
@@ -87,7 +87,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
     config = replace(CONFIG, use=use)
     tracks = Tracks([drive])
     shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(config)[1]
-    assert shares[VEHICLE] < CONFIG.min_concentration
+    assert shares[VEHICLE] < MIN_CONCENTRATION
     below = with_lower_edges([drive], tracks, [(one, centre)], JOINT, config)
     if use == "always":
         assert below.joint.graph.lower_edges == (VEHICLE,)
