@@ -17,14 +17,14 @@ import gtsam
 import numpy as np
 
 from sst_graph import CalibrationConfig
+from sst_graph.batch.answer import Guess
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.contradictions import Contradictions, find_contradictions
-from sst_graph.batch.parts import Parts
+from sst_graph.batch.part_solver import PartSolver
+from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, JointProblem, solve_joint
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
 from sst_graph.graph.state import State
-from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.types import Frame, Source
 
@@ -101,11 +101,10 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
     config = CalibrationConfig()
     joint = replace(config.joint, graph=replace(config.joint.graph, lower_edges=tuple(config.classes)))
     drives = prepare_drives([source], config)
-    objects = [object_tracks(drive) for drive in drives]
-    tracks = Tracks(drives, objects)
-    solution = solve_joint(JointProblem(drives, tracks, joint), start, NARROW_KERNELS_PX)
-    parts = Parts(drives, tracks, objects, solution.state, joint, config.assumptions)
-    return find_contradictions(parts, config.contradictions)
+    guess = Guess(start.cTl, start.offsets_s[0])
+    problem = CalibrationProblem.of(drives, guess, replace(config, joint=joint))
+    solution = solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
+    return find_contradictions(PartSolver(problem, solution.state))
 
 
 def found_in(seed: int, edits: Sequence[Callable[[list[Frame]], list[Frame]]]) -> list[Contradictions | None]:

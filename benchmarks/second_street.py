@@ -2,7 +2,7 @@
 
 What holds on one simulator may hold of that simulator only. This one builds its streets from convex bodies:
 a LiDAR ray meets a body where it enters its half-spaces last, and a mask is the filled hulls of the bodies'
-corners, the farther ones first. Rays are ideal, lasers sit in one point, cars have open lower edges.
+corners, the farther ones first. Rays are ideal, lasers sit in one point, cars have open undersides.
 """
 
 from __future__ import annotations

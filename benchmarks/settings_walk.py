@@ -37,7 +37,7 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.types import Frame, GroundTruth
 
 FRAMES = 6
-METHODS = {"paper": "paper", "semalign": "semalign", "challenge": "paper", "motion": "motion"}
+METHODS = {"paper": "paper", "semalign": "semalign", "motion": "motion"}
 """Method that a table of settings belongs to; ``joint`` for the others."""
 QUICK = {"joint": ("start.enabled=false",), "semalign": ("semalign.starts=200",)}
 """What makes a method quick, for settings that have nothing to do with it."""

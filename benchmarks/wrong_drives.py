@@ -1,6 +1,6 @@
 """Drives made wrong on purpose, each in one way that happens to people: units, axes, sizes, stamps, labels.
 
-``LIES`` maps the name of each to a function of the drive as it is; benchmarks/wrong_input.py tries them.
+``INPUT_FAULTS`` maps the name of each to a function of the drive; benchmarks/wrong_input.py tries them.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def with_images_of(
     return replace(drive, frames=tuple(frames))
 
 
-Lie = Callable[[KeptDrive, KeptDrive], KeptDrive]
+InputFault = Callable[[KeptDrive, KeptDrive], KeptDrive]
 """From a drive, and another one, to the wrong drive; the calibration starts from its nominal pose."""
 
 
@@ -167,7 +167,7 @@ def _in_millimetres(cTl: gtsam.Pose3) -> gtsam.Pose3:
 
 _CAMERA_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
-LIES: dict[str, Lie] = {
+INPUT_FAULTS: dict[str, InputFault] = {
     "half-size images": lambda d, o: resized(d, 0.5),
     "half-size masks": lambda d, o: _half_masks(d),
     "stamps in ms": lambda d, o: with_stamps(d, 10**3),
@@ -250,4 +250,4 @@ NAMED: dict[str, str] = {
     "masks shifted 6 px": "the masks are shifted right",
     "right camera": "the pictures are those of another camera",
 }
-"""Words of the sentence that names each lie rightly. That all stamps are doubled or tenfold no data tell."""
+"""Words of the sentence that names each fault rightly; no data show that all stamps are doubled."""

@@ -1,7 +1,7 @@
 """Drives made wrong on purpose, calibrated as a user would: status, named cause, error. Prints a table.
 
     OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --seeds 201 202
-    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --drive DATA --image-shift 1 --lies "Tr inverted" clean
+    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --drive DATA --faults "Tr inverted" clean
 
 Streets have 30 frames (--frames) of 621x188 px, and start from the pose that the data bring. --quick leaves
 the solution out where something is certain before it: the status is then never ok.
@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
-from wrong_drives import LIES, NAMED, right_camera
+from wrong_drives import INPUT_FAULTS, NAMED, right_camera
 
 from sst_graph import CalibrationConfig, open_source
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
@@ -33,7 +33,7 @@ def street(seed: int, frames: int, right: bool = False) -> KeptDrive:
 
 
 def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
-    """A line of the table, and whether it is as it should be: a lie named and not ok, clean data silent."""
+    """A line of the table, and whether it is as it should be: a fault named and not ok, clean data silent."""
     config = CalibrationConfig()
     try:
         prepared = prepare_drives([drive], config)
@@ -66,7 +66,7 @@ def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive
         drive = KeptDrive.of(source, sweep="auto")
         yield path.name, drive, other or drive, None
     for seed in args.seeds:
-        beside = street(seed, args.frames, right=True) if RIGHT in args.lies else None
+        beside = street(seed, args.frames, right=True) if RIGHT in args.faults else None
         yield str(seed), street(seed, args.frames), street(seed + 1000, args.frames), beside
 
 
@@ -78,18 +78,20 @@ def main() -> None:
     parser.add_argument("--image-shift", type=int, default=0)
     parser.add_argument("--frames", type=int, default=30)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--lies", nargs="*", default=[CLEAN, *LIES, RIGHT])
+    parser.add_argument("--faults", nargs="*", default=[CLEAN, *INPUT_FAULTS, RIGHT])
     args = parser.parse_args()
     right, total = 0, 0
     for name, drive, other, beside in drives(args):
-        for lie in args.lies:
-            if lie == RIGHT and beside is None:
+        for fault in args.faults:
+            if fault == RIGHT and beside is None:
                 continue
-            wrong = drive if lie == CLEAN else beside if lie == RIGHT else LIES[lie](drive, other)
+            wrong = (
+                drive if fault == CLEAN else beside if fault == RIGHT else INPUT_FAULTS[fault](drive, other)
+            )
             assert wrong is not None
-            text, as_it_should = row(lie, wrong, args.quick)
+            text, as_it_should = row(fault, wrong, args.quick)
             right, total = right + as_it_should, total + 1
-            print(f"{name} | {lie} | {'yes' if as_it_should else 'NO'} | {text}", flush=True)
+            print(f"{name} | {fault} | {'yes' if as_it_should else 'NO'} | {text}", flush=True)
     print(f"{right} of {total} as they should be")
 
 

@@ -5,7 +5,7 @@ The cost of a calibration (cTl, offset), in the tangent space of the linearizati
     0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - offset_0]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
-docs/export.md tells how a C++ program rebuilds it from the JSON.
+docs/export.md shows how a C++ program rebuilds it from the JSON.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class CalibrationMarginal(ByValue):
         """(7, 7) inverse of the information.
 
         Raises:
-            EstimationError: a direction that the information does not tell.
+            EstimationError: a direction without information.
         """
         return inverse(self.information, "information of a marginal")
 
@@ -84,7 +84,7 @@ class CalibrationMarginal(ByValue):
         """cTl and offset [s] of the least cost.
 
         Raises:
-            EstimationError: a direction that the information does not tell.
+            EstimationError: a direction without information.
         """
         d = self.covariance() @ self.vector
         return self.cTl.retract(d[:6]), self.offset_s + float(d[6])
@@ -169,7 +169,7 @@ def _information(table: JsonTable) -> FloatArray:
     diagonal = np.diag(L)
     if (diagonal < 0.0).any():
         raise DataError(place, f"{diagonal.min():.3g} on the diagonal", "at least 0")
-    # Of a direction that nothing tells there is no information: rounding is measured by the largest entry.
+    # A direction may have no information: rounding is measured by the largest entry.
     scale = np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max(initial=0.0) + 1e-300))
     unit = L / scale[:, None] / scale
     if (np.abs(unit - unit.T) > 1e-6).any():

@@ -36,7 +36,7 @@ FORMAT = "sst-graph/calibration"
 VERSION = 1
 
 WALL_CLOCK = "seconds"
-"""Entry of the diagnostics that tells how long each stage took [s]; it is not written."""
+"""Entry of the diagnostics: how long each stage took [s]; it is not written."""
 
 DIRECTION_SCALES: FloatArray = np.array([np.radians(0.1)] * 3 + [0.01] * 3 + [0.001])
 """(7,) one scaled unit of a weak direction: 0.1 deg [rad], 1 cm [m], 1 ms [s]."""
@@ -44,14 +44,14 @@ DIRECTION_SCALES: FloatArray = np.array([np.radians(0.1)] * 3 + [0.01] * 3 + [0.
 
 @dataclass(frozen=True, eq=False)
 class WeakDirection(ByValue):
-    """A combination of the unknowns that the data hardly tells.
+    """A combination of the unknowns that the data hardly determine.
 
     Attributes:
         vector: (7,) unit vector in scaled units (:data:`DIRECTION_SCALES`), order of the covariance; where
             drives have a time offset each, the last is that of the drive which the sentence begins with.
         sigma: standard deviation along it, in scaled units; large but finite.
-        sentence: what cannot be told, in words and numbers.
-        advice: what to record to tell it.
+        sentence: what is not observable, in words and numbers.
+        advice: what to record to determine it.
     """
 
     vector: FloatArray
@@ -101,7 +101,7 @@ class CalibrationResult:
         camera: the camera that T_camera_lidar belongs to.
         camera_name: its name in the data, such as ``image_2``.
         reasons: one sentence for each cause of a status that is not ``ok``.
-        weak_directions: what the data hardly tells, weakest first.
+        weak_directions: what the data hardly determine, weakest first.
         frames_used: the frames that took part.
         drive_offsets: an offset for each drive, where one each was asked for.
         method: name of the method.

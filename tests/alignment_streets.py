@@ -106,7 +106,7 @@ class Street:
             trajectory.append(X(k), stamp_ns)
             new = [self.term(k, keys)] if k < len(self.images) else []
             terms.update(graph, values, new, {X(k): 1e-9 * (stamp_ns - self.stamps_ns[0])})
-        return terms.settle(20)
+        return terms.converge(20)
 
     def errors(self, values: gtsam.Values) -> tuple[float, float, float]:
         """Rotation [deg], translation [m] and offset [s] from the truth."""

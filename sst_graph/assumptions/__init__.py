@@ -1,4 +1,4 @@
-"""What a calibration takes for granted: tested against the data, considered in the covariance, or estimated.
+"""What a calibration assumes: tested against the data, considered in the covariance, or estimated.
 
 One more assumption is one more small file here, and its name in :data:`ASSUMPTIONS`.
 """

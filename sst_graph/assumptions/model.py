@@ -1,4 +1,4 @@
-"""What a calibration takes for granted, as parameters: an assumption is that its parameter is zero.
+"""What a calibration assumes, as parameters: an assumption is that its parameter is zero.
 
 A nuisance parameter theta acts on a match in at most four ways: it moves the point (a range that is too
 long), changes the interval from the point to its image (a sweep that is not compensated), moves the pixel
@@ -73,7 +73,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Assumption:
-    """One parameter that is taken to be zero.
+    """One parameter that is held at zero.
 
     Attributes:
         name: as it stands in settings and results.

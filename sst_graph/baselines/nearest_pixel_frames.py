@@ -200,7 +200,7 @@ def frozen_covariance(
 ) -> FloatArray:
     """(7, 7) covariance as if the matches were certain and independent, scaled by their mean square.
 
-    Too sure: neighbouring matches err together, and interior points claim half a pixel.
+    Too small: neighbouring matches err together, and interior points claim half a pixel.
 
     Raises:
         EstimationError: no point of any frame falls on its image.

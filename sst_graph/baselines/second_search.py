@@ -1,4 +1,4 @@
-"""A second opinion on an answer: does the global search, begun there, explain the labels better elsewhere?"""
+"""A second search around an answer: is there a pose nearby that explains the labels better?"""
 
 from __future__ import annotations
 
@@ -8,28 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, spread
-from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
 from sst_graph.initialization.global_search import FINE, SearchConfig, SearchProblem, search_steps
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
 from sst_graph.stepwise import whole
 from sst_graph.types import SemanticClass
 
-
-@dataclass(frozen=True)
-class SecondSearchConfig(Settings):
-    """When an answer is believed.
-
-    Attributes:
-        min_ratio: its score, at least, as a fraction of the best that the search finds around it.
-    """
-
-    min_ratio: float = setting(0.9, at_least=0.0, at_most=1.0)
+_MIN_RATIO = 0.9
+"""Least score of an answer as a fraction of the best one found around it: below 1, for the labels' own errors
+move the best score's place a little."""
 
 
 @dataclass(frozen=True)
-class Challenge:
-    """Scores of a start, of an answer, and of the best pose that the search finds around the answer.
+class SecondSearch:
+    """Scores of a start, of an answer, and of the best pose that a search finds around the answer.
 
     All in the units of :class:`~sst_graph.initialization.global_search.Candidate`: 0 is chance.
     """
@@ -38,14 +30,15 @@ class Challenge:
     answer: float
     best: float
 
-    def doubts(self, config: SecondSearchConfig) -> list[str]:
-        """Why the answer is not to be believed, in sentences; none for one that stands."""
+    @property
+    def reasons(self) -> list[str]:
+        """Why the answer may be wrong, in sentences; none for one that scores best."""
         found = []
         if self.answer < self.start:
             found.append(
                 f"the labels agree less than at the start (score {self.answer:.3f} against {self.start:.3f})"
             )
-        if self.answer < config.min_ratio * self.best or self.best <= 0.0:
+        if self.answer < _MIN_RATIO * self.best or self.best <= 0.0:
             found.append(
                 f"another pose nearby explains the labels better (score {self.best:.3f} against "
                 f"{self.answer:.3f}): give a closer start, or use method joint"
@@ -53,14 +46,14 @@ class Challenge:
         return found
 
 
-def challenge(
+def search_again(
     frames: Sequence[MatchFrame],
     drives: Sequence[Drive],
     classes: Sequence[SemanticClass],
     start: Calibration,
     answer: Calibration,
     config: SearchConfig,
-) -> Challenge:
+) -> SecondSearch:
     """Search the surroundings of an answer, on the frames of the drive that has most.
 
     Points of all classes vote on the masks: a score that no nearest-pixel method maximises.
@@ -71,16 +64,16 @@ def challenge(
     numbers = [frame.pair.drive for frame in frames]
     richest = max(set(numbers), key=numbers.count)
     own = spread([frame for frame in frames if frame.pair.drive == richest], config.frames)
-    looked_at = [_search_frame(frame, answer) for frame in own]
+    chosen = [_search_frame(frame, answer) for frame in own]
     camera = drives[richest].camera
-    problem = SearchProblem(looked_at, camera, classes, answer.cTl, answer.offset_s, config)
+    problem = SearchProblem(chosen, camera, classes, answer.cTl, answer.offset_s, config)
     best = whole(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
-    points = LabelledPoints.sampled(looked_at, camera, classes, config.points_per_class, rng)
+    points = LabelledPoints.sampled(chosen, camera, classes, config.points_per_class, rng)
     agreement = points.agreement_map(FINE[-1].blur_px, FINE[-1].share)
     scores = whole(agreement.score_steps(_states([start, answer])))
-    cells = len(looked_at) * CELLS[0] * CELLS[1]
-    return Challenge(float(scores[0]) / cells, float(scores[1]) / cells, best.score)
+    cells = len(chosen) * CELLS[0] * CELLS[1]
+    return SecondSearch(float(scores[0]) / cells, float(scores[1]) / cells, best.score)
 
 
 def _states(calibrations: Sequence[Calibration]) -> States:

@@ -1,8 +1,8 @@
 """SST-Calib as printed (Kodaira, Zhou, Zang, Zhan, Tomizuka, ITSC 2022): the static and the joint stage.
 
 Where the print is silent: frames are those of equal stamps, spread over the drive; the time offset starts
-at the guess; camera velocity comes from visual odometry with LiDAR depth, renewed every few steps because
-the depth hangs on extrinsic and offset; a re-match is followed by one Levenberg-Marquardt step.
+at the guess; camera velocity comes from visual odometry with LiDAR depth, computed anew every few
+steps because the depth depends on extrinsic and offset; one Levenberg-Marquardt step follows each match.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from sst_graph.baselines.nearest_pixel_frames import (
 )
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.errors import EstimationError
 from sst_graph.factors import beta_regularizer
 from sst_graph.graph.state import EXTRINSIC
 from sst_graph.odometry import metric_motions, standstill_frames
@@ -36,39 +36,31 @@ _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 
+_STATIC_PHASES = ((20.0, 20), (1.0, 30), (0.02, 10))
+"""w_l of each phase of the static stage, and its iterations: the paper's."""
+_JOINT_WEIGHT, _JOINT_ITERATIONS = 5.0, 20
+"""w_l of the joint stage, and its iterations: the paper's."""
+_PIXEL_SHARE = 0.02
+"""Share of the mask's pixels that are matched: the paper's."""
+_VELOCITY_EVERY = 5
+"""Iterations of the joint stage between renewals of the velocities: the paper does not say how many."""
+
+
 @dataclass(frozen=True)
 class PaperConfig(Settings):
-    """Both stages, with the paper's numbers.
+    """What the paper leaves open, and the weights of its regularizer.
 
     Attributes:
-        static_weights, static_iterations: w_l of each phase of the static stage, and its iterations.
-        joint_weight, joint_iterations: w_l of the joint stage, and its iterations.
-        lambda_t, lambda_r: weights of the regularizer beta [1/m^2], [1/rad^2].
-        pixel_share: share of the mask's pixels that are matched.
+        lambda_t, lambda_r: weights of the regularizer beta [1/m^2], [1/rad^2]; the defaults are the paper's.
         static_frames, joint_frames: most frames of each stage.
-        velocity_every: iterations of the joint stage between renewals of the velocities.
         seed: of the sample of pixels.
     """
 
-    static_weights: tuple[float, ...] = setting((20.0, 1.0, 0.02), at_least=0.0, at_most=1e6, length=(1, 20))
-    static_iterations: tuple[int, ...] = setting((20, 30, 10), at_least=1, at_most=1000, length=(1, 20))
-    joint_weight: float = setting(5.0, at_least=0.0, at_most=1e6)
-    joint_iterations: int = setting(20, at_least=1, at_most=1000)
     lambda_t: float = setting(1e6, at_least=1e-6, at_most=1e15)
     lambda_r: float = setting(1e9, at_least=1e-6, at_most=1e15)
-    pixel_share: float = setting(0.02, at_least=0.0001, at_most=1.0)
     static_frames: int = setting(5, at_least=1, at_most=1000)
     joint_frames: int = setting(20, at_least=1, at_most=1000)
-    velocity_every: int = setting(5, at_least=1, at_most=1000)
     seed: int = setting(0, at_least=0, at_most=10**15)
-
-    def __post_init__(self) -> None:
-        weights, iterations = len(self.static_weights), len(self.static_iterations)
-        if weights != iterations:
-            raise ConfigError(
-                f"static_weights: found {weights} of them, expected {iterations}, one for each of "
-                "static_iterations"
-            )
 
 
 @dataclass(frozen=True)
@@ -78,16 +70,16 @@ class NearestSolution:
     Attributes:
         calibration: the estimate.
         covariance: (7, 7) of the frozen matches.
-        creep: (7,) way that the last step would make in as many steps again as its phase had [rad, m, s]:
-            a fixed number of steps may end on the way.
-        frames: those that took part, moving as they were taken to.
+        remaining_step: (7,) the last step times the number of steps of its phase [rad, m, s]: a fixed number
+            of steps may end before the optimum.
+        frames: those that took part, with the velocities that were used.
         reasons: what was missing.
         diagnostics: JSON-able numbers.
     """
 
     calibration: Calibration
     covariance: FloatArray
-    creep: FloatArray
+    remaining_step: FloatArray
     frames: tuple[MatchFrame, ...]
     reasons: tuple[str, ...] = ()
     diagnostics: dict[str, object] = field(default_factory=dict)
@@ -101,87 +93,115 @@ class StillFrames:
     reasons: tuple[str, ...] = ()
 
 
-def solve_paper(
-    drives: Sequence[Drive],
-    guess: Calibration,
-    classes: Sequence[SemanticClass],
-    config: PaperConfig,
-    progress: Progress | None = None,
-) -> NearestSolution:
+@dataclass(frozen=True)
+class PaperProblem:
+    """Drives for the nearest-pixel methods, and how they are matched.
+
+    Attributes:
+        drives: what is kept of them.
+        classes: to match.
+        config: settings of both stages.
+        progress: called with (stage, steps done, steps in all).
+    """
+
+    drives: Sequence[Drive]
+    classes: Sequence[SemanticClass]
+    config: PaperConfig
+    progress: Progress | None = None
+
+    def motions(self, at: Calibration) -> list[list[RelativeMotion]]:
+        """Of each drive's camera, with the depth of LiDAR points at rest."""
+        return camera_motions(self.drives, at, [None] * len(self.drives))
+
+    def standstill(self, motions: Sequence[Sequence[RelativeMotion]]) -> list[NDArray[np.bool_]]:
+        """Whether the vehicle stands at each image of each drive; nowhere where no motion is known."""
+        return [
+            standstill_frames(found) if found else np.zeros(len(drive.images), np.bool_)
+            for drive, found in zip(self.drives, motions, strict=True)
+        ]
+
+    def frames(self, pairs: Sequence[FramePair], most: int | None = None) -> list[MatchFrame]:
+        """Frames of those pairs that show a class to both sensors; at most so many, evenly spread."""
+        found = match_frames(pairs, self.drives, self.classes, _PIXEL_SHARE, self.config.seed)
+        return found if most is None else spread(found, most)
+
+    def still(self, stands: Sequence[NDArray[np.bool_]]) -> list[MatchFrame]:
+        """Standing frames for the static stage."""
+        chosen = [p for p in frame_pairs(self.drives) if stands[p.drive][p.image_position]]
+        return self.frames(chosen, self.config.static_frames)
+
+    def moving(
+        self, motions: Sequence[Sequence[RelativeMotion]], stands: Sequence[NDArray[np.bool_]]
+    ) -> list[MatchFrame]:
+        """Moving frames whose velocity is known, for the joint stage."""
+        chosen = []
+        for p in frame_pairs(self.drives):
+            known = motions[p.drive]
+            if known and not stands[p.drive][p.image_position] and known[max(0, p.image_position - 1)].ok:
+                chosen.append(p)
+        return self.frames(chosen, self.config.joint_frames)
+
+
+def solve_paper(problem: PaperProblem, guess: Calibration) -> NearestSolution:
     """The static stage on standing frames, then the joint stage on moving ones.
 
     Raises:
         EstimationError: no standing frame, or no point of a class on any image.
     """
     # 1. Standing and moving frames by visual odometry.
-    pairs = frame_pairs(drives)
-    motions = camera_motions(drives, guess, [None] * len(drives))
-    stands = _standing_images(drives, motions)
-    still = _standing(pairs, drives, stands, classes, config)
+    motions = problem.motions(guess)
+    stands = problem.standstill(motions)
+    still = problem.still(stands)
     if not still:
         raise EstimationError(
             "no standing frame shows the classes to both sensors: the static stage needs the vehicle at rest"
         )
     # 2. The static stage.
-    static, static_creep = _static_stage(still, guess, config, progress)
+    static, static_remaining = _static_stage(still, guess, problem.progress)
     # 3. The joint stage.
-    moving = _moving(pairs, drives, motions, stands, classes, config)
+    moving = problem.moving(motions, stands)
     if not moving:
-        covariance = frozen_covariance(still, static, config.static_weights[-1])
+        covariance = frozen_covariance(still, static, _STATIC_PHASES[-1][0])
         reason = "no moving frame with a known velocity: the joint stage was left out"
         counts: dict[str, object] = {"standstill_frames": len(still)}
-        return NearestSolution(static, covariance, static_creep, tuple(still), (reason,), counts)
-    joint, creep, moving = _joint_stage(drives, moving, static, motions, config, progress)
-    # 4. What holds the extrinsic is the standing frames themselves: they stand in beta's place.
-    covariance = frozen_covariance([*still, *moving], joint, config.joint_weight)
+        return NearestSolution(static, covariance, static_remaining, tuple(still), (reason,), counts)
+    joint, remaining, moving = _joint_stage(problem, moving, static, motions)
+    # 4. Covariance: the standing frames hold the extrinsic, in beta's place.
+    covariance = frozen_covariance([*still, *moving], joint, _JOINT_WEIGHT)
     counts = {"standstill_frames": len(still), "moving_frames": len(moving)}
-    # beta holds the extrinsic where the static stage left it: that stage's way is still to go.
-    creep[:6] = static_creep[:6]
-    return NearestSolution(joint, covariance, creep, (*still, *moving), (), counts)
+    # beta holds the extrinsic where the static stage left it, so that stage's remaining step counts.
+    remaining[:6] = static_remaining[:6]
+    return NearestSolution(joint, covariance, remaining, (*still, *moving), (), counts)
 
 
-def solve_static(
-    drives: Sequence[Drive],
-    guess: Calibration,
-    classes: Sequence[SemanticClass],
-    config: PaperConfig,
-    progress: Progress | None = None,
-) -> NearestSolution:
+def solve_static(problem: PaperProblem, guess: Calibration) -> NearestSolution:
     """The static stage alone; the time offset stays at the guess.
 
     Raises:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
-    still = still_frames(drives, guess, classes, config)
-    answer, creep = _static_stage(still.frames, guess, config, progress)
-    covariance = frozen_covariance(still.frames, answer, config.static_weights[-1])
+    still = still_frames(problem, guess)
+    answer, remaining = _static_stage(still.frames, guess, problem.progress)
+    covariance = frozen_covariance(still.frames, answer, _STATIC_PHASES[-1][0])
     counts: dict[str, object] = {"frames": len(still.frames)}
-    return NearestSolution(answer, covariance, creep, still.frames, still.reasons, counts)
+    return NearestSolution(answer, covariance, remaining, still.frames, still.reasons, counts)
 
 
-def still_frames(
-    drives: Sequence[Drive],
-    guess: Calibration,
-    classes: Sequence[SemanticClass],
-    config: PaperConfig,
-) -> StillFrames:
+def still_frames(problem: PaperProblem, guess: Calibration) -> StillFrames:
     """Standing frames that show the classes, or all frames that do where none is known to stand.
 
     Raises:
         EstimationError: no frame shows a class to both sensors.
     """
-    pairs = frame_pairs(drives)
-    motions = camera_motions(drives, guess, [None] * len(drives))
-    stands = _standing_images(drives, motions)
-    still = _standing(pairs, drives, stands, classes, config)
+    still = problem.still(problem.standstill(problem.motions(guess)))
     if still:
         return StillFrames(tuple(still))
-    every = match_frames(pairs, drives, classes, config.pixel_share, config.seed)
+    every = problem.frames(frame_pairs(problem.drives))
     if not every:
-        names = " or ".join(c.name.lower() for c in classes)
+        names = " or ".join(c.name.lower() for c in problem.classes)
         raise EstimationError(f"no frame in which LiDAR and camera both show {names}")
     return StillFrames(
-        tuple(spread(every, config.static_frames)),
+        tuple(spread(every, problem.config.static_frames)),
         ("no frame is known to stand: motion between scan and image was ignored",),
     )
 
@@ -222,84 +242,43 @@ class _Depth:
         return np.asarray(cPs - tau_s * velocity_at(self._former, position))
 
 
-def _standing_images(
-    drives: Sequence[Drive], motions: Sequence[Sequence[RelativeMotion]]
-) -> list[NDArray[np.bool_]]:
-    """Whether the vehicle stands at each image of each drive; nowhere where no motion is known."""
-    return [
-        standstill_frames(found) if found else np.zeros(len(drive.images), np.bool_)
-        for drive, found in zip(drives, motions, strict=True)
-    ]
-
-
 def velocity_at(motions: Sequence[RelativeMotion], image: int) -> FloatArray:
     """(3,) camera velocity at an image, from the motion that ended there [m/s]; v_k of the paper is -v."""
     return np.asarray(motions[max(0, image - 1)].mean_twist[3:])
 
 
-def _standing(
-    pairs: Sequence[FramePair],
-    drives: Sequence[Drive],
-    stands: Sequence[NDArray[np.bool_]],
-    classes: Sequence[SemanticClass],
-    config: PaperConfig,
-) -> list[MatchFrame]:
-    chosen = [p for p in pairs if stands[p.drive][p.image_position]]
-    frames = match_frames(chosen, drives, classes, config.pixel_share, config.seed)
-    return spread(frames, config.static_frames)
-
-
-def _moving(
-    pairs: Sequence[FramePair],
-    drives: Sequence[Drive],
-    motions: Sequence[Sequence[RelativeMotion]],
-    stands: Sequence[NDArray[np.bool_]],
-    classes: Sequence[SemanticClass],
-    config: PaperConfig,
-) -> list[MatchFrame]:
-    chosen = []
-    for p in pairs:
-        known = motions[p.drive]
-        if known and not stands[p.drive][p.image_position] and known[max(0, p.image_position - 1)].ok:
-            chosen.append(p)
-    frames = match_frames(chosen, drives, classes, config.pixel_share, config.seed)
-    return spread(frames, config.joint_frames)
-
-
 def _static_stage(
-    frames: Sequence[MatchFrame], start: Calibration, config: PaperConfig, progress: Progress | None
+    frames: Sequence[MatchFrame], start: Calibration, progress: Progress | None
 ) -> tuple[Calibration, FloatArray]:
-    """The estimate and its creep."""
-    at, creep = start, np.zeros(7)
-    done, total = 0, sum(config.static_iterations)
-    for weight, iterations in zip(config.static_weights, config.static_iterations, strict=True):
+    """The estimate and its remaining step."""
+    at, remaining = start, np.zeros(7)
+    done, total = 0, sum(iterations for _, iterations in _STATIC_PHASES)
+    for weight, iterations in _STATIC_PHASES:
         for _ in range(iterations):
             last, at = at, step_once(frames, at, weight)
-            creep = iterations * last.to(at)
+            remaining = iterations * last.to(at)
             done += 1
             if progress is not None:
                 progress("static stage", done, total)
-    return at, creep
+    return at, remaining
 
 
 def _joint_stage(
-    drives: Sequence[Drive],
+    problem: PaperProblem,
     frames: Sequence[MatchFrame],
     static: Calibration,
     motions: list[list[RelativeMotion]],
-    config: PaperConfig,
-    progress: Progress | None,
 ) -> tuple[Calibration, FloatArray, list[MatchFrame]]:
-    """The estimate, its creep, and the frames with the velocities that it was made with."""
-    beta = beta_regularizer(EXTRINSIC, static.cTl, config.lambda_t, config.lambda_r)
-    at, creep, moving = static, np.zeros(7), list(frames)
-    for iteration in range(config.joint_iterations):
-        if iteration % config.velocity_every == 0:
-            motions = camera_motions(drives, at, motions)
+    """The estimate, its remaining step, and the frames with the velocities that it was made with."""
+    beta = beta_regularizer(EXTRINSIC, static.cTl, problem.config.lambda_t, problem.config.lambda_r)
+    at, remaining, moving = static, np.zeros(7), list(frames)
+    for iteration in range(_JOINT_ITERATIONS):
+        if iteration % _VELOCITY_EVERY == 0:
+            motions = camera_motions(problem.drives, at, motions)
             moving = [f.moving_at(velocity_at(motions[f.pair.drive], f.pair.image_position)) for f in moving]
-        last, at = at, step_once(moving, at, config.joint_weight, beta, offset_free=True)
-        creep = config.joint_iterations * last.to(at)
-        if progress is not None:
-            progress("joint stage", iteration + 1, config.joint_iterations)
-    _LOG.info("paper: offset %.4f s after %d joint iterations", at.offset_s, config.joint_iterations)
-    return at, creep, moving
+        last, at = at, step_once(moving, at, _JOINT_WEIGHT, beta, offset_free=True)
+        remaining = _JOINT_ITERATIONS * last.to(at)
+        if problem.progress is not None:
+            problem.progress("joint stage", iteration + 1, _JOINT_ITERATIONS)
+    _LOG.info("paper: offset %.4f s after %d joint iterations", at.offset_s, _JOINT_ITERATIONS)
+    return at, remaining, moving

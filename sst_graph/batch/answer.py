@@ -24,6 +24,8 @@ from sst_graph.covariance.observability import (
 )
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import jumps_of
+from sst_graph.graph.outer_loop import JointSolution
+from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
 
@@ -41,13 +43,13 @@ class Guess:
 
 
 @dataclass(frozen=True)
-class DriveKnowledge:
+class DriveCovariance:
     """How well the extrinsic and the time offset of one drive are known.
 
     Attributes:
         drive: its name.
         covariance: (7, 7) of the extrinsic and the drive's own offset.
-        by_static_objects: (7, 7) the same by objects that stand alone.
+        by_static_objects: (7, 7) the same by static objects alone.
     """
 
     drive: str
@@ -63,9 +65,9 @@ class Answer:
         cTl, offset_s: the estimate.
         covariance: (7, 7), see :class:`~sst_graph.result.CalibrationResult`.
         frames: that took part.
-        doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
+        reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: what else was missing, for the reader.
-        by_static_objects: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
+        by_static_objects: (7, 7) covariance by static objects alone, and by motion where always used.
         drive_offsets: an offset for each drive, where one each was asked for.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
@@ -75,22 +77,22 @@ class Answer:
     offset_s: float
     covariance: FloatArray
     frames: tuple[FrameId, ...]
-    doubts: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
     by_static_objects: FloatArray | None = None
     drive_offsets: tuple[DriveOffset, ...] = ()
-    by_drive: tuple[DriveKnowledge, ...] = ()
+    by_drive: tuple[DriveCovariance, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
 
 
 def result_of(
     answer: Answer, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
-    """The result: unobservable where the covariance says so, not_converged where there are doubts."""
+    """The result: unobservable where the covariance says so, not_converged where the answer may be wrong."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
     weak = _weak_directions(answer, config.observability, advice)
-    doubts = (*answer.doubts, *(_jumps(drives) if config.check_stamps else ()))
-    status: Status = "not_converged" if doubts else "unobservable" if weak else "ok"
+    wrong = (*answer.reasons, *(_jumps(drives) if config.check_stamps else ()))
+    status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(
         T_camera_lidar=answer.cTl,
@@ -98,7 +100,7 @@ def result_of(
         covariance=answer.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*doubts, *answer.remarks, *sentences),
+        reasons=(*wrong, *answer.remarks, *sentences),
         weak_directions=weak,
         frames_used=answer.frames,
         drive_offsets=answer.drive_offsets,
@@ -145,6 +147,24 @@ def _jumps(drives: Sequence[Drive]) -> list[str]:
                 "calibrate the frames before it and those from it on apart"
             )
     return found
+
+
+def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:
+    """The scans of a joint solution's pairs."""
+    return tuple(
+        FrameId(drives[pair.drive].name, drives[pair.drive].scans[pair.pair.scan].index)
+        for pair in solution.pairs
+    )
+
+
+def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray) -> tuple[DriveOffset, ...]:
+    """Each drive's time offset, where they have one each; covariance: (n, n) of extrinsic and offsets."""
+    if len(state.offsets_s) == 1:
+        return ()
+    sigmas = np.sqrt(np.diag(covariance))
+    return tuple(
+        DriveOffset(drive.name, state.offset_s(i), float(sigmas[6 + i])) for i, drive in enumerate(drives)
+    )
 
 
 def no_answer(

@@ -1,4 +1,4 @@
-"""Do the data contradict what is taken for granted? Each assumption's parameter is let free and looked at.
+"""Do the data contradict what is assumed? The parameter of each assumption is estimated and tested.
 
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
 near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
@@ -21,6 +21,7 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
+from sst_graph.batch.problem import CalibrationProblem, Estimate
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import (
     MatchTable,
@@ -30,12 +31,11 @@ from sst_graph.covariance.cluster_robust import (
     match_table,
     robust_covariance,
 )
-from sst_graph.covariance.considered import AssumptionConfig, Considered
-from sst_graph.drive.preparation import Drive
+from sst_graph.covariance.considered import AssumptionConfig, Considered, consider
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks, state_from
+from sst_graph.graph.building import state_from
 from sst_graph.graph.elimination import Unknowns, marginal_covariance, scaled_inverse
-from sst_graph.graph.outer_loop import JointConfig, JointProblem, JointSolution, solve_joint
+from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
 
@@ -50,13 +50,13 @@ still moves after them does not matter: the linear step to one parameter's estim
 """
 _ALONE_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
 """... and of the solution with one of them free, which starts near its end [px]."""
-_SETTLING = 4
+_MOST_AT_LAST_SCALE = 4
 """Most further outer iterations of the latter at the last scale."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the data say of one assumption's parameter while all other assumptions hold.
+    """The estimate of one assumption's parameter while all other assumptions hold.
 
     Attributes:
         assumption: which.
@@ -91,21 +91,14 @@ class Finding:
 
 @dataclass(frozen=True)
 class SolvedProblem:
-    """A solved problem whose assumptions are to be tested.
+    """A solved problem whose assumptions are to be tested."""
 
-    Attributes:
-        drives, tracks, objects: its data: twists and moving objects, and object tracks by drive.
-        solution: its answer.
-        config: what it was solved with.
-        guess: what its weak priors are centred on.
-    """
-
-    drives: Sequence[Drive]
-    tracks: Tracks
-    objects: Sequence[dict[ObjectId, int]]
+    problem: CalibrationProblem
     solution: JointSolution
-    config: JointConfig
-    guess: State
+
+    @property
+    def objects(self) -> Sequence[dict[ObjectId, int]]:
+        return self.problem.objects
 
     def solve_with(
         self, names: Sequence[str], start: State, kernel_px: tuple[float, ...], most_outer: int
@@ -115,16 +108,47 @@ class SolvedProblem:
         Raises:
             EstimationError: too few matches at any step.
         """
-        graph = replace(self.config.graph, estimate=(*self.config.graph.estimate, *names))
-        free = replace(self.config, max_outer=most_outer, graph=graph)
-        return solve_joint(JointProblem(self.drives, self.tracks, free, self.guess), start, kernel_px)
+        joint, centre = self.problem.config.joint, self.problem.prior_centre(self.solution.state)
+        graph = replace(joint.graph, estimate=(*joint.graph.estimate, *names))
+        free = replace(joint, max_outer=most_outer, graph=graph)
+        return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernel_px)
+
+
+@dataclass(frozen=True)
+class ExaminedAssumptions:
+    """The assumptions of a joint estimate: tests against the data, and what they add to the covariance.
+
+    Attributes:
+        findings: of the tests, the most contradicted first.
+        considered: what the assumptions add to the covariance, the tests' results included.
+    """
+
+    findings: tuple[Finding, ...]
+    considered: Considered
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """A sentence where the data contradict an assumption."""
+        return contradiction_sentence(self.findings)
+
+    def report(self) -> dict[str, Any]:
+        """As :func:`assumption_report`."""
+        return assumption_report(self.considered, self.findings)
+
+
+def examine_assumptions(problem: CalibrationProblem, estimate: Estimate) -> ExaminedAssumptions:
+    """Test the assumptions against the data, and consider in the covariance what the data leave open."""
+    config, solution = problem.config.assumptions, estimate.solution
+    findings = check_assumptions(SolvedProblem(problem, solution), config)
+    considered = consider(estimate.robust, solution.pairs, solution.values, solution.state, config)
+    return ExaminedAssumptions(findings, with_test_results(considered, findings))
 
 
 def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
-    """What the data say of every assumption that the matches test, the most contradicted first."""
+    """Test every assumption that the matches can test; the most contradicted first."""
     if not config.test:
         return ()
-    estimated = dict(named_sigmas(problem.config.graph.estimate))
+    estimated = dict(named_sigmas(problem.problem.config.joint.graph.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
     try:
         linear = LinearProblem.of(problem, names)
@@ -221,7 +245,7 @@ def _solved_alone(
     """The finding by a solution with its parameter alone; as it was where that ends somewhere else."""
     name = finding.assumption.name
     try:
-        solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _SETTLING)
+        solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _MOST_AT_LAST_SCALE)
     except EstimationError as error:
         _LOG.info("assumption %s: %s", name, error)
         return finding
@@ -277,7 +301,7 @@ def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
 
 
 def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
-    """JSON-able: what each assumption adds to the covariance, and what the data say of it.
+    """JSON-able: what each assumption adds to the covariance, and the test of it.
 
     By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the answer
     [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sst_graph.baselines.nearest_pixel_frames import Calibration
-from sst_graph.baselines.second_search import challenge
+from sst_graph.baselines.second_search import search_again
 from sst_graph.baselines.semalign import solve_semalign
-from sst_graph.baselines.sst_calib import NearestSolution, solve_paper, solve_static
+from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, solve_paper, solve_static
 from sst_graph.batch.answer import Answer, Guess
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.drive.preparation import Drive, Progress
@@ -20,22 +20,14 @@ def answer_paper(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """SST-Calib, static and joint stage."""
-
-    def solve(start: Calibration) -> NearestSolution:
-        return solve_paper(drives, start, config.classes, config.paper, progress)
-
-    return _judged(solve, drives, guess, config)
+    return _checked(solve_paper, _problem(drives, config, progress), guess, config)
 
 
 def answer_static(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """SST-Calib's static stage alone."""
-
-    def solve(start: Calibration) -> NearestSolution:
-        return solve_static(drives, start, config.classes, config.paper, progress)
-
-    return _judged(solve, drives, guess, config)
+    return _checked(solve_static, _problem(drives, config, progress), guess, config)
 
 
 def answer_semalign(
@@ -43,19 +35,23 @@ def answer_semalign(
 ) -> Answer:
     """SemAlign."""
 
-    def solve(start: Calibration) -> NearestSolution:
-        return solve_semalign(drives, start, config.classes, config.semalign, config.paper, progress)
+    def solve(problem: PaperProblem, start: Calibration) -> NearestSolution:
+        return solve_semalign(problem, start, config.semalign)
 
-    return _judged(solve, drives, guess, config)
+    return _checked(solve, _problem(drives, config, progress), guess, config)
 
 
-def _judged(
-    solve: Callable[[Calibration], NearestSolution],
-    drives: Sequence[Drive],
+def _problem(drives: Sequence[Drive], config: CalibrationConfig, progress: Progress | None) -> PaperProblem:
+    return PaperProblem(drives, config.classes, config.paper, progress)
+
+
+def _checked(
+    solve: Callable[[PaperProblem, Calibration], NearestSolution],
+    problem: PaperProblem,
     guess: Guess,
     config: CalibrationConfig,
 ) -> Answer:
-    """The solution, with doubts where a second opinion finds better.
+    """The solution, with reasons against it where a second search finds a better pose.
 
     Raises:
         EstimationError: no guess, or nothing to solve.
@@ -63,28 +59,31 @@ def _judged(
     if guess.cTl is None:
         raise EstimationError(f"method {config.method} needs a guess to start from: it has no search")
     start = Calibration(guess.cTl, guess.offset_s)
-    solution = solve(start)
-    at = solution.calibration
-    opinion = challenge(solution.frames, drives, config.classes, start, at, config.start.search)
+    solution = solve(problem, start)
+    at, step = solution.calibration, solution.remaining_step
+    second = search_again(solution.frames, problem.drives, config.classes, start, at, config.start.search)
     return Answer(
         at.cTl,
         at.offset_s,
-        solution.covariance + np.outer(solution.creep, solution.creep),
+        solution.covariance + np.outer(step, step),
         tuple(frame.id for frame in solution.frames),
-        doubts=(*opinion.doubts(config.challenge), *_unfinished(solution, config)),
+        reasons=(*second.reasons, *_unfinished(solution, config)),
         remarks=solution.reasons,
         diagnostics={
-            "covariance": "of the frozen matches, too sure, and of the way still to go",
-            "scores": {"start": opinion.start, "answer": opinion.answer, "best_nearby": opinion.best},
+            "covariance": "of the frozen matches, too small, and of the remaining step",
+            "scores": {"start": second.start, "answer": second.answer, "best_nearby": second.best},
             **solution.diagnostics,
         },
     )
 
 
 def _unfinished(solution: NearestSolution, config: CalibrationConfig) -> list[str]:
-    """A sentence where the last step, gone on with, would leave what counts as known."""
-    rotation, translation = np.linalg.norm(solution.creep[:3]), np.linalg.norm(solution.creep[3:6])
-    offset, limits = abs(float(solution.creep[6])), config.observability
+    """A sentence where the remaining step is larger than what counts as known."""
+    rotation, translation = (
+        np.linalg.norm(solution.remaining_step[:3]),
+        np.linalg.norm(solution.remaining_step[3:6]),
+    )
+    offset, limits = abs(float(solution.remaining_step[6])), config.observability
     if (
         np.degrees(rotation) <= limits.rotation_deg
         and translation <= limits.translation_m
@@ -92,6 +91,6 @@ def _unfinished(solution: NearestSolution, config: CalibrationConfig) -> list[st
     ):
         return []
     return [
-        f"the last step was still on its way: as many again would make {np.degrees(rotation):.2f} deg, "
+        f"it had not converged: as many steps again would make {np.degrees(rotation):.2f} deg, "
         f"{100 * translation:.1f} cm, {1e3 * offset:.1f} ms"
     ]

@@ -3,75 +3,35 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
-from sst_graph.batch.answer import Answer, DriveKnowledge, Guess, no_answer, result_of
-from sst_graph.batch.assumption_tests import (
-    SolvedProblem,
-    assumption_report,
-    check_assumptions,
-    contradiction_sentence,
-    estimated_report,
-    with_test_results,
-)
+from sst_graph.batch.answer import Answer, Guess, drive_offsets, frames_used, no_answer, result_of
+from sst_graph.batch.assumption_tests import examine_assumptions
 from sst_graph.batch.baselines import answer_paper, answer_semalign, answer_static
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
+from sst_graph.batch.joint_report import (
+    joint_diagnostics,
+    joint_reasons,
+    label_agreement,
+    unknown_motion_remarks,
+)
 from sst_graph.batch.motion_answer import answer_motion
-from sst_graph.batch.motion_factor import Labels, WithMotion, with_motion
-from sst_graph.batch.parts import Parts
+from sst_graph.batch.motion_factor import may_use_motion, with_motion
+from sst_graph.batch.part_solver import PartSolver
+from sst_graph.batch.problem import CalibrationProblem, Estimate
 from sst_graph.batch.sources import as_sources
-from sst_graph.batch.sweep_effect import SweepEffects, sweep_effects
-from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
-from sst_graph.covariance.considered import BUDGET, budget, consider, motion_covariance, remainder
-from sst_graph.covariance.observability import weak_directions
-from sst_graph.covariance.stationary_objects import standing_covariance
-from sst_graph.covariance.unknown_motion import unknown_motion_covariance
+from sst_graph.batch.total_covariance import total_covariance
+from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.preparation import Drive, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
-from sst_graph.graph.building import PairMatches, Tracks
-from sst_graph.graph.outer_loop import (
-    KERNELS_PX,
-    NARROW_KERNELS_PX,
-    JointProblem,
-    JointSolution,
-    agreement,
-    concentration,
-    explained,
-    poor_fit,
-    solve_all,
-)
-from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import difference
-from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import (
-    ALTERNATIVE_RATIO,
-    REACH,
-    Selection,
-    alternatives,
-    select_start_steps,
-)
-from sst_graph.inspect.frame_gains import frame_gains
-from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
-from sst_graph.inspect.frame_information import to_document
-from sst_graph.objects.tracks import object_tracks
 from sst_graph.odometry.sweep import with_sweep
-from sst_graph.result import CalibrationResult, DriveOffset, FrameId
-from sst_graph.stepwise import whole
+from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
-
-FloatArray = NDArray[np.float64]
-
-_FAR_SIGMAS = 6.0
-"""Two answers farther apart than this contradict each other."""
 
 
 def calibrate(
@@ -115,7 +75,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Of every frame what the method needs: image features are not tracked for one that does without."""
     prepare = config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS and not _may_hear_motion(config):
+    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
     with_lower_edges = config.method == "joint" and config.lower_edges.use != "never"
     depth = config.method in _NEED_DEPTH
@@ -161,249 +121,49 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
     if config.time_offset_per_drive and config.method != "joint":
         raise ConfigError(f"time_offset_per_drive needs method joint, found {config.method}")
     if config.time_offset_per_drive and config.use_motion == "always":
-        raise ConfigError("use_motion always knows one time offset only: leave out time_offset_per_drive")
-
-
-def _may_hear_motion(config: CalibrationConfig) -> bool:
-    return config.method == "joint" and config.use_motion != "never" and not config.time_offset_per_drive
+        raise ConfigError("use_motion=always has one time offset only: leave out time_offset_per_drive")
 
 
 def answer_joint(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
-    """The default: a global start, then silhouettes over the whole drive."""
-    config = config.estimating
-    # 1. A start, searched around the guess or without one.
-    tracks = Tracks(drives)
-    search = StartProblem(drives, tracks, config.classes, guess.cTl, guess.offset_s)
-    selection = whole(select_start_steps(search, config.joint.graph, config.start))
-    # 2. Silhouettes over all frames, from the best start and from different ones that are nearly as good.
-    objects = [object_tracks(drive) for drive in drives]
-    by_object = config.joint.graph.object_bias_sigma_px > 0.0
-    tracks = Tracks(drives, objects) if by_object else tracks
-    joint_problem = JointProblem(drives, tracks, config.joint)
-    finals = _finals(joint_problem, selection, search, config, progress)
-    evidence = {"explained": explained(finals[0])}
-    evidence["concentration"] = concentration(finals[0], joint_problem)
-    # 3. Edges towards the ground, where the labels agree about them.
-    best = [(solution, search.centre(solution.state)) for solution in alternatives(finals)]
-    below = with_lower_edges(joint_problem, best, config.lower_edges, progress)
-    config, finals = replace(config, joint=below.joint), below.solutions
-    solution = finals[0]
-    # 4. Do the drives agree, and the stretches of each?
-    parts = Parts(drives, tracks, objects, solution.state, config.joint, config.assumptions)
-    contradictions = find_contradictions(parts, config.contradictions)
-    # 5. How sure; where the labels tell everything, the motion is heard too.
-    robust = robust_covariance(*_frozen(solution), objects)
-    covariance, by_static_objects = robust.matrix, standing_covariance(robust, solution.pairs)
-    labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
-    heard = _hear_motion(search, tracks, labels, config, progress)
-    if heard.solution is not solution:
-        solution = heard.solution
-        robust = robust_covariance(*_frozen(solution), objects)
-        covariance = heard.inflation * robust.matrix
-        if config.use_motion == "always":
-            by_static_objects = standing_covariance(robust, solution.pairs)
-    # 6. What is taken for granted: considered in the covariance, and tested.
-    frozen = solution.pairs, solution.values, solution.state
-    centre = search.centre(solution.state)
-    problem = SolvedProblem(drives, tracks, objects, solution, config.joint, centre)
-    findings = check_assumptions(problem, config.assumptions)
-    considered = with_test_results(consider(robust, *frozen, config.assumptions), findings)
-    size = 6 + len(solution.state.offsets_s)
-    motion = motion_covariance(robust, solution.pairs, solution.state, config.joint.graph)
-    parts_of_sigma = budget(covariance, motion, considered)
-    covariance = covariance[:size, :size] + considered.covariance(size)
-    sweeps = _with_sweeps(drives, solution, covariance, config)
-    parts_of_sigma |= remainder(sweeps.covariance, covariance)
+    """The default: a global search, then object outlines over the whole drive in one factor graph."""
+    problem = CalibrationProblem.of(drives, guess, config, progress)
+    # 1. Start: a global search, whose candidates are compared on a few scans.
+    start = problem.start()
+    # 2. Outlines over all frames, from the best start and from others that are nearly as good.
+    solutions = problem.solve_from(start)
+    agreement = label_agreement(problem, solutions[0])
+    # 3. Lower edges of the objects, where both sensors' labels agree about them.
+    lower = problem.with_lower_edges(solutions)
+    problem, solutions = problem.with_joint(lower.joint), lower.solutions
+    # 4. Consistency: drives against each other, stretches of a drive against its rest.
+    contradictions = find_contradictions(PartSolver(problem, solutions[0].state))
+    # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.
+    labels_alone = Estimate.of(solutions[0], problem.objects)
+    motion = with_motion(problem, labels_alone, contradictions.stretches)
+    # 6. Assumptions: tested against the data, considered in the covariance.
+    assumptions = examine_assumptions(problem, motion.estimate)
+    # 7. What no match shows: motion that nothing measures, sweeps that nothing decides.
+    total = total_covariance(problem, motion.estimate, assumptions.considered)
+    # 8. The answer, and why it may be wrong.
+    solution, unknowns = motion.estimate.solution, total.unknowns
+    wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
     return Answer(
         solution.state.cTl,
         solution.state.offsets_s[0],
-        sweeps.covariance,
-        _frames_used(drives, solution),
-        remarks=(*_remarks(drives), *heard.remarks),
-        by_static_objects=by_static_objects[:7, :7],
-        doubts=(
-            *contradiction_sentence(findings),
-            *_doubts(solution, finals, covariance, evidence, guess, config),
-            *contradictions.sentences,
-            *heard.doubts,
-            *sweeps.doubts,
-        ),
-        drive_offsets=_drive_offsets(drives, solution, covariance),
-        by_drive=_by_drive(drives, solution, covariance, by_static_objects, config),
-        diagnostics={
-            **evidence,
-            "start_score": selection.score,
-            "motion": heard.diagnostics,
-            "assumptions": assumption_report(considered, findings),
-            BUDGET: parts_of_sigma,
-            "estimated": estimated_report(robust, solution.state),
-            "contradictions": contradictions.diagnostics,
-            **_numbers(drives, solution, below, robust),
-        },
+        total.covariance,
+        frames_used(drives, solution),
+        (*assumptions.reasons, *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
+        (*unknown_motion_remarks(drives), *motion.remarks),
+        motion.estimate.by_static_objects[:7, :7],
+        drive_offsets(drives, solution.state, unknowns),
+        total.by_drive,
+        agreement
+        | {"start_score": start.score, "contradictions": contradictions.diagnostics}
+        | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
+        | joint_diagnostics(problem, motion.estimate, lower),
     )
-
-
-def _numbers(
-    drives: Sequence[Drive], solution: JointSolution, below: WithLowerEdges, robust: RobustCovariance
-) -> dict[str, Any]:
-    """JSON-able numbers about a joint solution."""
-    model = robust.model
-    return {
-        "outer_iterations": solution.outer_iterations,
-        "matches": sum(len(pair) for pair in solution.pairs),
-        "pairs": len(solution.pairs),
-        "mask_bias_px": {
-            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
-        },
-        "lower_edge_concentration": {c.name.lower(): share for c, share in below.concentration.items()},
-        "lower_edges": [c.name.lower() for c in below.joint.graph.lower_edges],
-        "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-        FRAME_INFORMATION: to_document(frame_gains(*_frozen(solution), drives, robust)),
-    }
-
-
-def _frozen(
-    solution: JointSolution,
-) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, list[PairMatches], State]:
-    """What the covariance is computed from."""
-    return solution.graph, solution.values, solution.pairs, solution.state
-
-
-def _hear_motion(
-    search: StartProblem,
-    tracks: Tracks,
-    labels: Labels,
-    config: CalibrationConfig,
-    progress: Progress | None,
-) -> WithMotion:
-    """The solution with the motion in its graph, where it is asked for and there is any."""
-    solution, drives = labels.solution, search.drives
-    if not _may_hear_motion(config):
-        return WithMotion(solution)
-    if config.use_motion == "auto":
-        weak = weak_directions(labels.covariance, solution.state.cTl, config.observability)
-        rolling = any(scan.offsets_s.any() for drive in drives for scan in drive.scans)
-        if weak or rolling:
-            why = "the labels alone leave directions open" if weak else "the scans take their time"
-            return WithMotion(solution, diagnostics={"left_out": why})
-    centre = search.centre(solution.state)
-    return with_motion(drives, tracks, labels, centre, config, progress)
-
-
-def _finals(
-    problem: JointProblem,
-    selection: Selection,
-    search: StartProblem,
-    config: CalibrationConfig,
-    progress: Progress | None,
-) -> Sequence[JointSolution]:
-    """Solutions of the whole problem from every selected start, the one that agrees best with the labels
-    first.
-
-    Raises:
-        EstimationError: none of them leads anywhere.
-    """
-    clocks = len(problem.drives) if config.time_offset_per_drive else 1
-    kernels_px = NARROW_KERNELS_PX if config.start.enabled else KERNELS_PX
-    starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in selection.starts]
-    return solve_all(problem, [(start, search.centre(start)) for start in starts], kernels_px, progress)
-
-
-def _doubts(
-    solution: JointSolution,
-    finals: Sequence[JointSolution],
-    covariance: FloatArray,
-    evidence: Mapping[str, float],
-    guess: Guess,
-    config: CalibrationConfig,
-) -> tuple[str, ...]:
-    """Why the joint estimate may be wrong altogether."""
-    doubts = []
-    if not solution.converged:
-        doubts.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
-    limit = np.radians(config.observability.rotation_deg)
-    vague = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > limit**2
-    if config.start.enabled:
-        doubts += poor_fit(evidence["explained"], evidence["concentration"], not vague)
-        search, around = config.start.search, np.zeros(3) if guess.cTl is None else guess.cTl.translation()
-        far = float(np.linalg.norm(solution.state.cTl.translation() - around))
-        if far > (REACH * search.free_translation_m if guess.cTl is None else 1.5 * search.translation_m):
-            what = "the guess" if guess.cTl is not None else "the LiDAR"
-            doubts.append(f"the answer lies {far:.2f} m from {what}, farther than was searched")
-    best, *others = finals
-    for other in others:
-        step = difference(solution.state, other.state)
-        sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
-        if sigmas > _FAR_SIGMAS and agreement(other) > ALTERNATIVE_RATIO * agreement(best):
-            doubts.append(
-                f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
-                f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "
-                "that explains the labels almost as well: record more varied scenes or give a closer guess"
-            )
-    return tuple(doubts)
-
-
-def _with_sweeps(
-    drives: Sequence[Drive], solution: JointSolution, covariance: FloatArray, config: CalibrationConfig
-) -> SweepEffects:
-    """The (7, 7) covariance with what no match shows, and doubts about sweeps that nothing tells."""
-    told = covariance[:7, :7] + _beside_matches(solution, float(covariance[6, 6]), config)
-    effects = sweep_effects(solution, drives, told, config.joint)
-    return SweepEffects(effects.doubts, told + effects.covariance)
-
-
-def _beside_matches(solution: JointSolution, variance_s2: float, config: CalibrationConfig) -> FloatArray:
-    """(7, 7) covariance by what no match shows."""
-    return unknown_motion_covariance(solution.pairs, solution.state, variance_s2, config.unknown_motion)
-
-
-def _remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
-    """What was taken for granted."""
-    if all(drive.lidar_motions for drive in drives):
-        return ()
-    return (
-        "a single scan tells no motion and was taken as standing: at 1 m/s every 100 ms between scan and "
-        "image would shift the translation by 10 cm; give its neighbours too, or, if it stood, say so "
-        "(unknown_motion.speed_mps and unknown_motion.turn_deg_per_s 0)",
-    )
-
-
-def _frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:
-    return tuple(
-        FrameId(drives[pair.drive].name, drives[pair.drive].scans[pair.pair.scan].index)
-        for pair in solution.pairs
-    )
-
-
-def _drive_offsets(
-    drives: Sequence[Drive], solution: JointSolution, covariance: FloatArray
-) -> tuple[DriveOffset, ...]:
-    if len(solution.state.offsets_s) == 1:
-        return ()
-    sigmas = np.sqrt(np.diag(covariance))
-    return tuple(
-        DriveOffset(drive.name, solution.state.offset_s(i), float(sigmas[6 + i]))
-        for i, drive in enumerate(drives)
-    )
-
-
-def _by_drive(
-    drives: Sequence[Drive],
-    solution: JointSolution,
-    covariance: FloatArray,
-    by_static_objects: FloatArray,
-    config: CalibrationConfig,
-) -> tuple[DriveKnowledge, ...]:
-    """What is known of the extrinsic and each drive's own offset, where drives have one each."""
-    found = []
-    for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
-        own = [*range(6), 6 + number]
-        block, standing = covariance[np.ix_(own, own)], by_static_objects[np.ix_(own, own)]
-        block = block + _beside_matches(solution, float(block[6, 6]), config)
-        found.append(DriveKnowledge(drives[number].name, block, standing))
-    return tuple(found)
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], Answer]

@@ -1,4 +1,4 @@
-"""The likely causes of a result that is not to be trusted, for its reasons."""
+"""The likely causes of a wrong or missing result, for its reasons."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def with_causes(
 def _suspected(
     result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> tuple[Finding, ...]:
-    """What explains a result that is missing, doubted, or agreed with by few of the labels."""
+    """What explains a result that is missing, may be wrong, or agrees with few of the labels."""
     fit = fit_labels(config)
     if not result.frames_used or result.status == "not_converged":
         return likely_causes(drives, guess.cTl, guess.offset_s, fit)

@@ -5,11 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from sst_graph.baselines.second_search import SecondSearchConfig
 from sst_graph.baselines.semalign import SemAlignConfig
 from sst_graph.baselines.sst_calib import PaperConfig
-from sst_graph.batch.contradictions import ContradictionConfig
-from sst_graph.batch.lower_edges import LowerEdgesConfig
 from sst_graph.config import Settings
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.observability import ObservabilityConfig
@@ -26,6 +23,29 @@ UseMotion = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
+class LowerEdgesConfig(Settings):
+    """When edges towards the ground are matched.
+
+    Attributes:
+        use: ``auto`` where the labels agree about them, class by class.
+    """
+
+    use: Literal["auto", "always", "never"] = "auto"
+
+
+@dataclass(frozen=True)
+class ContradictionConfig(Settings):
+    """Whether parts of the data are compared with one another.
+
+    Attributes:
+        check: solve drives, and stretches of each, by themselves and compare the answers; costs about as
+            much time as the calibration.
+    """
+
+    check: bool = True
+
+
+@dataclass(frozen=True)
 class CalibrationConfig(Settings):
     """What to do and how; one part a stage, written beside every result.
 
@@ -35,9 +55,9 @@ class CalibrationConfig(Settings):
             against visual odometry).
         classes: semantic classes to align.
         time_offset_per_drive: each drive has a time offset of its own, instead of one for all.
-        use_motion: whether method joint also hears what camera and LiDAR motion say (hand-eye), as a factor
-            and as a check. ``auto``: where the labels alone tell all seven unknowns (a direction that only
-            the motion tells stays reported as unobservable), and the points of a scan share one time (a
+        use_motion: whether method joint also uses camera and LiDAR motion (hand-eye), as a factor and as a
+            check. ``auto``: where the labels alone determine all seven unknowns (a direction that only the
+            motion determines stays reported as unobservable), and the points of a scan share one time (a
             rolling sweep is compensated by the very motion, which then lags a few milliseconds behind).
         sweep: how the times of the points are decided where the data bring none.
         prepare: what is taken from every frame.
@@ -47,16 +67,15 @@ class CalibrationConfig(Settings):
         paper: both stages of the paper.
         semalign: sampled starts.
         motion: hand-eye calibration.
-        challenge: when an answer of ``paper``, ``static`` or ``semalign`` is believed.
-        assumptions: what is taken for granted: considered in the covariance, tested, or estimated.
-        unknown_motion: what the covariance has beside that of the matches where a single scan tells no
+        assumptions: what is assumed: considered in the covariance, tested, or estimated.
+        unknown_motion: what the covariance has beside that of the matches where a single scan does not show
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
         contradictions: when method joint finds that drives, or parts of one, contradict each other.
-        check_stamps: doubt an answer where a sensor's stamps jump against their own rhythm, for then there is
-            no one time offset; not for sensors whose rate goes up and down.
-        find_causes: where a result of method joint is doubted or missing, try changes of the data that would
-            make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
+        check_stamps: call an answer not converged where a sensor's stamps jump against their own frame
+            interval, for then there is no one time offset; not for sensors whose rate goes up and down.
+        find_causes: where a result of method joint may be wrong or is missing, try changes of the data that
+            would make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
     """
 
     method: Method = "joint"
@@ -71,7 +90,6 @@ class CalibrationConfig(Settings):
     paper: PaperConfig = field(default_factory=PaperConfig)
     semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
-    challenge: SecondSearchConfig = field(default_factory=SecondSearchConfig)
     assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)

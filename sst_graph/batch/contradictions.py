@@ -15,32 +15,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.parts import Part, Parts, SolvedPart
-from sst_graph.config import Settings, setting
+from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
 from sst_graph.covariance.contradiction import Difference, combined, name_step
 from sst_graph.graph.state import State
 
 FloatArray = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class ContradictionConfig(Settings):
-    """When parts of the data contradict one another.
-
-    Attributes:
-        check: look for it at all.
-        false_alarm: probability that any part of a calibration seems to contradict the rest where none does,
-            as far as the covariances hold.
-        hint: the same for one drive by its stretches alone, before both sides are solved to be sure.
-        most_stretches: stretches that a drive is cut into.
-        least_scans: fewest scans of a stretch.
-    """
-
-    check: bool = True
-    false_alarm: float = setting(1e-3, at_least=1e-12, at_most=0.5)
-    hint: float = setting(1e-2, at_least=1e-12, at_most=0.5)
-    most_stretches: int = setting(8, at_least=1, at_most=100)
-    least_scans: int = setting(4, at_least=1, at_most=100_000)
+FALSE_ALARM = 1e-3
+"""Probability that any part of a calibration seems to contradict the rest where none does, as far as the
+covariances hold: one false alarm in a thousand calibrations."""
+_SUSPICION = 1e-2
+"""The same for one drive by its stretches alone, before both sides are solved to be sure: a larger one costs
+time only."""
+_MOST_STRETCHES = 8
+"""Stretches that a drive is cut into: each costs a solution of its scans."""
+_LEAST_SCANS = 4
+"""Fewest scans of a stretch: fewer seldom determine an answer."""
 
 
 @dataclass(frozen=True)
@@ -58,23 +49,19 @@ class Contradictions:
     diagnostics: dict[str, Any] = field(default_factory=dict)
 
 
-def find_contradictions(parts: Parts, config: ContradictionConfig) -> Contradictions:
+def find_contradictions(parts: PartSolver) -> Contradictions:
     """Drives against the other drives, and within each drive the run of stretches that differs most."""
-    if not config.check:
+    if not parts.problem.config.contradictions.check:
         return Contradictions()
     # 1. Every stretch of every drive by itself.
     stretches = [
-        _solved(parts, [Part(number, scans) for scans in _cut(len(drive.scans), config)])
+        _solved(parts, [Part(number, scans) for scans in _cut(len(drive.scans))])
         for number, drive in enumerate(parts.drives)
     ]
     # 2. Within each drive.
     tests = len(parts.drives) + (len(parts.drives) > 1)
-    false_alarm = config.false_alarm / tests
-    steps = [
-        step
-        for of_drive in stretches
-        if (step := _within(parts, of_drive, config.hint, false_alarm)) is not None
-    ]
+    false_alarm = FALSE_ALARM / tests
+    steps = [step for of_drive in stretches if (step := _within(parts, of_drive, false_alarm)) is not None]
     sentences = [_step_sentence(parts, step) for step in steps]
     # 3. Each drive against the others.
     against = _between(parts, stretches)
@@ -90,13 +77,13 @@ def find_contradictions(parts: Parts, config: ContradictionConfig) -> Contradict
     return Contradictions(tuple(sentences), tuple(s for own in stretches for s in own), diagnostics)
 
 
-def _cut(scans: int, config: ContradictionConfig) -> list[tuple[int, ...]]:
+def _cut(scans: int) -> list[tuple[int, ...]]:
     """Positions of the scans of each stretch, evenly many."""
-    count = max(1, min(config.most_stretches, scans // config.least_scans))
+    count = max(1, min(_MOST_STRETCHES, scans // _LEAST_SCANS))
     return [tuple(stretch.tolist()) for stretch in np.array_split(np.arange(scans), count)]
 
 
-def _solved(parts: Parts, wanted: Sequence[Part]) -> list[SolvedPart]:
+def _solved(parts: PartSolver, wanted: Sequence[Part]) -> list[SolvedPart]:
     return [solved for part in wanted if (solved := parts.solve(part)) is not None]
 
 
@@ -115,7 +102,7 @@ class Step:
     difference: Difference
 
 
-def _within(parts: Parts, stretches: Sequence[SolvedPart], hint: float, false_alarm: float) -> Step | None:
+def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: float) -> Step | None:
     """The run of scans of one drive that contradicts the others most, where one does."""
     if len(stretches) < 2:
         return None
@@ -123,7 +110,7 @@ def _within(parts: Parts, stretches: Sequence[SolvedPart], hint: float, false_al
     runs = _runs(len(stretches))
     differences = {run: _of_run(stretches, run) for run in runs}
     run = min(runs, key=lambda run: differences[run].rank)
-    if differences[run].p_value * len(runs) > hint:
+    if differences[run].p_value * len(runs) > _SUSPICION:
         return None
     # 2. Where exactly it begins and ends, and both sides by themselves.
     inside, outside = ([s.state for s in side] for side in _sides(stretches, run))
@@ -146,7 +133,7 @@ def _within(parts: Parts, stretches: Sequence[SolvedPart], hint: float, false_al
         states, difference = [own.state, rest.state], Difference.of(rest.answer, own.answer)
         if _located(parts, number, states)[0] == bounds:
             break
-    # 3. Sure?
+    # 3. Is it certain, with both sides solved?
     return Step(number, bounds, difference) if difference.p_value * len(runs) < false_alarm else None
 
 
@@ -181,7 +168,7 @@ def _parts_of(drive: int, bounds: tuple[int, int], scans: int) -> tuple[Part, Pa
     return Part(drive, tuple(inside)), Part(drive, tuple(k for k in range(scans) if k not in inside))
 
 
-def _located(parts: Parts, drive: int, states: Sequence[State]) -> tuple[tuple[int, int], list[State]]:
+def _located(parts: PartSolver, drive: int, states: Sequence[State]) -> tuple[tuple[int, int], list[State]]:
     """Where a run begins and ends by which of two states each scan agrees with; the run's state first.
 
     A run that ends with the drive (a split in two) is preferred to one that the same state is resumed after.
@@ -210,7 +197,7 @@ _SECOND_STEP = 0.1
 """A second step back must raise what agrees with the two answers by this share."""
 
 
-def _between(parts: Parts, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, Difference]:
+def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, Difference]:
     """Each drive against the others together, by the drive's number; those without an answer are left out."""
     if len(parts.drives) < 2:
         return {}
@@ -231,7 +218,7 @@ def _between(parts: Parts, stretches: Sequence[Sequence[SolvedPart]]) -> dict[in
     }
 
 
-def _step_sentence(parts: Parts, step: Step) -> str:
+def _step_sentence(parts: PartSolver, step: Step) -> str:
     drive = parts.drives[step.drive]
     first, end = step.scans
     named = name_step(step.difference, parts.reference.cTl)
@@ -255,7 +242,7 @@ def _advice(kinds: Sequence[str]) -> str:
     return f"check whether {likely}, and calibrate the frames before and after apart"
 
 
-def _drive_sentence(parts: Parts, number: int, difference: Difference) -> str:
+def _drive_sentence(parts: PartSolver, number: int, difference: Difference) -> str:
     named = name_step(difference, parts.reference.cTl)
     others = f"drive {parts.drives[0].name!r}" if len(parts.drives) == 2 else "the others"
     return (
@@ -264,7 +251,7 @@ def _drive_sentence(parts: Parts, number: int, difference: Difference) -> str:
     )
 
 
-def _step_document(parts: Parts, step: Step) -> dict[str, Any]:
+def _step_document(parts: PartSolver, step: Step) -> dict[str, Any]:
     drive = parts.drives[step.drive]
     frames = [drive.scans[step.scans[0]].index, drive.scans[step.scans[1] - 1].index]
     return {"drive": drive.name, "frames": frames, **_difference_document(step.difference)}

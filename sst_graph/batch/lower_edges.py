@@ -1,8 +1,8 @@
 """Edges towards the ground: matched only where image and LiDAR labels mean the same by them.
 
-They tell roll and height better than any other edge. But some labels end an object at its body, others
-at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Nothing but
-the data tells which: where the two sorts of labels agree, most lower edges lie within the narrow kernel of
+They determine roll and height better than any other edge. But some labels end an object at its body, others
+at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Only the
+data show which: where the two sorts of labels agree, most lower edges lie within the narrow kernel of
 the last iterations; where they do not, distances are spread as widely as a kernel can see.
 """
 
@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 from sst_graph.association.edge_matching import BOTTOM
-from sst_graph.config import Settings, setting
+from sst_graph.batch.config import LowerEdgesConfig
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
@@ -30,28 +29,19 @@ from sst_graph.graph.outer_loop import (
 from sst_graph.graph.state import State
 from sst_graph.types import SemanticClass
 
-
-@dataclass(frozen=True)
-class LowerEdgesConfig(Settings):
-    """When edges towards the ground are matched.
-
-    Attributes:
-        use: ``auto`` where the labels agree about them, class by class.
-        min_concentration: ... which is so where this share of what a kernel five times as wide matches
-            remains under the last one.
-        min_support: ... and so many matches remain, each counted by its robust weight.
-        kernel_px: scales of the robust kernel, outer iteration by outer iteration [px].
-    """
-
-    use: Literal["auto", "always", "never"] = "auto"
-    min_concentration: float = setting(0.7, at_least=0.0, at_most=1.0)
-    min_support: float = setting(30.0, at_least=0.001, at_most=1e9)
-    kernel_px: tuple[float, ...] = setting((5.0, 4.0, 3.0), at_least=0.1, at_most=1000.0, length=(1, 100))
+MIN_CONCENTRATION = 0.7
+"""Share of the support under a kernel five times as wide that must remain under the last one: labels that
+agree leave 0.67 to 0.83 (simulated streets), others 0.45 to 0.68 (real drives; docs/accuracy.md)."""
+MIN_SUPPORT = 30.0
+"""Least matches under the last kernel, each counted by its robust weight: a share of fewer says little."""
+_KERNELS_PX = (5.0, 4.0, 3.0)
+"""Scales of the robust kernel with the lower edges, outer iteration by outer iteration [px]: the last ones of
+the joint method, for the solution without them is near."""
 
 
 @dataclass(frozen=True)
 class WithLowerEdges:
-    """Joint solutions after their lower edges were looked at.
+    """Joint solutions after their lower edges were tested.
 
     Attributes:
         solutions: with them among the matches, or as they were; the one that agrees best first.
@@ -86,7 +76,7 @@ def with_lower_edges(
         return WithLowerEdges(solutions, joint, concentration)
     joint = replace(joint, graph=replace(joint.graph, lower_edges=chosen))
     starts = [(one.state, centre) for one, centre in finals]
-    fuller = solve_all(replace(problem, config=joint), starts, config.kernel_px, progress)
+    fuller = solve_all(replace(problem, config=joint), starts, _KERNELS_PX, progress)
     return WithLowerEdges(fuller, joint, concentration)
 
 
@@ -115,18 +105,16 @@ class LowerEdgeSupport:
         return LowerEdgeSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
 
     def agreed(
-        self, config: LowerEdgesConfig
+        self, config: LowerEdgesConfig, min_support: float = MIN_SUPPORT
     ) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
         """Classes whose labels agree, and the share of the wide support that remains under the last kernel.
 
         Classes with too little support under the last kernel are left out.
         """
         concentration = {
-            c: self.narrow[c] / self.wide[c]
-            for c in sorted(self.narrow)
-            if self.narrow[c] >= config.min_support
+            c: self.narrow[c] / self.wide[c] for c in sorted(self.narrow) if self.narrow[c] >= min_support
         }
-        least = config.min_concentration if config.use == "auto" else 0.0
+        least = MIN_CONCENTRATION if config.use == "auto" else 0.0
         return tuple(c for c, share in concentration.items() if share >= least), concentration
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from sst_graph.batch.answer import Answer, Guess
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.hand_eye.solution import MotionConfig, MotionSolution, difference, rival, solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
 from sst_graph.result import FrameId
 
@@ -18,7 +18,7 @@ from sst_graph.result import FrameId
 def answer_motion(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
-    """LiDAR odometry against visual odometry; no label is looked at but to leave out what may move.
+    """LiDAR odometry against visual odometry; labels only leave out what may move.
 
     Raises:
         EstimationError: too few consecutive frames with known motion.
@@ -27,13 +27,13 @@ def answer_motion(
     best = solutions[0]
     pairs = [term.pair for term in best.terms]
     frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)
-    gained = pair_gains(best.terms, frames, best.state, config.motion.priors)
+    gained = pair_gains(best.terms, frames, best.state)
     return Answer(
         best.state.cTl,
         best.state.offsets_s[0],
         best.covariance,
         frames,
-        doubts=_doubts(solutions, config.motion),
+        reasons=_reasons(solutions),
         diagnostics={
             "outer_iterations": best.outer_iterations,
             "pairs": len(pairs),
@@ -51,17 +51,17 @@ def _turned_deg(solution: MotionSolution) -> float:
     return float(np.degrees(np.sum(turns)))
 
 
-def _doubts(solutions: Sequence[MotionSolution], config: MotionConfig) -> tuple[str, ...]:
+def _reasons(solutions: Sequence[MotionSolution]) -> tuple[str, ...]:
     best = solutions[0]
-    doubts = []
+    reasons = []
     if not best.converged:
-        doubts.append(f"the outer loop still moved after {best.outer_iterations} iterations")
-    other = rival(solutions, config)
+        reasons.append(f"the outer loop still moved after {best.outer_iterations} iterations")
+    other = alternative(solutions)
     if other is not None:
         step = difference(best.state, other.state)
         degrees = np.degrees(np.linalg.norm(step[:3]))
-        doubts.append(
+        reasons.append(
             f"another solution, {degrees:.1f} deg and {1e3 * step[6]:+.0f} ms away, explains the motion "
             "almost as well: record more turns and changes of speed"
         )
-    return tuple(doubts)
+    return tuple(reasons)

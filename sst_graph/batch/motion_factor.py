@@ -1,9 +1,9 @@
-"""What motion alone says, as one more factor of the joint graph, and as a check of it."""
+"""The hand-eye solution as one more factor of the joint graph, and as a check of it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import gtsam
@@ -11,99 +11,108 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.parts import SolvedPart
+from sst_graph.batch.contradictions import FALSE_ALARM
+from sst_graph.batch.part_solver import SolvedPart
+from sst_graph.batch.problem import CalibrationProblem, Estimate
 from sst_graph.covariance.contradiction import Difference, PartAnswer, name_step
-from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.covariance.observability import weak_directions
+from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import KERNELS_PX, JointProblem, JointSolution, solve_joint
+from sst_graph.graph.outer_loop import KERNELS_PX, solve_joint
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.solution import difference, solve_motion
 
 FloatArray = NDArray[np.float64]
 
+MAX_DISAGREEMENT_CHI2 = 40.0
+"""Chi-squared, of 7, of the difference between labels and motion up to which the motion is used: both
+covariances may be too small by a factor of 1.7 for an agreement that a 95 % quantile (14.07) would accept."""
 _UNLIKELY_CHI2 = 14.07
 """95 % quantile of chi-squared with 7 degrees of freedom."""
 
 
 @dataclass(frozen=True)
-class Labels:
-    """What the labels alone say.
-
-    Attributes:
-        solution: of the joint graph.
-        covariance: (7, 7) of it.
-        stretches: of the drives, each solved by itself; steps are from the solution.
-    """
-
-    solution: JointSolution
-    covariance: FloatArray
-    stretches: Sequence[SolvedPart] = ()
-
-
-@dataclass(frozen=True)
 class WithMotion:
-    """A joint solution after motion was heard.
+    """A joint estimate after it was compared with the motion.
 
     Attributes:
-        solution: with the motion in its graph, or as it was where motion says nothing or something else.
-        doubts: a sentence where the two contradict each other.
-        inflation: of the covariance of what both say together: 1 where they agree as their covariances
-            claim, else the chi-squared of their difference over its dimension (Birge's ratio, squared).
+        estimate: with the motion in its graph, or as it was where the motion is not used.
+        reasons: a sentence where labels and motion contradict each other.
         diagnostics: JSON-able numbers.
         remarks: a sentence where the motion was left out for a stretch of a drive that contradicts it.
     """
 
-    solution: JointSolution
-    doubts: tuple[str, ...] = ()
-    inflation: float = 1.0
+    estimate: Estimate
+    reasons: tuple[str, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
 
-def with_motion(
-    drives: Sequence[Drive],
-    tracks: Tracks,
-    labels: Labels,
-    guess: State,
-    config: CalibrationConfig,
-    progress: Progress | None = None,
-) -> WithMotion:
-    """The joint solution with the hand-eye solution as a factor, where the two agree.
+def may_use_motion(config: CalibrationConfig) -> bool:
+    """Whether the settings allow motion in the joint graph."""
+    return config.method == "joint" and config.use_motion != "never" and not config.time_offset_per_drive
 
-    The labels see translation, and the time offset by speed alone; the motion sees the time offset by
-    turning, also where the speed is constant. Both lean on the LiDAR's odometry, whose noise counts as
-    independent here.
+
+def with_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequence[SolvedPart]) -> WithMotion:
+    """The estimate with the motion in its graph, where the settings ask for it and the two agree.
+
+    With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
+    points of a scan share one time: a rolling sweep is compensated by the very motion.
 
     Args:
-        labels: what they say alone.
-        guess: what the weak priors are centred on.
+        labels: what the labels alone say.
+        stretches: of the drives, each solved by itself; steps are from that solution.
+    """
+    config, state = problem.config, labels.solution.state
+    if not may_use_motion(config):
+        return WithMotion(labels)
+    if config.use_motion == "auto":
+        weak = weak_directions(labels.covariance[:7, :7], state.cTl, config.observability)
+        rolling = any(scan.offsets_s.any() for drive in problem.drives for scan in drive.scans)
+        if weak or rolling:
+            why = "the labels alone leave directions open" if weak else "the scans are rolling sweeps"
+            return WithMotion(labels, diagnostics={"left_out": why})
+    return fuse_motion(problem, labels, stretches)
+
+
+def fuse_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequence[SolvedPart]) -> WithMotion:
+    """The estimate with the hand-eye solution as a factor, where labels and motion agree.
+
+    The labels determine translation, and the time offset by speed alone; the motion determines the time
+    offset by turning, also where the speed is constant. Both depend on the LiDAR's odometry, whose noise
+    counts as independent here.
     """
     # 1. The hand-eye solution from the joint one.
-    solution, state = labels.solution, labels.solution.state
+    config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
     try:
-        motion = solve_motion(drives, state.cTl, state.offsets_s[0], config.motion, progress)[0]
+        motion = solve_motion(problem.drives, state.cTl, state.offsets_s[0], config.motion, problem.progress)[
+            0
+        ]
     except EstimationError as error:
-        return WithMotion(solution, diagnostics={"left_out": str(error)})
+        return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree?
     step = difference(state, motion.state)
-    apart = float(step @ np.linalg.solve(labels.covariance + motion.covariance, step))
+    chi2 = float(step @ np.linalg.solve(covariance + motion.covariance, step))
     sigmas = np.sqrt(np.diag(motion.covariance))
-    facts = {"chi2_of_7": apart, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
-    if apart > config.motion.max_disagreement or not motion.converged:
-        return WithMotion(solution, _contradiction(step, apart, motion.converged), diagnostics=facts)
-    worst = _worst_stretch(labels.stretches, PartAnswer(step, motion.covariance))
+    facts = {"chi2_of_7": chi2, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
+    if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
+        return WithMotion(labels, _contradiction(step, chi2, motion.converged), facts)
+    worst = _worst_stretch(stretches, PartAnswer(step, motion.covariance))
     if worst is not None:
-        facts["stretch_p_value"] = worst[1].p_value * len(labels.stretches)
-        if facts["stretch_p_value"] < config.contradictions.false_alarm:
-            said = _of_stretch(drives, worst, state)
-            return WithMotion(solution, diagnostics={"left_out": said, **facts}, remarks=(said,))
-    # 3. Silhouettes once more, the motion among the factors.
-    belief = gaussian_factor(motion.state, motion.covariance)
-    problem = JointProblem(drives, tracks, config.joint, guess, belief)
-    fused = solve_joint(problem, state, KERNELS_PX[-1:], progress)
-    inflation = apart / len(step) if apart > _UNLIKELY_CHI2 else 1.0
-    return WithMotion(fused, inflation=inflation, diagnostics={"fused": True, **facts})
+        facts["stretch_p_value"] = worst[1].p_value * len(stretches)
+        if facts["stretch_p_value"] < FALSE_ALARM:
+            sentence = _of_stretch(problem.drives, worst, state)
+            return WithMotion(labels, diagnostics={"left_out": sentence, **facts}, remarks=(sentence,))
+    # 3. Outlines once more, the motion among the factors.
+    factor = gaussian_factor(motion.state, motion.covariance)
+    joint = replace(problem.joint(), centre=problem.prior_centre(state), prior=factor)
+    solution = solve_joint(joint, state, KERNELS_PX[-1:], problem.progress)
+    # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
+    inflation = chi2 / len(step) if chi2 > _UNLIKELY_CHI2 else 1.0
+    fused = Estimate.of(solution, problem.objects)
+    static = fused.by_static_objects if config.use_motion == "always" else labels.by_static_objects
+    fused = replace(fused, covariance=inflation * fused.covariance, by_static_objects=static)
+    return WithMotion(fused, diagnostics={"fused": True, **facts})
 
 
 def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContainerFactor:
@@ -136,11 +145,11 @@ def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], s
 
 
 def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:
-    """A sentence about two solutions that lie apart; none where the motion found no end by itself."""
+    """A sentence about two solutions that lie apart; none where the motion did not converge by itself."""
     if not converged:
         return ()
     degrees, metres = np.degrees(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))
     return (
-        f"motion alone says another calibration, {degrees:.2f} deg, {100 * metres:.0f} cm and "
+        f"motion alone gives another calibration, {degrees:.2f} deg, {100 * metres:.0f} cm and "
         f"{1e3 * step[6]:+.1f} ms away (chi-squared {chi2:.0f} of 7): labels or odometry are wrong",
     )

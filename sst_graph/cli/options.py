@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
-from sst_graph.cli.messages import say
+from sst_graph.cli.messages import complain, say
 from sst_graph.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,6 +26,23 @@ class _Parser(argparse.ArgumentParser):
     def _print_message(self, message: str, file: SupportsWrite[str] | None = None) -> None:
         # Help and version are printed nowhere else; argparse's own passes over a stdout that fails.
         say(message, end="")
+
+
+class _Renamed(argparse.Action):
+    """A switch under its former name: sets what the switch ``const`` sets, and says so."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, const: str, help: str | None = None) -> None:
+        super().__init__(option_strings, const.lstrip("-").replace("-", "_"), nargs=0, const=const, help=help)
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        setattr(namespace, self.dest, True)
+        complain(f"{option_string} is now called {self.const}")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -130,6 +148,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument(
         "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
+    )
+    calibrate.add_argument(
+        "--delay-per-drive", action=_Renamed, const="--time-offset-per-drive", help=argparse.SUPPRESS
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)

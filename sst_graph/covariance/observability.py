@@ -17,6 +17,13 @@ _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is worth a word."""
 
 
+_PAIR_CORRELATION = 0.98
+"""A translation and the time offset that are correlated as closely as this hardly separate, as at constant
+speed: what does separate them is small ..."""
+_PAIR_SHARE = 0.5
+"""... so that it must determine them to this share of the limits."""
+
+
 @dataclass(frozen=True)
 class Advice:
     """What to record so that a direction is told, by what is weak in it.
@@ -56,16 +63,11 @@ class ObservabilityConfig(Settings):
         rotation_deg: of any rotation [deg].
         translation_m: of any translation [m].
         offset_s: of the time offset [s].
-        pair_correlation: a translation and the time offset that are correlated as closely as this hardly
-            separate, as at constant speed: what does separate them is small ...
-        pair_share: ... and must tell them to this share of the limits.
     """
 
     rotation_deg: float = setting(0.5, at_least=1e-30, at_most=180.0)
     translation_m: float = setting(0.05, at_least=1e-30, at_most=1000.0)
     offset_s: float = setting(0.01, at_least=1e-30, at_most=1000.0)
-    pair_correlation: float = setting(0.98, at_least=0.0, at_most=2.0)
-    pair_share: float = setting(0.5, at_least=0.001, at_most=1.0)
 
 
 def weak_directions(
@@ -116,7 +118,7 @@ def inseparable_directions(
     Args:
         covariance: (7, 7) by what stands alone.
     """
-    if _paired(covariance) < config.pair_correlation:
+    if _paired(covariance) < _PAIR_CORRELATION:
         return ()
     return tuple(
         replace(direction, sentence=f"by what stands alone, {direction.sentence}")
@@ -133,8 +135,8 @@ def involves_offset(direction: WeakDirection) -> bool:
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
-    if _paired(covariance) >= config.pair_correlation:
-        limits[3:] *= config.pair_share
+    if _paired(covariance) >= _PAIR_CORRELATION:
+        limits[3:] *= _PAIR_SHARE
     return limits
 
 

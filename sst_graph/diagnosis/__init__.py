@@ -2,7 +2,7 @@
 
 A check is a function of the prepared data that returns a :class:`Finding` or None. :func:`preflight` runs
 those that are certain by themselves, for every calibration; :func:`likely_causes` those that explain a result
-that is doubted already, among them changes of the data that would make the labels agree.
+that may be wrong, among them changes of the data that would make the labels agree.
 """
 
 from __future__ import annotations

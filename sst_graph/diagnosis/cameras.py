@@ -13,7 +13,7 @@ _ALIKE = 1.25
 
 def image_size(camera: PinholeCamera) -> Finding | None:
     """Pictures of another size than the intrinsics were made for: the principal point is off the middle by
-    one factor across and down, which tells the ratio of the sizes to some per cent."""
+    one factor across and down, which gives the ratio of the sizes to some per cent."""
     across, down = 2.0 * camera.cx / camera.width, 2.0 * camera.cy / camera.height
     if min(across, down) <= 0.0:
         return None

@@ -1,4 +1,4 @@
-"""All checks, in the order in which they are believed."""
+"""All checks, the most certain first."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def _preflight(
 def likely_causes(
     drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter
 ) -> tuple[Finding, ...]:
-    """Why the labels do not agree, for a result that is missing or doubted; empty where they do agree.
+    """Why the labels do not agree, for a result that is missing or may be wrong; empty where they do agree.
 
     Args:
         guess, offset_s: where the calibration started.
@@ -69,7 +69,7 @@ def likely_causes(
 def mirror(
     drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, answer: Fit
 ) -> tuple[Finding, ...]:
-    """Whether mirrored data would agree better, for a result that nothing else speaks against.
+    """Whether mirrored data would agree better, for a result without any other reason against it.
 
     Args:
         answer: how well the labels agree in the result.

@@ -113,7 +113,7 @@ def _wrong_rate(how: str, period: float, found: list[str]) -> Finding:
 
 
 def _dynamics(drive: Drive) -> tuple[float, float]:
-    """Speed [m/s] and acceleration [m/s^2] that a part of the drive exceeds; 0 where too few motions tell."""
+    """Speed [m/s] and acceleration [m/s^2] that a part of the drive exceeds; 0 where too few are known."""
     motions = [motion for motion in drive.lidar_motions if motion.ok]
     if len(motions) < 3:
         return 0.0, 0.0

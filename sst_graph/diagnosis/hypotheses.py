@@ -1,7 +1,7 @@
 """Which simple change of the data would make the labels agree: the change names the cause.
 
-When a calibration fails or is doubted, things that often go wrong are undone one by one, a start is searched
-each time, and how well the labels agree is compared with what they say of the data as given.
+When a calibration fails or may be wrong, common mistakes are undone one by one, a start is searched each
+time, and the agreement of the labels is compared with that of the data as given.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def best_hypothesis(
 def _best(
     tried: Iterator[Hypothesis], offset_s: float, fit: Fitter, given: Fit | None, enough: float = np.inf
 ) -> tuple[float, Finding] | None:
-    """Quality and cause of the best change that is believed; none is tried after one of ``enough``."""
+    """Quality and cause of the best change that is accepted; none is tried after one of ``enough``."""
     base = Fit(gtsam.Pose3(), 0.0, 0.0, 0.0) if given is None else given
     best: tuple[float, Finding] | None = None
     for hypothesis in tried:

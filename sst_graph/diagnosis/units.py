@@ -29,7 +29,7 @@ _FARTHEST_START_M = 10.0
 
 
 def clouds(drive: Drive) -> Finding | None:
-    """Clouds in another unit than metres: vehicles and the ground below the LiDAR tell."""
+    """Clouds in another unit than metres: vehicles and the ground below the LiDAR show it."""
     if drive.statistics is None:
         return None
     heights = vehicle_heights(drive.statistics)
@@ -60,7 +60,7 @@ def clouds(drive: Drive) -> Finding | None:
 
 
 def axes(drive: Drive, guess: gtsam.Pose3 | None) -> Finding | None:
-    """Clouds in the camera's axes under a start that is not made for them: the ground tells what is down."""
+    """Clouds in the camera's axes under a start that is not made for them: the ground shows what is down."""
     ground = None if drive.statistics is None else usual_ground(drive.statistics)
     if ground is None or ground.share < FLAT or ground.up[1] > -_UPRIGHT:
         return None

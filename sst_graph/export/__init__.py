@@ -15,9 +15,9 @@ from sst_graph.export.marginal import (
 )
 
 __all__ = [
-    "TIME_OFFSET",
     "EXTRINSIC",
     "FORMATS",
+    "TIME_OFFSET",
     "CalibrationMarginal",
     "ExportOptions",
     "export_text",

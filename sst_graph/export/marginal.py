@@ -24,9 +24,9 @@ from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
 
 __all__ = [
-    "TIME_OFFSET",
     "EXTRINSIC",
     "FORMAT",
+    "TIME_OFFSET",
     "VERSION",
     "CalibrationMarginal",
     "fuse_graphs",

@@ -58,6 +58,8 @@ class GraphConfig(Settings):
 
     Attributes:
         match: how boundary points meet contours.
+        lower_edges: classes whose edges towards the ground are matched too. They sharpen roll and height
+            where both sides label them alike; hand-drawn outlines often cover the gap above the ground.
         bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
         object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
             of a class the same bias.
@@ -448,8 +450,10 @@ class DriveMatches:
 
     @cached_property
     def tracks(self) -> IntArray | None:
-        """(m,) track whose mask bias each match has: its object's or the lower edges' of its class; None where
-        objects share their class's."""
+        """(m,) track whose mask bias each match has: its object's or the lower edges' of its class.
+
+        None where objects share their class's.
+        """
         own = self.outlines.own_tracks
         if own is None:
             return None

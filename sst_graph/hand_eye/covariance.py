@@ -4,7 +4,7 @@ A scan and an image end one pair and begin the next, so scores of neighbours are
 summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
 for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
 What all pairs share, such as a principal point that is off, no residual shows: it stands in
-:class:`HandEyeErrors`.
+:class:`SharedErrors`.
 """
 
 from __future__ import annotations
@@ -17,55 +17,60 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
-from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
 
 FloatArray = NDArray[np.float64]
 
 
-FEIGNED_MARGIN = 2.0
-"""What noise feigns counts so many times: its own size is known from the same few motions."""
-TAKEN_BACK = 0.5
-"""Largest part of the variance that scores which cancel one another take back: few may do so by chance."""
-LEAST_GENUINE = 1e-3
-"""Of the information in any direction at least this part is taken for genuine, to keep it positive."""
+NOISE_INFORMATION_MARGIN = 2.0
+"""What noise seems to bring counts so many times: its size is known from the same few motions."""
+MOST_TAKEN_OFF = 0.5
+"""Largest part of the variance that scores of neighbours which cancel take off: few may do so by chance."""
+LEAST_INFORMATION = 1e-3
+"""In any direction at least this part of the information remains, to keep it positive."""
+_LAGS = 3
+"""Neighbours up to this far apart may be correlated: a scan and an image end one pair and begin the next, and
+smoothing spreads errors a little farther. More lags make the estimate noisier."""
 
 
 @dataclass(frozen=True)
-class HandEyeErrors(Settings):
-    """Sigmas of what all pairs share, and how far neighbours go together.
+class SharedErrors:
+    """Sigmas of what all pairs have in common.
 
     Attributes:
-        direction_deg: of every direction of travel, about each axis of the camera [deg].
-        turn_rate_deg_s: of every rotation, by the length of its interval [deg/s].
-        lags: neighbours up to this far apart go together.
+        direction_deg: of every direction of travel, about each axis of the camera [deg]; 0.03 deg is half a
+            pixel of the principal point at a focal length of 900 px.
+        turn_rate_deg_s: of every rotation, by the length of its interval [deg/s]: drift of the odometry.
     """
 
-    direction_deg: float = setting(0.03, at_least=0.0, at_most=90.0)
-    turn_rate_deg_s: float = setting(0.02, at_least=0.0, at_most=90.0)
-    lags: int = setting(3, at_least=0, at_most=1000)
+    direction_deg: float = 0.03
+    turn_rate_deg_s: float = 0.02
+
+
+SHARED_ERRORS = SharedErrors()
+"""Of the odometry here."""
 
 
 def hand_eye_covariance(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
     terms: Sequence[HandEyeTerm],
-    errors: HandEyeErrors,
-    priors: HandEyePriors,
+    errors: SharedErrors = SHARED_ERRORS,
 ) -> FloatArray:
     """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, at most the priors' own.
 
     Args:
         graph: the terms' factors and the priors, at its optimum ``values``.
         terms: in the order of drive and time.
+        errors: what all pairs have in common.
     """
     ordering = gtsam.Ordering()
     ordering.push_back(EXTRINSIC)
     ordering.push_back(time_offset_key())
     hessian = graph.linearize(values).hessian(ordering)[0]
-    feigned = FEIGNED_MARGIN * np.sum([_feigned(term) for term in terms], axis=0)
-    bread = _inverse_of_genuine(hessian, feigned)
+    noise = NOISE_INFORMATION_MARGIN * np.sum([_noise_information(term) for term in terms], axis=0)
+    bread = _inverse_without(hessian, noise)
     blocks, scores, shared = [], [], np.zeros((7, 6))
     for term in terms:
         J, r, root = _whitened(term, values)
@@ -78,29 +83,28 @@ def hand_eye_covariance(
         if term.has_direction:
             shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
     residuals = sum(5 if term.has_direction else 3 for term in terms)
-    surplus = _surplus(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), errors.lags, residuals)
-    covariance = _filled(bread, surplus) + bread @ shared @ shared.T @ bread
-    return _capped(covariance, priors)
+    excess = _excess(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), residuals)
+    covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
+    return _capped(covariance)
 
 
-def _filled(bread: FloatArray, surplus: FloatArray) -> FloatArray:
-    """(7, 7) bread + bread surplus bread, of which the surplus takes back no more than :data:`TAKEN_BACK`."""
+def _sandwich(bread: FloatArray, excess: FloatArray) -> FloatArray:
+    """(7, 7) bread + bread excess bread, where the excess takes off no more than :data:`MOST_TAKEN_OFF`."""
     root = np.linalg.cholesky(bread)
-    values, vectors = np.linalg.eigh(np.eye(len(bread)) + root.T @ surplus @ root)
+    values, vectors = np.linalg.eigh(np.eye(len(bread)) + root.T @ excess @ root)
     half = root @ vectors
-    return np.asarray((half * np.maximum(values, 1.0 - TAKEN_BACK)) @ half.T)
+    return np.asarray((half * np.maximum(values, 1.0 - MOST_TAKEN_OFF)) @ half.T)
 
 
-def _capped(covariance: FloatArray, priors: HandEyePriors) -> FloatArray:
+def _capped(covariance: FloatArray) -> FloatArray:
     """(7, 7) covariance, nowhere wider than the priors that stand in the graph."""
-    sigmas = np.append(np.repeat([priors.rotation_rad, priors.translation_m], 3), priors.offset_s)
-    both = np.outer(sigmas, sigmas)
+    both = np.outer(PRIOR_SIGMAS, PRIOR_SIGMAS)
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) / both)
     return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T * both)
 
 
-def _feigned(term: HandEyeTerm) -> FloatArray:
-    """(7, 7) information that the noise of the LiDAR's motion seems to bring: a turn that was none."""
+def _noise_information(term: HandEyeTerm) -> FloatArray:
+    """(7, 7) information that the noise of the LiDAR's motion seems to bring, as if it were turns."""
     step, H = term.pair.lidar, term.rows_H_step
     weight = np.linalg.inv(term.covariance)
     result = np.zeros((7, 7))
@@ -112,14 +116,14 @@ def _feigned(term: HandEyeTerm) -> FloatArray:
     return result
 
 
-def _inverse_of_genuine(hessian: FloatArray, feigned: FloatArray) -> FloatArray:
+def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
     """(7, 7) inverse of the information without what noise feigns, which stays positive."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
     both = np.outer(scale, scale)
     whitener = np.linalg.inv(np.linalg.cholesky(hessian * both + 1e-14 * np.eye(7)))
-    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (feigned * both) @ whitener.T)
+    values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (noise * both) @ whitener.T)
     root = whitener.T @ vectors
-    return np.asarray((root / np.maximum(values, LEAST_GENUINE)) @ root.T * both)
+    return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)
 
 
 def _whitened(term: HandEyeTerm, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -135,26 +139,23 @@ def _breaks(terms: Sequence[HandEyeTerm]) -> NDArray[np.bool_]:
     return np.array([True] + [a.drive != b.drive or a.to_ns != b.from_ns for a, b in pairwise(cameras)])
 
 
-def _surplus(
-    scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], lags: int, residuals: int
-) -> FloatArray:
+def _excess(scores: FloatArray, model: FloatArray, breaks: NDArray[np.bool_], residuals: int) -> FloatArray:
     """(7, 7) by which the scores' own long-run variance exceeds the model's, or falls short of it.
 
-    What an image or a scan errs makes the turn before it too large and the next one too small.
+    An error of an image or a scan makes the turn before it too large and the next one too small.
 
     Args:
         scores: (n, 7) of the pairs.
         model: (7, 7) their variance if the model holds.
         breaks: (n,) where a pair does not go on where the one before ended.
-        lags: neighbours up to this far apart go together.
         residuals: number of independent residuals behind the scores.
     """
     run = np.cumsum(breaks)
     total = scores.T @ scores
-    for lag in range(1, lags + 1):
+    for lag in range(1, _LAGS + 1):
         same = run[lag:] == run[:-lag]
         product = (scores[lag:][same]).T @ scores[:-lag][same]
-        total += (1.0 - lag / (lags + 1.0)) * (product + product.T)
+        total += (1.0 - lag / (_LAGS + 1.0)) * (product + product.T)
     pairs, unknowns = len(scores), len(model)
     total *= pairs / max(pairs - 1, 1) * (residuals - 1) / max(residuals - unknowns, 1)
     return np.asarray(total - model)

@@ -13,7 +13,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.drive.path import PathStep, SensorPath
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors import hand_eye_factor, rotation_hand_eye, time_offset_prior
@@ -27,13 +26,23 @@ FloatArray = NDArray[np.float64]
 
 MIN_LENGTH_M = 0.1
 """Shorter motions of the camera have no direction worth the name [m]."""
+MAX_ROTATION_SIGMA_RAD = 0.02
+"""Camera motions whose rotation is known worse are left out [rad]."""
+PRIOR_SIGMAS: FloatArray = np.array([1.0] * 3 + [0.5] * 3 + [0.3])
+"""(7,) deviations from the guess, or from the start without one [rad, m, s]: so wide that they matter only
+where the motion says nothing."""
+_KERNEL = RobustKernel("cauchy", 3.0)
+"""Of whitened rotations and directions, scale in sigmas: odometry fails on single pairs; what lies
+within three sigmas counts nearly in full."""
+_LEAST_SCALE = 0.3
+"""The odometry's sigmas are never made smaller by more than this factor, however well few pairs fit."""
 _MEDIAN_CHI2 = {3: 2.366, 2: 1.386}
 """Median of the chi-squared distribution by degrees of freedom."""
 
 
 @dataclass(frozen=True)
 class CameraStep:
-    """What two images tell of the camera's motion.
+    """The camera's motion between two images.
 
     Attributes:
         drive: number of the drive.
@@ -70,27 +79,13 @@ class NoiseScales:
     direction: float = 1.0
 
 
-@dataclass(frozen=True)
-class HandEyePriors(Settings):
-    """Deviations from the guess: so wide that they matter only where the motion says nothing.
-
-    Attributes:
-        rotation_rad, translation_m: of the extrinsic.
-        offset_s: of the time offset.
-    """
-
-    rotation_rad: float = setting(1.0, at_least=1e-5, at_most=100.0)
-    translation_m: float = setting(0.5, at_least=1e-5, at_most=1000.0)
-    offset_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
-
-
-def camera_steps(drives: Sequence[Drive], max_rotation_sigma_rad: float) -> list[CameraStep]:
+def camera_steps(drives: Sequence[Drive]) -> list[CameraStep]:
     """The camera's motion between consecutive images of all drives, where at least its rotation is known."""
     return [
         CameraStep(number, image.index, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
         for number, drive in enumerate(drives)
         for image, pair in zip(drive.images, drive.image_pairs, strict=False)
-        if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * max_rotation_sigma_rad**2
+        if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * MAX_ROTATION_SIGMA_RAD**2
     ]
 
 
@@ -141,10 +136,8 @@ class HandEyeTerm:
         return np.asarray(self.factor.unwhitenedError(values))
 
 
-def hand_eye_terms(
-    pairs: Sequence[MotionPair], state: State, kernel: RobustKernel, least_scale: float
-) -> tuple[list[HandEyeTerm], NoiseScales]:
-    """A factor for every pair, and the scales at which half of the residuals are as small as they claim.
+def hand_eye_terms(pairs: Sequence[MotionPair], state: State) -> tuple[list[HandEyeTerm], NoiseScales]:
+    """A factor for every pair, and the scales at which half of the residuals are within their sigmas.
 
     The factors' noise is scaled so; robust weights are frozen at the state.
     """
@@ -153,10 +146,10 @@ def hand_eye_terms(
     turns, swerves = np.array([_sizes(term, values) for term in terms]).T
     directed = swerves[np.isfinite(swerves)]
     scales = NoiseScales(
-        max(_scale(turns, 3), least_scale), max(_scale(directed, 2), least_scale) if len(directed) else 1.0
+        max(_scale(turns, 3), _LEAST_SCALE), max(_scale(directed, 2), _LEAST_SCALE) if len(directed) else 1.0
     )
-    turn_weights = kernel.weight(turns / (scales.rotation * np.sqrt(3.0)))
-    swerve_weights = kernel.weight(np.nan_to_num(swerves) / (scales.direction * np.sqrt(2.0)))
+    turn_weights = _KERNEL.weight(turns / (scales.rotation * np.sqrt(3.0)))
+    swerve_weights = _KERNEL.weight(np.nan_to_num(swerves) / (scales.direction * np.sqrt(2.0)))
     weights = np.maximum(np.stack([turn_weights, swerve_weights], axis=1), 1e-6)
     return [_scaled(term, scales, w) for term, w in zip(terms, weights, strict=True)], scales
 
@@ -166,20 +159,18 @@ def _scale(sizes: FloatArray, freedom: int) -> float:
     return float(np.sqrt(np.median(sizes**2) / _MEDIAN_CHI2[freedom]))
 
 
-def hand_eye_graph(
-    terms: Sequence[HandEyeTerm], centre: State, priors: HandEyePriors
-) -> gtsam.NonlinearFactorGraph:
+def hand_eye_graph(terms: Sequence[HandEyeTerm], centre: State) -> gtsam.NonlinearFactorGraph:
     """The terms and the priors around ``centre``."""
     graph = gtsam.NonlinearFactorGraph()
     for term in terms:
         graph.add(term.factor)
-    sigmas = np.repeat([priors.rotation_rad, priors.translation_m], 3)
-    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    noise, sigma_s = gtsam.noiseModel.Diagonal.Sigmas(PRIOR_SIGMAS[:6]), float(PRIOR_SIGMAS[6])
+    graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, noise))
     # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
     # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
     pull = sum(term.noise_pull for term in terms)
-    mean_s = centre.offsets_s[0] + pull * priors.offset_s**2
-    graph.add(time_offset_prior(time_offset_key(), mean_s, priors.offset_s))
+    mean_s = centre.offsets_s[0] + pull * sigma_s**2
+    graph.add(time_offset_prior(time_offset_key(), mean_s, sigma_s))
     return graph
 
 
@@ -192,7 +183,7 @@ def state_values(state: State) -> gtsam.Values:
 
 
 def _term(pair: MotionPair, state: State) -> HandEyeTerm:
-    """The factor of a pair, with the noise that the odometry claims."""
+    """The factor of a pair, with the noise that the odometry states."""
     step, motion = pair.lidar, pair.camera.motion
     predicted = state.cTl * step.aTb * state.cTl.inverse()
     length = float(np.linalg.norm(predicted.translation()))

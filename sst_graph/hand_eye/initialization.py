@@ -15,37 +15,33 @@ from sst_graph.hand_eye.graph import CameraStep, MotionPair, pair_motions
 
 FloatArray = NDArray[np.float64]
 
+LEAST_SHARE = 0.4
+"""A time offset for which a smaller share of the pairs has LiDAR motion is not tried."""
+_STEP_S = 0.02
+"""Between time offsets [s]: a fifth of the usual time between scans."""
+_SELECTED = 4
+"""Most time offsets, each the best of its neighbourhood, that are refined."""
+_MAX_PAIRS = 150
+"""Most pairs that are compared, evenly spread: more cost time only."""
+_LEVER_SIGMA_M = 0.4
+"""Translation of the extrinsic, which the directions leave out, as a sigma [m]."""
+_TRUNCATION = 5.0
+"""Whitened size from which a residual costs no more: of outliers."""
+_GUESS_SIGMA_RAD = 1.0
+"""Sigma of the guess's rotation [rad]: it decides only what the motion leaves open."""
 _ROUNDS = 6
-_MOST_STEPS = 200
-"""Most offsets tried to either side: each takes some 10 ms."""
+"""Times that robust weights and rotation are found in turn; more cost time only."""
 
 
 @dataclass(frozen=True)
 class MotionStartConfig(Settings):
-    """The grid of time offsets and what counts in it.
+    """The time offsets that are tried.
 
     Attributes:
-        max_offset_s: farthest time offset tried, either side [s].
-        step_s: between offsets [s].
-        contenders: most offsets, each the best of its neighbourhood, that are refined.
-        max_pairs: most pairs looked at.
-        least_share: an offset for which fewer of the pairs have LiDAR motion is not tried.
-        lever_m: translation of the extrinsic that is left out of the directions, as a sigma [m].
-        truncation: whitened size at which a residual stops to cost more.
-        guess_rad: sigma of the guess's rotation [rad].
+        max_offset_s: farthest time offset tried, either side [s]; each step of 0.02 s takes some 10 ms.
     """
 
-    max_offset_s: float = setting(0.5, at_least=0.0, at_most=10.0)
-    step_s: float = setting(0.02, at_least=0.001, at_most=1.0)
-    contenders: int = setting(4, at_least=1, at_most=100)
-    max_pairs: int = setting(150, at_least=2, at_most=2000)
-    least_share: float = setting(0.4, at_least=0.0, at_most=1.0)
-    lever_m: float = setting(0.4, at_least=0.0, at_most=100.0)
-    truncation: float = setting(5.0, at_least=0.1, at_most=1000.0)
-    guess_rad: float = setting(1.0, at_least=0.001, at_most=100.0)
-
-    def __post_init__(self) -> None:
-        self.expect_at_most("max_offset_s", _MOST_STEPS * self.step_s, f"{_MOST_STEPS} step_s")
+    max_offset_s: float = setting(0.5, at_least=0.0, at_most=4.0)
 
 
 @dataclass(frozen=True)
@@ -69,32 +65,30 @@ def motion_starts(
     Rotation vectors and directions of travel of the LiDAR are turned into the camera's (Kabsch, robustly
     weighted) at every time offset of the grid. Directions leave out the lever arm.
     """
-    chosen = np.unique(np.linspace(0, len(steps) - 1, min(config.max_pairs, len(steps))).astype(int))
+    chosen = np.unique(np.linspace(0, len(steps) - 1, min(_MAX_PAIRS, len(steps))).astype(int))
     some = [steps[i] for i in chosen] if steps else []
-    count = int(np.ceil(config.max_offset_s / config.step_s))
-    grid = guess_offset_s + config.step_s * np.arange(-count, count + 1)
+    count = int(np.ceil(config.max_offset_s / _STEP_S))
+    grid = guess_offset_s + _STEP_S * np.arange(-count, count + 1)
     found: list[MotionStart | None] = []
     for offset_s in grid:
         pairs = pair_motions(some, paths, float(offset_s))
-        enough = len(pairs) >= max(2, config.least_share * len(some))
-        found.append(_best_rotation(pairs, float(offset_s), guess, config) if enough else None)
-    return _minima(found)[: config.contenders]
+        enough = len(pairs) >= max(2, LEAST_SHARE * len(some))
+        found.append(_best_rotation(pairs, float(offset_s), guess) if enough else None)
+    return _minima(found)[:_SELECTED]
 
 
 def _minima(found: Sequence[MotionStart | None]) -> list[MotionStart]:
-    """Those no dearer than both of their neighbours, cheapest first."""
+    """Local minima of the cost, the lowest first."""
     costs = np.array([np.inf if one is None else one.cost for one in found])
     around = np.concatenate([[np.inf], costs, [np.inf]])
     lowest = np.isfinite(costs) & (costs <= around[:-2]) & (costs <= around[2:])
     return sorted((one for one, low in zip(found, lowest, strict=True) if one and low), key=lambda s: s.cost)
 
 
-def _best_rotation(
-    pairs: Sequence[MotionPair], offset_s: float, guess: gtsam.Rot3 | None, config: MotionStartConfig
-) -> MotionStart:
+def _best_rotation(pairs: Sequence[MotionPair], offset_s: float, guess: gtsam.Rot3 | None) -> MotionStart:
     """Robust Kabsch over rotation vectors and directions."""
-    l_vectors, c_vectors, sigmas = _vectors(pairs, config)
-    prior = np.zeros((3, 3)) if guess is None else guess.matrix() / config.guess_rad**2
+    l_vectors, c_vectors, sigmas = _vectors(pairs)
+    prior = np.zeros((3, 3)) if guess is None else guess.matrix() / _GUESS_SIGMA_RAD**2
     weights = np.ones(len(sigmas))
     R = np.eye(3)
     for _ in range(_ROUNDS):
@@ -102,14 +96,12 @@ def _best_rotation(
         U, _, Vt = np.linalg.svd(moment)
         R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
         size = np.linalg.norm(c_vectors - l_vectors @ R.T, axis=1) / sigmas
-        weights = 1.0 / (1.0 + (size / config.truncation) ** 2) ** 2
-    cost = float(np.minimum(size, config.truncation) @ np.minimum(size, config.truncation)) / len(size)
+        weights = 1.0 / (1.0 + (size / _TRUNCATION) ** 2) ** 2
+    cost = float(np.minimum(size, _TRUNCATION) @ np.minimum(size, _TRUNCATION)) / len(size)
     return MotionStart(gtsam.Rot3(R), offset_s, cost)
 
 
-def _vectors(
-    pairs: Sequence[MotionPair], config: MotionStartConfig
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _vectors(pairs: Sequence[MotionPair]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """(n, 3) vectors in the LiDAR, (n, 3) the same in the camera, (n,) sigmas: rotations, directions."""
     of_lidar, of_camera, sigmas = [], [], []
     for pair in pairs:
@@ -120,7 +112,7 @@ def _vectors(
         variance = np.trace(motion.covariance[:3, :3]) + np.trace(step.covariance[:3, :3])
         sigmas.append(np.sqrt(variance / 3.0))
         length = float(np.linalg.norm(step.aTb.translation()))
-        lever = config.lever_m * float(np.linalg.norm(turn))
+        lever = _LEVER_SIGMA_M * float(np.linalg.norm(turn))
         if not motion.ok or length < 2.0 * lever or length < 1e-3:
             continue
         of_lidar.append(step.aTb.translation() / length)

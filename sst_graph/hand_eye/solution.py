@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -19,12 +19,10 @@ from sst_graph.config import Settings, setting
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
-from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.covariance import HandEyeErrors, hand_eye_covariance
+from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (
     CameraStep,
-    HandEyePriors,
     HandEyeTerm,
     NoiseScales,
     camera_steps,
@@ -34,13 +32,27 @@ from sst_graph.hand_eye.graph import (
     pair_motions,
     state_values,
 )
-from sst_graph.hand_eye.initialization import MotionStartConfig, motion_starts
+from sst_graph.hand_eye.initialization import LEAST_SHARE, MotionStartConfig, motion_starts
 
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 VAGUE_DEG, VAGUE_S = 5.0, 0.03
 """A rotation or a time offset with a larger sigma than this is as good as unknown [deg], [s]."""
+_MAX_OUTER = 20
+"""Most outer iterations: a bound on the time; what has not converged by then is reported."""
+_FIRST_OUTER = 4
+"""Outer iterations from every start, before the best of them go on."""
+_FULL_STEPS = 6
+"""Outer steps after which ever smaller parts of each are made: robust weights and the LiDAR's motion at the
+new offset may alternate for ever."""
+_STEP_SIGMAS = 0.1
+"""An outer step shorter than this many standard deviations ends the outer loop."""
+_INNER_ITERATIONS = 10
+"""Most Levenberg-Marquardt iterations on frozen motions: the next outer iteration goes on from there."""
+ALTERNATIVE_CHI2 = 9.0
+"""A different solution that costs at most this much more makes the answer ambiguous: three sigmas of one
+unknown. Solutions farther apart than this (chi-squared of 7) are different."""
 
 
 @dataclass(frozen=True)
@@ -48,37 +60,12 @@ class MotionConfig(Settings):
     """Hand-eye calibration.
 
     Attributes:
-        start: the closed-form start.
-        priors: around the guess, or around the start without a guess.
-        errors: what all pairs share.
-        kernel: of whitened rotations and directions, scales in sigmas.
-        max_rotation_sigma_rad: camera motions whose rotation is known worse are left out [rad].
+        start: time offsets that are tried first.
         min_pairs: fewest pairs for an answer.
-        max_outer: most times that the LiDAR's motion is looked up anew.
-        heat_outer: outer steps from every start, before the best go on.
-        full_steps: outer steps after which ever smaller parts of each are made: robust weights and look-ups
-            may go to and fro for ever.
-        settled: an outer step shorter than this many standard deviations ends the outer loop.
-        inner_iterations: most Levenberg-Marquardt iterations in between.
-        least_scale: the odometry's sigmas are never made smaller by more than this factor.
-        max_disagreement: chi-squared of 7 up to which the joint method takes the motion in.
-        rival_chi2: a different solution that costs at most this much more makes the answer doubtful.
     """
 
     start: MotionStartConfig = field(default_factory=MotionStartConfig)
-    priors: HandEyePriors = field(default_factory=HandEyePriors)
-    errors: HandEyeErrors = field(default_factory=HandEyeErrors)
-    kernel: RobustKernel = field(default_factory=lambda: RobustKernel("cauchy", 3.0))
-    max_rotation_sigma_rad: float = setting(0.02, at_least=1e-6, at_most=10.0)
     min_pairs: int = setting(5, at_least=2, at_most=1_000_000)
-    max_outer: int = setting(20, at_least=1, at_most=1000)
-    heat_outer: int = setting(4, at_least=1, at_most=1000)
-    full_steps: int = setting(6, at_least=0, at_most=1000)
-    settled: float = setting(0.1, at_least=0.0, at_most=10.0)
-    inner_iterations: int = setting(10, at_least=1, at_most=1000)
-    least_scale: float = setting(0.3, at_least=0.001, at_most=10.0)
-    max_disagreement: float = setting(40.0, at_least=0.0, at_most=1e6)
-    rival_chi2: float = setting(9.0, at_least=0.0, at_most=1e6)
 
 
 @dataclass(frozen=True)
@@ -89,7 +76,7 @@ class MotionSolution:
         state: the estimate.
         centre: of the priors.
         terms: its factors, under the noise that the residuals have.
-        scales: that noise, in multiples of what odometry claims.
+        scales: that noise, in multiples of what odometry states.
         covariance: (7, 7).
         cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
         outer_iterations: done.
@@ -119,10 +106,10 @@ def solve_motion(
         EstimationError: too few pairs of motions.
     """
     # 1. The motions, which depend on no calibration.
-    steps, paths = camera_steps(drives, config.max_rotation_sigma_rad), lidar_paths(drives)
+    steps, paths = camera_steps(drives), lidar_paths(drives)
     if len(steps) < config.min_pairs:
         raise EstimationError(_too_few(len(steps), config))
-    # 2. Rotation and time offset by trying all offsets.
+    # 2. Rotation and time offset on a grid of offsets.
     guess = None if guess_cTl is None else guess_cTl.rotation()
     starts = motion_starts(steps, paths, guess, guess_offset_s, config.start)
     if not starts:
@@ -133,26 +120,26 @@ def solve_motion(
     for number, start in enumerate(starts):
         cTl = gtsam.Pose3(start.cRl, translation)
         centre = State(guess_cTl or cTl, (guess_offset_s,))
-        heat = replace(config, max_outer=config.heat_outer)
-        solution = _solve(steps, paths, State(cTl, (start.offset_s,)), centre, heat)
+        first = State(cTl, (start.offset_s,))
+        solution = _solve(steps, paths, first, centre, config, _FIRST_OUTER)
         if solution is not None:
             solutions.append(solution)
         if progress is not None:
             progress("motion", number + 1, len(starts))
     if not solutions:
-        raise EstimationError("the time offset ran to where the drive has no LiDAR motion, from every start")
-    finished = [_finished(steps, paths, s, config) for s in _different(solutions, config)]
+        raise EstimationError("from every start the time offset left the time that the LiDAR's motion covers")
+    finished = [_finished(steps, paths, s, config) for s in _different(solutions)]
     _LOG.info("motion: %d pairs, costs %s", len(steps), [round(s.cost, 1) for s in finished])
     return sorted(finished, key=lambda s: s.cost)
 
 
-def _different(solutions: Sequence[MotionSolution], config: MotionConfig) -> list[MotionSolution]:
+def _different(solutions: Sequence[MotionSolution]) -> list[MotionSolution]:
     """The cheapest, and those that cost little more and lie elsewhere; all before they were finished."""
     first, *others = sorted(solutions, key=lambda s: s.cost)
     kept = [first]
     for other in others:
-        near = 2.0 * (other.cost - first.cost) < 3.0 * config.rival_chi2
-        if near and all(_apart(one, other) > config.rival_chi2 for one in kept):
+        near = 2.0 * (other.cost - first.cost) < 3.0 * ALTERNATIVE_CHI2
+        if near and all(_apart(one, other) > ALTERNATIVE_CHI2 for one in kept):
             kept.append(other)
     return kept
 
@@ -178,29 +165,30 @@ def _solve(
     state: State,
     centre: State,
     config: MotionConfig,
+    max_outer: int = _MAX_OUTER,
 ) -> MotionSolution | None:
     """Look the LiDAR's motion up at the time offset, optimise, until nothing moves.
 
     None where the offset runs away to where too few pairs are left.
     """
     converged, outer = False, 0
-    while outer < config.max_outer and not converged:
+    while outer < max_outer and not converged:
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
         pairs = pair_motions(steps, paths, state.offsets_s[0])
-        if len(pairs) < max(config.min_pairs, config.start.least_share * len(steps)):
+        if len(pairs) < max(config.min_pairs, LEAST_SHARE * len(steps)):
             return None
-        terms, scales = hand_eye_terms(pairs, state, config.kernel, config.least_scale)
+        terms, scales = hand_eye_terms(pairs, state)
         # 2. Inner optimisation.
-        graph = hand_eye_graph(terms, centre, config.priors)
-        values = _optimise(graph, state_values(state), config.inner_iterations)
-        covariance = hand_eye_covariance(graph, values, terms, config.errors, config.priors)
+        graph = hand_eye_graph(terms, centre)
+        values = _optimise(graph, state_values(state))
+        covariance = hand_eye_covariance(graph, values, terms)
         # 3. Move; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
         step = difference(state, moved)
-        step /= 1 + max(0, outer - config.full_steps)
+        step /= 1 + max(0, outer - _FULL_STEPS)
         state = State(state.cTl.retract(step[:6]), (state.offsets_s[0] + float(step[6]),))
-        converged = float(step @ np.linalg.solve(covariance, step)) < config.settled**2
+        converged = float(step @ np.linalg.solve(covariance, step)) < _STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
 
@@ -210,9 +198,9 @@ def difference(a: State, b: State) -> FloatArray:
     return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
 
 
-def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, iterations: int) -> gtsam.Values:
+def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:
     params = gtsam.LevenbergMarquardtParams()
-    params.setMaxIterations(iterations)
+    params.setMaxIterations(_INNER_ITERATIONS)
     params.setlambdaInitial(1e-6)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
@@ -224,16 +212,16 @@ def _too_few(pairs: int, config: MotionConfig) -> str:
     )
 
 
-def rival(solutions: Sequence[MotionSolution], config: MotionConfig) -> MotionSolution | None:
+def alternative(solutions: Sequence[MotionSolution]) -> MotionSolution | None:
     """A solution that fits almost as well as the first and is another one by the covariance of both.
 
-    None where the first is so vague that it claims nothing that another could contradict.
+    None where the first is so uncertain that no other can contradict it.
     """
     best, *others = solutions
     sigmas = np.sqrt(np.diag(best.covariance))
     if np.degrees(sigmas[:3].max()) > VAGUE_DEG or sigmas[6] > VAGUE_S:
         return None
     for other in others:
-        if 2.0 * (other.cost - best.cost) < config.rival_chi2 and _apart(best, other) > config.rival_chi2:
+        if 2.0 * (other.cost - best.cost) < ALTERNATIVE_CHI2 and _apart(best, other) > ALTERNATIVE_CHI2:
             return other
     return None

@@ -1,6 +1,6 @@
-"""What methods other than the joint one can say of each frame, as it stands in ``calibration.json``.
+"""Information gained by frame, of methods other than the joint one, as it stands in ``calibration.json``.
 
-Under ``diagnostics.information_gained``: the tracker tells what each scan brought as it came, the hand-eye
+Under ``diagnostics.information_gained``: for the tracker what each scan added when it came, for the hand-eye
 method what each pair of motions adds to the others. Both are less than
 :mod:`sst_graph.inspect.frame_information`: no view is kept, so what to record next cannot be predicted.
 """
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
 from sst_graph.graph.state import State
-from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm, state_values
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm, state_values
 from sst_graph.inspect.frame_information import MAX_NUMBER
 from sst_graph.result import CalibrationResult, FrameId
 
@@ -46,7 +46,7 @@ class Gain:
 
 @dataclass(frozen=True)
 class Gained:
-    """All of them, in their order; ``kind`` tells what bits and values mean."""
+    """All of them, in their order; ``kind`` says what bits and values mean."""
 
     kind: Kind
     gains: tuple[Gain, ...]
@@ -57,13 +57,10 @@ def bits_between(before: FloatArray, after: FloatArray) -> float:
     return 0.5 * (_log_det(before) - _log_det(after)) / float(np.log(2.0))
 
 
-def pair_gains(
-    terms: Sequence[HandEyeTerm], frames: Sequence[FrameId], state: State, priors: HandEyePriors
-) -> Gained:
+def pair_gains(terms: Sequence[HandEyeTerm], frames: Sequence[FrameId], state: State) -> Gained:
     """What each pair of motions adds to all others, the pairs counted as independent."""
     values = state_values(state)
-    sigmas = np.append(np.repeat([priors.rotation_rad, priors.translation_m], 3), priors.offset_s)
-    both = np.outer(sigmas, sigmas)
+    both = np.outer(PRIOR_SIGMAS, PRIOR_SIGMAS)
     parts = [both * term.factor.linearize(values).information() for term in terms]
     total = np.eye(7) + np.sum(parts, axis=0)
     covariance, gains = np.linalg.inv(total), []
@@ -87,7 +84,7 @@ def to_document(gained: Gained) -> dict[str, Any]:
 
 
 def gained_of(result: CalibrationResult) -> Gained | None:
-    """What a result says of each frame, or None.
+    """Information gained by frame in a result, or None.
 
     Raises:
         DataError: the entry is there, and is not such columns.

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.covariance.observability import ObservabilityConfig, weak_directions
-from sst_graph.errors import DataError
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.inspect.frame_information import KEY, FrameInformation, frames_of
 from sst_graph.inspect.gained import Gained, gained_of
 from sst_graph.inspect.planning import Plan, limits_of, plan_recording
@@ -29,22 +28,18 @@ HUMAN: FloatArray = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
 """(7,) from SI to :data:`UNITS`."""
 
 RANGES_M = (5.0, 20.0, 50.0)
-"""Ranges for which the error in the image is told [m]."""
+"""Ranges for which the error in the image is given [m]."""
 
 
-@dataclass(frozen=True)
-class InspectConfig(Settings):
-    """What is told, and from where on.
+STRONG = 0.6
+"""Least correlation that is put into words: above it, knowing one unknown takes a fifth or more off the
+other's sigma."""
 
-    Attributes:
-        strong: least correlation that is put into words.
-        redundant: a frame is redundant if no sigma grows by more than this share without it.
-        next_frames: frames that the predictions add.
-    """
+REDUNDANT_SHARE = 0.01
+"""A frame is redundant if no sigma grows by more than this share without it."""
 
-    strong: float = setting(0.6, at_least=0.0, at_most=1.0)
-    redundant: float = setting(0.01, at_least=0.0, at_most=10.0)
-    next_frames: int = setting(10, at_least=1, at_most=1_000_000)
+MOST_NEXT_FRAMES = 1_000_000
+"""Most frames that the predictions may add."""
 
 
 @dataclass(frozen=True)
@@ -92,11 +87,11 @@ class Inspection:
         correlation: (7, 7).
         strong: the strongest correlations, strongest first.
         weakest: the direction known worst, measured in the limits, also where it is within them.
-        frames: what each frame brought; empty where the result does not tell.
+        frames: what each frame brought; empty where the result has none.
         redundant: positions in ``frames`` of those that each could be left out ...
         redundant_share: ... without any sigma growing by more than this share.
         plan: what to record next, or None without ``frames``.
-        gained: what else the result says of each frame, or None.
+        gained: other information by frame in the result, or None.
     """
 
     result: CalibrationResult
@@ -113,13 +108,19 @@ class Inspection:
     gained: Gained | None
 
 
-def inspect_result(result: CalibrationResult, config: InspectConfig | None = None) -> Inspection:
+def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspection:
     """Everything there is to say about a result's uncertainty.
 
+    Args:
+        next_frames: frames that the predictions add.
+
     Raises:
+        ConfigError: less than one frame, or more than :data:`MOST_NEXT_FRAMES`.
         DataError: the result's information by frame is malformed.
     """
-    config = config or InspectConfig()
+    if not 1 <= next_frames <= MOST_NEXT_FRAMES:
+        expected = f"at least 1 and at most {MOST_NEXT_FRAMES}"
+        raise ConfigError(f"next_frames: found {next_frames}, expected {expected}")
     frames = frames_of(result)
     limits = limits_of(result)
     return Inspection(
@@ -128,12 +129,12 @@ def inspect_result(result: CalibrationResult, config: InspectConfig | None = Non
         camera_sigmas(result),
         tuple(pixel_sigma(result, range_m) for range_m in RANGES_M),
         correlation_matrix(result.covariance),
-        strong_correlations(result.covariance, config.strong),
+        strong_correlations(result.covariance, STRONG),
         weakest_direction(result, limits),
         frames,
-        redundant_frames(frames, config.redundant),
-        config.redundant,
-        _plan(result, frames, config.next_frames),
+        redundant_frames(frames, REDUNDANT_SHARE),
+        REDUNDANT_SHARE,
+        _plan(result, frames, next_frames),
         gained_of(result),
     )
 

@@ -1,10 +1,10 @@
 """What to record next: the covariance that frames not yet recorded would give.
 
 A recorded frame's view (its information on the extrinsic) is combined with any motion: taken at
-twist l_twist it tells the offset through J_offset = -J_extrinsic l_twist. Frames are predicted at other
+twist l_twist it informs the offset through J_offset = -J_extrinsic l_twist. Frames are predicted at other
 places, each with objects and mask biases of its own, so that their information adds up.
 
-What is taken for granted (a focal length, a principal point) errs in every frame alike: the part of the
+What is assumed (a focal length, a principal point) errs in every frame alike: the part of the
 covariance that considers it stays, however many frames are added.
 """
 
@@ -32,7 +32,7 @@ from sst_graph.result import CalibrationResult
 FloatArray = NDArray[np.float64]
 
 ASSUMPTIONS = "assumptions"
-"""Key among a result's diagnostics of what it takes for granted: by name, deviation and sensitivity."""
+"""Key among a result's diagnostics of what it assumes: by name, deviation and sensitivity."""
 
 AT_REST_MPS = 0.3
 """Below this speed a frame counts as standing [m/s]."""
@@ -68,7 +68,7 @@ class Prediction:
         name: of the proposal.
         sigmas: (7,) [rad, m, s] after it.
         worst: sigma of the direction known worst, over the limit: below 1 the status would be ok.
-        bits: information gained [bit]; 0 where a covariance has no inverse, which tells none.
+        bits: information gained [bit]; 0 where a covariance has no inverse, and nothing is known.
         enough: fewest frames that bring ``worst`` below 1, or None where :data:`MOST_FRAMES` don't, or
             where it was not looked for.
     """
@@ -221,7 +221,7 @@ def predicted_covariance(
 
 
 def considered_covariance(result: CalibrationResult) -> FloatArray:
-    """(7, 7) part of a result's covariance by what it takes for granted; zeros where it does not tell."""
+    """(7, 7) part of a result's covariance by its assumptions; zeros where it has none."""
     stored = result.diagnostics.get(ASSUMPTIONS)
     found, variances = np.zeros((7, 7)), np.diag(result.covariance)
     for entry in stored.values() if isinstance(stored, Mapping) else ():
@@ -307,7 +307,7 @@ def nearer(view: FloatArray, cTl: gtsam.Pose3, factor: float = 2.0) -> FloatArra
 
 
 def limits_of(result: CalibrationResult) -> ObservabilityConfig:
-    """The limits that the result was judged by; the defaults where it does not tell."""
+    """The limits that the result was judged by; the defaults where it has none."""
     place: Any = result.config.get("observability")
     if place is None and isinstance(result.config.get("calibration"), Mapping):
         place = result.config["calibration"].get("observability")

@@ -34,7 +34,7 @@ class Comparison:
 
 
 def summary(result: CalibrationResult, comparison: Comparison | None = None) -> str:
-    """The result in a dozen lines: numbers with sigmas, status, what cannot be told."""
+    """The result in a dozen lines: numbers with sigmas, status, unobservable directions."""
     rows = [
         ("status", result.status),
         ("method", f"{result.method}, {_frames(result)}"),
@@ -100,7 +100,7 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
         blocks += ["## Where the sigmas come from", "```\n" + "\n".join(parts) + "\n```"]
     if result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
-        blocks += ["## What the data hardly tells", "\n".join(items)]
+        blocks += ["## What the data hardly determine", "\n".join(items)]
     if pictures:
         blocks += [
             "## Before and after",

@@ -1,10 +1,10 @@
 """One image and one scan in a graph of the user's own: matched anew at every estimate.
 
-A term knows its data, and where extrinsic, time offset and the trajectory stand in the graph. At any values
+A term holds its data, and where extrinsic, time offset and the trajectory stand in the graph. At any values
 it finds the two poses between which the image was taken in true time, stamp + offset, matches scan and image
 there, and makes its factor (:func:`sst_graph.factors.pose_alignment_factor`). Matches are frozen in a
-factor: what it says holds near the values at which it was made, and :class:`TermMatches` tells how near they
-still are. :mod:`sst_graph.slam.solving` swaps the factors of many terms in a solver.
+factor: it is valid near the values at which it was made, and :class:`TermMatches` measures how far they have
+moved since. :mod:`sst_graph.slam.solving` swaps the factors of many terms in a solver.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.pose_alignment import pose_alignment_factor
 from sst_graph.factors.reprojection import residuals
-from sst_graph.factors.robust import KernelKind, RobustKernel
+from sst_graph.factors.robust import RobustKernel
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.slam.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
@@ -41,14 +41,12 @@ class TermConfig(Settings):
 
     Attributes:
         classes: to match.
-        match: how boundary points meet contours; its ``side_sigma_px`` bounds what a side may claim.
-        kernel: kind of robust kernel on each match.
+        match: how boundary points meet contours; its ``side_sigma_px`` bounds the information of a side.
         min_matches: fewer matches than this make no factor.
     """
 
     classes: tuple[SemanticClass, ...] = VEHICLES
     match: MatchConfig = SLAM_MATCHES
-    kernel: KernelKind = "geman_mcclure"
     min_matches: int = setting(10, at_least=1, at_most=1_000_000)
 
 
@@ -362,7 +360,7 @@ class AlignmentTerm:
             classes=self.config.classes,
             biases_px={c: keys.bias(values, c) for c in keys.biases_px},
             l_velocities=moving if lTs is None else None,
-            kernel=RobustKernel(self.config.kernel, kernel_px),
+            kernel=RobustKernel("geman_mcclure", kernel_px),
             config=self.config.match,
         )
 

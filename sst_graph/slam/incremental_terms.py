@@ -1,6 +1,6 @@
 """Alignment terms in iSAM2 and in a fixed-lag smoother: factors swapped as the estimate moves.
 
-At every update the user's factors go in first. Then the terms whose matches have become stale (points moved,
+At every update the user's factors go in first. Then the terms whose matches have changed (points moved,
 stamp + offset in another interval, another kernel) are matched again at the new estimate, and their factors
 take the place of the old ones. Kernel, proximal prior and the scale of the information are those of
 :mod:`sst_graph.slam.solving`.
@@ -9,17 +9,16 @@ take the place of the old ones. Kernel, proximal prior and the scale of the info
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, cast
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches, TermState
-from sst_graph.slam.config import RematchConfig
+from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     Robust,
     TermSums,
@@ -40,24 +39,15 @@ FloatArray = NDArray[np.float64]
 Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
 
 
-@dataclass(frozen=True)
-class IncrementalConfig(Settings):
-    """Beside the schedule of :class:`RematchConfig`.
-
-    Attributes:
-        rematch: kernels and scale of the information.
-        stale_px: a term is matched again when the estimate has moved its points by more (RMS) [px].
-        rounds: rounds of matching an update, at most.
-        known: the kernel is narrowed only when extrinsic and offset are known to less than this share of it
-            in the image (one sigma): a single image must not decide.
-        rescale: the factors are made anew when the scale of their information is off by more than this share.
-    """
-
-    rematch: RematchConfig = field(default_factory=RematchConfig)
-    stale_px: float = setting(0.3, at_least=0.0, at_most=1000.0)
-    rounds: int = setting(2, at_least=1, at_most=1000)
-    known: float = setting(0.5, at_least=0.001, at_most=1000.0)
-    rescale: float = setting(0.2, at_least=0.0, at_most=100.0)
+_REMATCH_PX = 0.3
+"""A term is matched again when the estimate has moved its points by more (RMS) [px]."""
+_ROUNDS = 2
+"""Most rounds of matching an update: bounds its time; the next update goes on."""
+_KNOWN = 0.5
+"""The kernel is narrowed only when extrinsic and offset are known to less than this share of it in the image
+(one sigma): a single image must not decide."""
+_RESCALE = 0.2
+"""The factors are made anew when the scale of their information is off by more than this share."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +59,7 @@ class IncrementalUpdate:
         covariance: (7, 7) cluster-robust, of extrinsic and offset, once the kernel has its last scale; until
             then the solver's marginal, proximal prior included.
         kernel_px: scale of the kernel [px].
-        settled: the kernel has its last scale, the proximal prior is gone, and the matches are fresh.
+        converged: the kernel has its last scale, the proximal prior is gone, no term needs matching.
         rematched: how many factors were swapped.
         waiting: terms that have no factor, and why.
         warnings: what may be wrong.
@@ -78,7 +68,7 @@ class IncrementalUpdate:
     values: gtsam.Values
     covariance: FloatArray
     kernel_px: float
-    settled: bool
+    converged: bool
     rematched: int
     waiting: Mapping[TermState, int]
     warnings: tuple[TermWarning, ...]
@@ -87,14 +77,14 @@ class IncrementalUpdate:
 class IncrementalTerms:
     """The alignment terms of one camera in one solver."""
 
-    def __init__(self, solver: Solver, keys: AlignmentKeys, config: IncrementalConfig | None = None) -> None:
+    def __init__(self, solver: Solver, keys: AlignmentKeys, config: RematchConfig | None = None) -> None:
         """solver: yours; all later updates go through :meth:`update`. keys: those of the terms."""
         self._solver, self._keys = solver, keys
-        self._config = config or IncrementalConfig()
+        self._config = config or RematchConfig()
         self._terms: list[_Placed] = []
         self._proximal: dict[int, gtsam.NonlinearFactor] = {}
         self._stamps: dict[int, float] = {}
-        self._kernel_px = self._config.rematch.first_px
+        self._kernel_px = self._config.first_px
         self._held, self._information = True, 1.0
         self._sides = ObjectSides()
         self._gone = TermSums()
@@ -116,17 +106,17 @@ class IncrementalTerms:
         stamps = self._stamped(stamps)
         self._solve(graph, values, stamps, self._leaving(stamps))
         self._terms += [_Placed(term) for term in terms]
-        return self._renew(self._config.rounds)
+        return self._rematch(_ROUNDS)
 
-    def settle(self, most_rounds: int | None = None) -> IncrementalUpdate:
+    def converge(self, most_rounds: int | None = None) -> IncrementalUpdate:
         """Rounds of matching without anything new, until they change nothing."""
-        rounds = self._config.rematch.most_rounds if most_rounds is None else most_rounds
-        return self._renew(rounds)
+        rounds = self._config.most_rounds if most_rounds is None else most_rounds
+        return self._rematch(rounds)
 
     # --- rounds
 
-    def _renew(self, rounds: int) -> IncrementalUpdate:
-        rematched, settled, estimate = 0, False, self._solver.calculateEstimate()
+    def _rematch(self, rounds: int) -> IncrementalUpdate:
+        rematched, converged, estimate = 0, False, self._solver.calculateEstimate()
         first_warnings: list[TermWarning] = []
         alone = None if self._matches() else self._marginal()[:7, :7]
         covariance, found = np.zeros((7, 7)), None
@@ -138,35 +128,35 @@ class IncrementalTerms:
             rematched += swapped
             before, estimate = estimate, self._solver.calculateEstimate()
             if alone is not None:
-                first_warnings = wide_uncertainty(self._matches(), before, alone, self._config.rematch)
+                first_warnings = wide_uncertainty(self._matches(), before, alone, self._config)
                 alone = None
-            covariance, found, settled = self._anneal(estimate)
-            if settled:
+            covariance, found, converged = self._anneal(estimate)
+            if converged:
                 break
         warnings = first_warnings
         matches = self._matches()
-        if matches and self._kernel_px == self._config.rematch.last_px:
-            warnings = warnings + last_warnings(matches, estimate, covariance, self._config.rematch)
+        if matches and self._kernel_px == self._config.last_px:
+            warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
-                warnings = warnings + told(P, found, cTl, self._config.rematch)
+                warnings = warnings + told(P, found, cTl, self._config)
         return IncrementalUpdate(
             estimate,
             covariance,
             self._kernel_px,
-            settled,
+            converged,
             rematched,
             self._waiting(),
             tuple(dict.fromkeys(warnings)),
         )
 
     def _anneal(self, estimate: gtsam.Values) -> tuple[FloatArray, Robust | None, bool]:
-        """The next kernel; covariance (7, 7), robust at the last kernel, and whether all has settled."""
-        config = self._config.rematch
+        """The next kernel; covariance (7, 7), robust at the last kernel, and whether all has converged."""
+        config = self._config
         P, matches = self._marginal(), self._matches()
         sigma_px = wide_uncertainty(matches, estimate, P[:7, :7], config, 0.0)
-        known = bool(sigma_px) and sigma_px[0].value < self._config.known * self._kernel_px
-        calm = moved_px(matches, estimate) < config.settled * self._kernel_px
+        known = bool(sigma_px) and sigma_px[0].value < _KNOWN * self._kernel_px
+        calm = moved_px(matches, estimate) < CALM * self._kernel_px
         if self._kernel_px > config.last_px:
             if calm and known:
                 self._kernel_px = config.narrower(self._kernel_px)
@@ -178,10 +168,10 @@ class IncrementalTerms:
         # The scale is that of what is known beforehand: it must not change with the residuals of the moment,
         # for factors that have been marginalized keep theirs.
         wanted = 1.0 / inflation(least.independent, least.clustered)
-        if abs(wanted / self._information - 1.0) > self._config.rescale:
+        if abs(wanted / self._information - 1.0) > _RESCALE:
             self._information = wanted
             return found.covariance, found, False
-        fresh = not any(self._is_stale(p, estimate) for p in self._terms if p.slots)
+        fresh = not any(self._needs_matching(p, estimate) for p in self._terms if p.slots)
         return found.covariance, found, fresh
 
     def _robust(self, P: FloatArray, estimate: gtsam.Values) -> tuple[Robust, Robust]:
@@ -193,16 +183,16 @@ class IncrementalTerms:
         rows = [rows_of(each, self._sides, estimate) for each in matches]
         sums = total(TermSums.of(each, m.information) for each, m in zip(rows, matches, strict=True))
         sums.add(self._gone)
-        config = self._config.rematch
+        config = self._config
         errors = fit_errors(rows, config), least_errors(config)
         found, least = (robust_covariance(P, sums, each, self._keys) for each in errors)
         return found, least
 
     def _swap(self, estimate: gtsam.Values) -> int:
-        """Match stale terms anew; new factors in, old ones and the old proximal prior out, in one update."""
-        stale = [placed for placed in self._terms if self._is_stale(placed, estimate)]
+        """Match terms that need it; new factors in, old ones and the old proximal prior out, at once."""
+        changed = [placed for placed in self._terms if self._needs_matching(placed, estimate)]
         graph, owners, removed = gtsam.NonlinearFactorGraph(), list[_Placed | None](), list[int]()
-        for placed in stale:
+        for placed in changed:
             removed += self._slots_of(placed.slots)
             matches = placed.term.matched(estimate, self._kernel_px, self._information)
             placed.set(matches, self._sums(matches, estimate))
@@ -221,12 +211,12 @@ class IncrementalTerms:
             for owner, slot in zip(owners, slots, strict=True):
                 held = self._proximal if owner is None else owner.slots
                 held[slot] = self._graph().at(slot)
-        return len(stale)
+        return len(changed)
 
     def _sums(self, matches: TermMatches, estimate: gtsam.Values) -> TermSums:
         return TermSums.of(rows_of(matches, self._sides, estimate), matches.information)
 
-    def _is_stale(self, placed: _Placed, estimate: gtsam.Values) -> bool:
+    def _needs_matching(self, placed: _Placed, estimate: gtsam.Values) -> bool:
         matches = placed.matches
         if matches is None or matches.factor is None:
             return True
@@ -234,11 +224,11 @@ class IncrementalTerms:
             matches.kernel_px != self._kernel_px
             or matches.information != self._information
             or matches.left_interval_s(estimate) > 0.0
-            or matches.moved_px(estimate) > self._config.stale_px
+            or matches.moved_px(estimate) > _REMATCH_PX
         )
 
     def _retire(self, estimate: gtsam.Values) -> None:
-        """Terms on poses that the smoother has marginalized stay as they are in its marginal.
+        """Drop terms on poses that the smoother has marginalized: they stay in its marginal as they are.
 
         Their sums are kept from when their poses were last there.
         """
@@ -296,8 +286,8 @@ class IncrementalTerms:
         return found
 
     def _leaving(self, stamps: Mapping[int, float]) -> list[int]:
-        """Slots of terms whose poses this update marginalizes, while their matches are not to be believed."""
-        if not stamps or (self._kernel_px == self._config.rematch.last_px and not self._held):
+        """Slots of terms whose poses this update marginalizes, while the kernel is still wide."""
+        if not stamps or (self._kernel_px == self._config.last_px and not self._held):
             return []
         assert not isinstance(self._solver, gtsam.ISAM2)
         horizon = max(stamps.values()) - self._solver.smootherLag()

@@ -1,14 +1,13 @@
-"""Matching again and again while a graph is solved: Levenberg-Marquardt, and what all solvers share.
+"""Matching again while a graph is solved: Levenberg-Marquardt, and what all solvers share.
 
-Frozen matches lead to a point that the next matches confirm or not. The loop solves, matches again at what
-was found, and narrows the robust kernel wherever a round has moved the matched points little beside it
-(deterministic annealing, as in robust ICP). While the kernel is wide, what the matches hardly tell is held
-by a *proximal* prior on extrinsic and offset about the present estimate, whose sigmas are a kernel's width
-in the image: matches say nothing farther than they reach. It follows the estimate, so that it pulls towards
-nothing, and it is gone at the end.
+The loop solves with frozen matches, matches again at the solution, and narrows the robust kernel
+wherever a round has moved the matched points little beside it (deterministic annealing, as in robust ICP).
+While the kernel is wide, what the matches hardly determine is held by a *proximal* prior on extrinsic and
+offset about the present estimate, whose sigmas are a kernel's width in the image: matches inform no farther
+than they reach. It follows the estimate, so it adds no bias, and it is removed at the end.
 
 The covariance of extrinsic and offset is cluster-robust (:mod:`sst_graph.slam.covariance`), and the factors
-are scaled down by its mean ratio to what they claim, so that the marginals of the graph itself tell the same
+are scaled down by its mean ratio to what they claim, so that the marginals of the graph itself have the same
 size.
 """
 
@@ -25,7 +24,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors.priors import time_offset_prior
 from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
-from sst_graph.slam.config import RematchConfig
+from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     TermSums,
     fit_errors,
@@ -41,6 +40,12 @@ from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings
 
 FloatArray = NDArray[np.float64]
 
+_STEP_PX = 0.1
+"""At the last scale, a round that moves the matched points by less (RMS) ends the loop [px]: matches
+that come and go in turn move them by a few hundredths for ever."""
+_INNER_ITERATIONS = 4
+"""Most Levenberg-Marquardt iterations on frozen matches: more would only be undone by the next matches."""
+
 
 @dataclass(frozen=True)
 class RematchSolution:
@@ -53,7 +58,7 @@ class RematchSolution:
         covariance: (7, 7) cluster-robust, of extrinsic and time offset; order and perturbation as
             :mod:`factors` has them; zeros for what is constant.
         rounds: rounds of matching.
-        settled: the last round moved the matched points by less than ``step_px``.
+        converged: the last round moved the matched points by less than 0.1 px.
         warnings: what may be wrong.
     """
 
@@ -62,7 +67,7 @@ class RematchSolution:
     matches: tuple[TermMatches, ...]
     covariance: FloatArray
     rounds: int
-    settled: bool
+    converged: bool
     warnings: tuple[TermWarning, ...]
 
 
@@ -88,23 +93,23 @@ def solve_with_terms(
         raise EstimationError("solve_with_terms: found no term, expected one or more")
     keys, kernel_px, held = terms[0].keys, config.first_px, True
     parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(config.inner_iterations)
+    parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
     warnings = wide_uncertainty(matches, values, marginal(graph, values, keys)[:7, :7], config)
-    settled, rounds = False, 0
-    while not settled and rounds < config.most_rounds:
+    converged, rounds = False, 0
+    while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
         if held:
             whole.push_back(proximal(matches, values, kernel_px, keys))
         values = gtsam.LevenbergMarquardtOptimizer(whole, values, parameters).optimize()
         moved, rounds = moved_px(matches, values), rounds + 1
         if kernel_px > config.last_px:
-            if moved < config.settled * kernel_px:
+            if moved < CALM * kernel_px:
                 kernel_px = config.narrower(kernel_px)
         elif held:
-            held = moved >= config.settled * kernel_px
+            held = moved >= CALM * kernel_px
         else:
-            settled = moved < config.step_px
+            converged = moved < _STEP_PX
         matches = match_all(terms, values, kernel_px, 1.0)
     # The covariance by matches that count in full; then the factors are scaled down to it.
     P, sides = marginal(with_factors(graph, matches), values, keys), ObjectSides()
@@ -117,11 +122,11 @@ def solve_with_terms(
     C = robust.covariance
     matches = match_all(terms, values, kernel_px, 1.0 / inflation(robust.independent, robust.clustered))
     whole = with_factors(graph, matches)
-    if not settled:
-        warnings.append(TermWarning(WarningKind.NOT_SETTLED, moved, config.step_px, "px"))
+    if not converged:
+        warnings.append(TermWarning(WarningKind.NOT_CONVERGED, moved, _STEP_PX, "px"))
     warnings += last_warnings(matches, values, C, config)
     warnings += told(marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config)
-    return RematchSolution(values, whole, tuple(matches), C, rounds, settled, tuple(warnings))
+    return RematchSolution(values, whole, tuple(matches), C, rounds, converged, tuple(warnings))
 
 
 def match_all(

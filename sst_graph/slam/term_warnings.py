@@ -23,9 +23,11 @@ class WarningKind(Enum):
     WIDE_UNCERTAINTY = "the calibration is less certain than the matches reach"
     LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
     NO_MATCHES = "terms without a factor"
-    NOT_SETTLED = "matching again still moves the matched points"
-    WEAK_DIRECTION = "a combination of extrinsic and time offset that the graph hardly tells"
-    OVERCONFIDENT_MARGINAL = "the graph's own marginal is surer than the matches allow; take the covariance"
+    NOT_CONVERGED = "matching again still moves the matched points"
+    WEAK_DIRECTION = "a combination of extrinsic and time offset that the graph hardly determines"
+    OVERCONFIDENT_MARGINAL = (
+        "the graph's own marginal is smaller than the matches allow; use the covariance of the solution"
+    )
     MASK_BIAS = "outlines that lie beside the edges, and no mask bias in the graph (AlignmentKeys.biases_px)"
 
 

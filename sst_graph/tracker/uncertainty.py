@@ -25,8 +25,8 @@ class Uncertainty:
     Attributes:
         joint: cluster-robust covariance of all unknowns.
         inflation: how much larger it is than that of independent matches.
-        by_static: (7, 7) covariance of extrinsic and offset from static objects alone; None where no object
-            moves.
+        by_static_objects: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
+            object moves.
         steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
     """
 

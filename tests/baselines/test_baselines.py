@@ -21,9 +21,9 @@ from sst_graph.baselines.nearest_pixel_frames import (
     spread,
     step_once,
 )
-from sst_graph.baselines.second_search import Challenge, SecondSearchConfig
+from sst_graph.baselines.second_search import SecondSearch
 from sst_graph.baselines.semalign import SemAlignConfig, sampled_poses, truncated_distances
-from sst_graph.baselines.sst_calib import PaperConfig, camera_motions, velocity_at
+from sst_graph.baselines.sst_calib import camera_motions, velocity_at
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
 from sst_graph.cli import main
 from sst_graph.data import open_source
@@ -235,23 +235,18 @@ def test_truncated_distances_by_hand(drive: Drive) -> None:
     view = ClassView.of(camera, lPs * z[:, None], 0.0, mask == SemanticClass.VEHICLE, 0.1, rng)
     assert view is not None
     frame = MatchFrame(frame_pairs([drive])[0], "drive", (view,), np.zeros(6))
-    found = truncated_distances(frame, [gtsam.Pose3()], SemAlignConfig(truncation_px=20.0))
+    found = truncated_distances(frame, [gtsam.Pose3()], 20.0)
     np.testing.assert_allclose(found, [40.0 / 3.0])
 
 
 @pytest.mark.parametrize(
-    ("scores", "doubts"),
+    ("scores", "reasons"),
     [((0.05, 0.12, 0.13), 0), ((0.05, 0.10, 0.13), 1), ((0.12, 0.11, 0.115), 1), ((0.0, -0.1, -0.05), 2)],
 )
-def test_a_second_opinion(scores: tuple[float, float, float], doubts: int) -> None:
-    assert len(Challenge(*scores).doubts(SecondSearchConfig())) == doubts
+def test_a_second_search(scores: tuple[float, float, float], reasons: int) -> None:
+    assert len(SecondSearch(*scores).reasons) == reasons
 
 
 def test_spread() -> None:
     assert spread(range(10), 4) == [0, 3, 6, 9]
     assert spread([1, 2], 5) == [1, 2] and spread([], 5) == []
-
-
-def test_schedule_must_fit() -> None:
-    with pytest.raises(ValueError, match="static_iterations"):
-        PaperConfig(static_weights=(20.0, 1.0))

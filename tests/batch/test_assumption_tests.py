@@ -9,12 +9,13 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.inspect.budget_text import budget_lines
 from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
+from sst_graph.batch.answer import Guess
 from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects
+from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import BUDGET, AssumptionConfig
@@ -22,10 +23,9 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.assumptions import CLEAN, AssumptionTableConfig, Run, table
 from sst_graph.experiments.wrong_drives import with_focal
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State, nuisance_key
-from sst_graph.objects.tracks import object_tracks
+from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.result import CalibrationResult
 
 CONFIG = with_overrides(
@@ -104,14 +104,15 @@ def test_a_slight_distortion_is_covered_or_named() -> None:
 def problem() -> SolvedProblem:
     """Solved with a distortion that is not known of."""
     drives = prepared(-0.03)
-    objects = [object_tracks(drive) for drive in drives]
-    tracks = Tracks(drives, objects)
     truth = crowded_street().truth
     assert truth is not None and truth.time_offset_s is not None
     guess = State(truth.cTl, (truth.time_offset_s,))
     joint = dataclasses.replace(CONFIG.joint, max_outer=6)
-    solution = solve_joint(JointProblem(drives, tracks, joint, guess), guess, (5.0, 3.0))
-    return SolvedProblem(drives, tracks, objects, solution, joint, guess)
+    config = dataclasses.replace(CONFIG, joint=joint)
+    problem = CalibrationProblem.of(drives, Guess(truth.cTl, truth.time_offset_s), config)
+    return SolvedProblem(
+        problem, solve_joint(dataclasses.replace(problem.joint(), centre=guess), guess, (5.0, 3.0))
+    )
 
 
 def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(problem: SolvedProblem) -> None:

@@ -13,17 +13,17 @@ import pytest
 from stored import simulated
 
 from sst_graph import CalibrationConfig, open_source
+from sst_graph.batch.answer import Guess
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
-from sst_graph.batch.contradictions import ContradictionConfig, find_contradictions
-from sst_graph.batch.motion_factor import Labels, with_motion
-from sst_graph.batch.parts import Part, Parts, SolvedPart
+from sst_graph.batch.contradictions import find_contradictions
+from sst_graph.batch.motion_factor import fuse_motion
+from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
+from sst_graph.batch.problem import CalibrationProblem, Estimate
 from sst_graph.config import with_overrides
 from sst_graph.covariance.contradiction import PartAnswer
 from sst_graph.drive.preparation import Drive
-from sst_graph.graph.building import Tracks
-from sst_graph.graph.outer_loop import JointConfig, JointProblem, solve_joint
+from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
-from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.types import Frame, Source
@@ -112,11 +112,11 @@ def calibrated(sources: Sequence[Source], config: CalibrationConfig = CONFIG) ->
     )
 
 
-def parts_of(drives: Sequence[Drive], offset_s: float) -> Parts:
+def parts_of(drives: Sequence[Drive], offset_s: float) -> PartSolver:
     """Ready to be solved, about the truth."""
-    objects = [object_tracks(drive) for drive in drives]
-    reference = State(street().truth.cTl, (offset_s,))
-    return Parts(drives, Tracks(drives, objects), objects, reference, JointConfig(), CONFIG.assumptions)
+    truth = street().truth.cTl
+    problem = CalibrationProblem.of(drives, Guess(truth, offset_s), CONFIG)
+    return PartSolver(problem, State(truth, (offset_s,)))
 
 
 def first_frame_after(result: CalibrationResult) -> int:
@@ -214,8 +214,8 @@ def test_parts_carry_the_tracks_of_their_scans() -> None:
     assert tracks.objects is not None
     own = tracks.objects[0]
     for (scan, c, n), track in own.items():
-        assert parts.objects[0][scans[scan], c, n] == track
-    assert len(own) == sum(scan in scans for scan, _, _ in parts.objects[0])
+        assert parts.problem.objects[0][scans[scan], c, n] == track
+    assert len(own) == sum(scan in scans for scan, _, _ in parts.problem.objects[0])
     assert [scan.index for scan in drives[0].part(scans).scans] == list(scans)
     solved = parts.solve(Part(0, scans))
     assert solved is not None
@@ -228,26 +228,27 @@ def test_a_part_without_labels_in_common_says_nothing() -> None:
     blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))
     parts = parts_of([blank], STREET.time_offset_s)
     assert parts.solve(Part(0, (0, 1, 2, 3))) is None
-    assert find_contradictions(parts, ContradictionConfig()).sentences == ()
+    assert find_contradictions(parts).sentences == ()
 
 
 def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     parts = parts_of(drives, STREET.time_offset_s)
-    problem = JointProblem(drives, parts.tracks, JointConfig())
-    solution = solve_joint(problem, parts.reference, (5.0, 3.0))
+    objects = parts.problem.objects
+    joint = replace(parts.problem.joint(), config=JointConfig())
+    solution = solve_joint(joint, parts.reference, (5.0, 3.0))
     sigmas = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
     sure = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
     agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartAnswer(np.zeros(7), sure))
     away = np.zeros(7)
     away[1] = np.radians(20.0)
     differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartAnswer(away, np.diag(sigmas**2)))
-    for stretches, heard in (([agrees], True), ([agrees, differs], False)):
-        labels = Labels(solution, np.diag(sigmas**2), stretches)
-        found = with_motion(drives, parts.tracks, labels, parts.reference, CONFIG)
-        assert bool(found.diagnostics.get("fused")) is heard
-        assert (found.solution is solution) is not heard
-        assert bool(found.remarks) is not heard
+    for stretches, used in (([agrees], True), ([agrees, differs], False)):
+        labels = replace(Estimate.of(solution, objects), covariance=np.diag(sigmas**2))
+        found = fuse_motion(parts.problem, labels, stretches)
+        assert bool(found.diagnostics.get("fused")) is used
+        assert (found.estimate is labels) is not used
+        assert bool(found.remarks) is not used
     assert "frames 4 to 7" in found.remarks[0]
 
 

@@ -91,7 +91,7 @@ def test_one_frame_of_a_moving_vehicle() -> None:
     result, error = checked(street(frames=1))
     sigmas = np.sqrt(np.diag(result.covariance))
     assert np.abs(error[3:6]).max() > 0.1 and (sigmas[3:6] > 0.5).all() and sigmas[6] > 0.1
-    assert "a single scan tells no motion" in result.reasons[0]
+    assert "a single scan does not show how the vehicle moved" in result.reasons[0]
 
 
 def test_one_frame_of_a_vehicle_that_stands_as_its_driver_says() -> None:

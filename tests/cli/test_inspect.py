@@ -143,7 +143,7 @@ def test_a_result_of_another_method(
     foreign = replace(result, method="paper", diagnostics={}, drive_offsets=(), frames_used=())
     assert main(["inspect", written(tmp_path, foreign), "--plots", str(tmp_path / "plots")]) == 0
     out = capsys.readouterr().out
-    assert "what each frame brought cannot be told" in out and "what to record next:" not in out
+    assert "what each frame brought is not known" in out and "what to record next:" not in out
     assert shown_in(tmp_path / "plots") == OF_COVARIANCE
 
 

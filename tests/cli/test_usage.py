@@ -107,3 +107,10 @@ def test_the_package_offers_its_names_on_demand() -> None:
 def test_the_old_name_of_an_option() -> None:
     parse = build_parser().parse_args
     assert parse(["simulate", "x", "--delay", "-0.1"]).time_offset == -0.1
+
+
+def test_a_former_name_of_an_option_is_accepted_with_a_note(capsys: pytest.CaptureFixture[str]) -> None:
+    args = build_parser().parse_args(["calibrate", "x", "--delay-per-drive"])
+    assert args.time_offset_per_drive is True
+    assert "--delay-per-drive is now called --time-offset-per-drive" in capsys.readouterr().err
+    assert build_parser().parse_args(["calibrate", "x"]).time_offset_per_drive is None

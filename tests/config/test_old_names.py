@@ -37,8 +37,8 @@ class Online(Settings):
     calibration: Method = field(default_factory=Method)
 
 
-OLD = {"delay_s": "time_offset_s", "lower_edges.use": "lower_edges.use", "scans": "window"}
-GONE = {"lower_edges.support": "sst_graph.edges.SUPPORT = 30.0"}
+OLD = {"delay_s": "time_offset_s", "undersides.use": "lower_edges.use", "scans": "window"}
+GONE = {"undersides.support": "sst_graph.edges.SUPPORT = 30.0"}
 
 
 def new(cls: Any, data: dict[str, Any]) -> Any:
@@ -47,16 +47,16 @@ def new(cls: Any, data: dict[str, Any]) -> Any:
 
 def test_an_old_name_is_the_new_one_with_a_warning(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
-        found = new(Method, {"delay_s": 0.2, "lower_edges": {"use": False}, "lower_edges": {"sigma_px": 2}})
+        found = new(Method, {"delay_s": 0.2, "undersides": {"use": False}, "lower_edges": {"sigma_px": 2}})
     assert from_dict(Method, found) == Method(0.2, Edges(2.0, False))
     assert [record.getMessage() for record in caplog.records] == [
         "setting 'delay_s' is called 'time_offset_s': use that name",
-        "setting 'lower_edges.use' is called 'lower_edges.use': use that name",
+        "setting 'undersides.use' is called 'lower_edges.use': use that name",
     ]
 
 
 def test_names_below_the_calibration_of_another_command() -> None:
-    found = new(Online, {"scans": 3, "calibration": {"lower_edges": {"use": False}}})
+    found = new(Online, {"scans": 3, "calibration": {"undersides": {"use": False}}})
     assert from_dict(Online, found) == Online(3, Method(lower_edges=Edges(use=False)))
 
 
@@ -65,7 +65,7 @@ def test_known_names_pass_without_a_word(caplog: pytest.LogCaptureFixture) -> No
     assert new(Method, given) is given and not caplog.records
 
 
-@pytest.mark.parametrize("name", ["lower_edges.support", "calibration.lower_edges.support"])
+@pytest.mark.parametrize("name", ["undersides.support", "calibration.undersides.support"])
 def test_a_constant_is_named_with_its_value(name: str) -> None:
     tree: Any = 3.0
     for key in reversed(name.split(".")):
@@ -83,9 +83,9 @@ def test_old_and_new_name_together_are_refused() -> None:
 @pytest.mark.parametrize(
     "data",
     [
-        {"foo": 3, "lower_edges": {}},
-        {"lower_edges": 3},
-        {"lower_edges": {"use": {"x": 1}}},
+        {"foo": 3, "undersides": {}},
+        {"undersides": 3},
+        {"undersides": {"use": {"x": 1}}},
         {"scans": 3},  # a name of another command
     ],
 )
@@ -97,7 +97,7 @@ def test_what_the_tables_do_not_know_stays_to_be_refused(data: dict[str, Any]) -
 
 def test_a_value_in_the_place_of_the_new_table_is_refused() -> None:
     with pytest.raises(ConfigError, match="lower_edges: found 3, expected a table"):
-        from_dict(Method, new(Method, {"lower_edges": 3, "lower_edges": {"use": True}}))
+        from_dict(Method, new(Method, {"lower_edges": 3, "undersides": {"use": True}}))
 
 
 def test_tables_nested_hundreds_deep_are_no_recursion_error() -> None:

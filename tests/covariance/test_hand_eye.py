@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
-from sst_graph.hand_eye.covariance import TAKEN_BACK, HandEyeErrors, hand_eye_covariance
-from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm
+from sst_graph.hand_eye.covariance import MOST_TAKEN_OFF, SharedErrors, hand_eye_covariance
+from sst_graph.hand_eye.graph import HandEyeTerm
 
 PAIRS = 600
-NOTHING_SHARED = HandEyeErrors(direction_deg=0.0, turn_rate_deg_s=0.0)
+NOTHING_SHARED = SharedErrors(direction_deg=0.0, turn_rate_deg_s=0.0)
 
 
 def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -35,7 +35,7 @@ def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pair: Any = SimpleNamespace(camera=camera, lidar=step)
         graph.add(factor)
         terms.append(HandEyeTerm(pair, factor, np.eye(6), 0.0, still))
-    found = hand_eye_covariance(graph, values, terms, NOTHING_SHARED, HandEyePriors())
+    found = hand_eye_covariance(graph, values, terms, NOTHING_SHARED)
     H = PAIRS // 2 * (J[:6].T @ J[:6] + J[6:].T @ J[6:])
     return found, np.linalg.inv(H)
 
@@ -63,4 +63,4 @@ def test_neighbours_that_err_together_count_less(white: np.ndarray) -> None:
 
 def test_neighbours_that_cancel_count_more_but_not_without_end(white: np.ndarray) -> None:
     ratios = _ratios((white[1:] - white[:-1]) / np.sqrt(2.0))
-    assert ratios == pytest.approx(np.full(7, 1.0 - TAKEN_BACK), abs=1e-6)
+    assert ratios == pytest.approx(np.full(7, 1.0 - MOST_TAKEN_OFF), abs=1e-6)

@@ -13,7 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stored import simulated
 
-from benchmarks.wrong_drives import LIES, NAMED, shifted_masks
+from benchmarks.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
@@ -91,10 +91,10 @@ def test_right_data_are_left_alone() -> None:
     assert causes(other()) == []
 
 
-@pytest.mark.parametrize("lie", BY_THEMSELVES)
-def test_a_lie_is_named_before_anything_is_solved(lie: str) -> None:
-    found = causes(LIES[lie](drive(), other()))
-    assert any(NAMED[lie] in sentence for sentence in found), found
+@pytest.mark.parametrize("fault", BY_THEMSELVES)
+def test_a_fault_is_named_before_anything_is_solved(fault: str) -> None:
+    found = causes(INPUT_FAULTS[fault](drive(), other()))
+    assert any(NAMED[fault] in sentence for sentence in found), found
 
 
 @cache
@@ -156,15 +156,15 @@ def test_single_stamps_that_are_off_are_no_second_clock() -> None:
 
 def test_masks_of_another_size_are_refused() -> None:
     with pytest.raises(DataError, match="a mask of 310x94 px, expected 621x188 px"):
-        causes(LIES["half-size masks"](drive(), other()))
+        causes(INPUT_FAULTS["half-size masks"](drive(), other()))
 
 
-@pytest.mark.parametrize("lie", ["Tr inverted", "y flipped"])
-def test_what_would_make_the_labels_agree_names_the_cause(lie: str) -> None:
-    wrong = LIES[lie](drive(), other())
+@pytest.mark.parametrize("fault", ["Tr inverted", "y flipped"])
+def test_what_would_make_the_labels_agree_names_the_cause(fault: str) -> None:
+    wrong = INPUT_FAULTS[fault](drive(), other())
     result = calibrate(wrong, wrong.nominal)
     assert result.status != "ok"
-    assert NAMED[lie] in result.reasons[0]
+    assert NAMED[fault] in result.reasons[0]
 
 
 def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
@@ -182,17 +182,17 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
     assert found is not None and NAMED["half the focal length"] in found.cause
 
 
-@pytest.mark.parametrize("lie", ["masks of another drive", "clouds in camera axes"])
-def test_what_shows_only_once_a_result_is_doubted(lie: str) -> None:
+@pytest.mark.parametrize("fault", ["masks of another drive", "clouds in camera axes"])
+def test_what_shows_only_once_a_result_is_doubted(fault: str) -> None:
     """Neither is certain by itself: masks may be coarse, and a scanner may be mounted on its side."""
-    wrong = LIES[lie](drive(), other())
+    wrong = INPUT_FAULTS[fault](drive(), other())
     assert causes(wrong) == []
     result = calibrate(wrong, wrong.nominal)
-    assert result.status != "ok" and NAMED[lie] in result.reasons[0]
+    assert result.status != "ok" and NAMED[fault] in result.reasons[0]
 
 
 def test_without_the_search_for_causes_the_doubts_stand_alone() -> None:
-    wrong = LIES["Tr inverted"](drive(), other())
+    wrong = INPUT_FAULTS["Tr inverted"](drive(), other())
     result = calibrate(wrong, wrong.nominal, CalibrationConfig(find_causes=False))
     assert result.status != "ok" and not any("inverted" in reason for reason in result.reasons)
 

@@ -8,18 +8,16 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.inspect.inspection_text import inspection_text
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
-from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
 from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
+from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.tracker.window.arrivals import Arrivals
-
-PRIORS = HandEyePriors()
 
 
 def _covariance(seed: int) -> np.ndarray:
@@ -53,9 +51,8 @@ def _terms(count: int) -> tuple[list[HandEyeTerm], list[np.ndarray]]:
 def test_a_pair_is_worth_what_the_others_lack_without_it() -> None:
     terms, rows = _terms(3)
     frames = [FrameId("a", k) for k in range(3)]
-    gained = pair_gains(terms, frames, State(gtsam.Pose3()), PRIORS)
-    sigmas = [PRIORS.rotation_rad] * 3 + [PRIORS.translation_m] * 3 + [PRIORS.offset_s]
-    H = np.diag(np.array(sigmas) ** -2.0) + sum(J.T @ J for J in rows)
+    gained = pair_gains(terms, frames, State(gtsam.Pose3()))
+    H = np.diag(PRIOR_SIGMAS**-2.0) + sum(J.T @ J for J in rows)
     for gain, J in zip(gained.gains, rows, strict=True):
         rest = H - J.T @ J
         bits = 0.5 * np.log2(np.linalg.det(H) / np.linalg.det(rest))
@@ -105,7 +102,7 @@ def test_the_tracker_s_scans_in_words_and_in_json() -> None:
 @pytest.mark.parametrize("method", ["paper", "static", "semalign", "track", "joint"])
 def test_where_nothing_can_be_said_it_says_why(method: str) -> None:
     text = inspection_text(inspect_result(_result(method)))
-    assert f"cannot be told for this result of method {method}: " in text
+    assert f"is not known for this result of method {method}: " in text
     assert ("independent" in text) == (method in ("paper", "static", "semalign"))
 
 

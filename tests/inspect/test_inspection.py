@@ -8,18 +8,11 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.inspect.inspection_text import (
-    correlation_sentence,
-    frame_list,
-    inspection_text,
-    short,
-)
 
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.frame_information import KEY, FrameInformation, to_document
 from sst_graph.inspect.inspection import (
-    InspectConfig,
     camera_sigmas,
     correlation_matrix,
     inspect_result,
@@ -29,6 +22,12 @@ from sst_graph.inspect.inspection import (
     telling_frames,
     to_dict,
     weakest_direction,
+)
+from sst_graph.inspect.inspection_text import (
+    correlation_sentence,
+    frame_list,
+    inspection_text,
+    short,
 )
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId
 
@@ -145,7 +144,7 @@ def test_two_digits(value: float, text: str) -> None:
 
 def test_the_text_of_a_result_with_frames() -> None:
     covariance = np.diag(SIGMAS**2)
-    text = inspection_text(inspect_result(result_of(covariance, FRAMES), InspectConfig(next_frames=7)))
+    text = inspection_text(inspect_result(result_of(covariance, FRAMES), next_frames=7))
     lines = text.splitlines()
     (lidar,) = [line for line in lines if line.startswith("rotation about the LiDAR")]
     (camera,) = [line for line in lines if line.startswith("rotation about the camera")]
@@ -166,7 +165,7 @@ def test_the_text_without_frames_says_so() -> None:
         drive_offsets=(DriveOffset("a/00", 0.05, 0.001), DriveOffset("b/00", -0.02, 0.002)),
     )
     text = inspection_text(inspect_result(result))
-    assert "what each frame brought cannot be told" in text
+    assert "what each frame brought is not known" in text
     assert "reason       it moved on" in text and "b/00: -20.00 ms, sigma 2.0 ms" in text
 
 

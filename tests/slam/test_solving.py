@@ -55,7 +55,7 @@ def solver_of(kind: str, lag_s: float) -> Solver:
 
 def test_levenberg_marquardt_comes_to_the_truth(street: Street, solution: RematchSolution) -> None:
     rotation_deg, translation_m, offset_s = street.errors(solution.values)
-    assert solution.settled
+    assert solution.converged
     assert rotation_deg < 0.15 and translation_m < 0.02 and offset_s < 0.005
     assert street.nees(solution.values, solution.covariance) < 14.0
 
@@ -79,7 +79,7 @@ def test_wide_priors_are_told_and_narrow_ones_are_not(street: Street, solution: 
     assert warning.value > warning.limit == pytest.approx(120.0)
     graph, values = street.whole(street.start(1), (0.03, 0.05, 0.03))
     narrow = solve_with_terms(graph, values, terms_of(street))
-    assert narrow.warnings == () and narrow.settled
+    assert narrow.warnings == () and narrow.converged
 
 
 def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
@@ -102,7 +102,7 @@ def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
 def test_incremental_solvers_come_to_the_truth(street: Street, kind: str) -> None:
     found = street.frame_by_frame(solver_of(kind, 1.25), street.start(1))
     rotation_deg, translation_m, offset_s = street.errors(found.values)
-    assert found.settled and found.kernel_px == 4.0
+    assert found.converged and found.kernel_px == 4.0
     assert rotation_deg < 0.15 and translation_m < 0.02 and offset_s < 0.005
     assert street.nees(found.values, found.covariance) < 14.0
     assert found.values.exists(X(0)) == (kind == "isam2")

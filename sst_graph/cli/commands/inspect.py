@@ -12,7 +12,7 @@ from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.reading import reading_words
 from sst_graph.errors import ConfigError
 from sst_graph.files import OutputKind, atomic_directory
-from sst_graph.inspect.inspection import InspectConfig, Inspection, inspect_result, to_dict
+from sst_graph.inspect.inspection import Inspection, inspect_result, to_dict
 from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.viz.inspection import inspection_plots
 
@@ -27,12 +27,12 @@ def run(args: argparse.Namespace) -> int:
     if not 1 <= args.next <= MOST_NEXT:
         raise ConfigError(f"--next {str(args.next)[:12]}: expected 1 or more, at most {MOST_NEXT}")
     check_apart({"RESULT": result_file(args.result)}, {"--plots": args.plots})
-    config, names = InspectConfig(next_frames=args.next), []
+    names = []
     if args.plots is None:
-        inspection = inspect_result(result_at(args.result), config)
+        inspection = inspect_result(result_at(args.result), args.next)
     else:
         with atomic_directory(args.plots, args.overwrite, PLOTS) as folder:
-            inspection = inspect_result(result_at(args.result), config)
+            inspection = inspect_result(result_at(args.result), args.next)
             names = _write_plots(inspection, folder)
     read_as = inspection.result.read_as
     if args.json:

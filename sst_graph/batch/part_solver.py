@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, consider
+from sst_graph.covariance.considered import consider
 from sst_graph.covariance.contradiction import PartAnswer
 from sst_graph.covariance.stationary_objects import standing_covariance
 from sst_graph.drive.preparation import Drive
@@ -17,21 +18,15 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.matching import edges_of, match_all
-from sst_graph.graph.outer_loop import (
-    JointConfig,
-    JointProblem,
-    JointSolution,
-    robust_weights,
-    solve_joint,
-)
+from sst_graph.graph.outer_loop import JointProblem, JointSolution, robust_weights, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
-from sst_graph.objects.tracks import ObjectId, tracks_of_scans
+from sst_graph.objects.tracks import tracks_of_scans
 
 FloatArray = NDArray[np.float64]
 
 
-_SETTLING = 3
+_MOST_AT_LAST_SCALE = 3
 """Most further outer iterations at the last kernel scale: what is left of a step then is within a sigma."""
 
 
@@ -45,7 +40,7 @@ class Part:
 
 @dataclass(frozen=True)
 class SolvedPart:
-    """A part and what it says by itself.
+    """A part and its own answer.
 
     Attributes:
         part: which.
@@ -59,27 +54,23 @@ class SolvedPart:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Drives whose parts are to be solved.
+class PartSolver:
+    """Solves parts of drives by themselves.
 
     Attributes:
-        drives: all of them.
-        tracks: with object tracks where objects have mask biases.
-        objects: tracks of each drive's objects.
+        problem: the drives, and how all of them were solved together.
         reference: the answer of all drives together, where the parts start and what their weak priors are
             centred on.
-        joint: settings of the joint method.
-        assumptions: what each part's covariance has beside its matches.
-        kernel_px: scales of the robust kernel of a part's solution, as in :func:`solve_joint` [px].
+        kernel_px: scales of the robust kernel of a part's solution, outer iteration by outer iteration [px].
     """
 
-    drives: Sequence[Drive]
-    tracks: Tracks
-    objects: Sequence[dict[ObjectId, int]]
+    problem: CalibrationProblem
     reference: State
-    joint: JointConfig
-    assumptions: AssumptionConfig
     kernel_px: tuple[float, ...] = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
+
+    @property
+    def drives(self) -> Sequence[Drive]:
+        return self.problem.drives
 
     def solve(self, part: Part) -> SolvedPart | None:
         """A part's own answer, from the reference; None where it has none."""
@@ -90,13 +81,13 @@ class Parts:
         return self._solved(part, start, self.kernel_px[len(self.kernel_px) // 2 :])
 
     def best_start(self, part: Part, starts: Sequence[State]) -> State:
-        """Of the reference and other states that which the part agrees with most."""
+        """The one of the reference and other states that the part agrees with most."""
         candidates = [self.reference_of(part), *starts]
         return max(candidates, key=lambda start: float(self.support(part, start).sum()))
 
     def _solved(self, part: Part, start: State, kernel_px: tuple[float, ...]) -> SolvedPart | None:
-        joint = replace(self.joint, max_outer=len(kernel_px) + _SETTLING)
-        drive, tracks = self.drives[part.drive].part(part.scans), self.tracks.part(part.drive, part.scans)
+        joint = replace(self.problem.config.joint, max_outer=len(kernel_px) + _MOST_AT_LAST_SCALE)
+        drive, tracks = self._data(part)
         try:
             problem = JointProblem([drive], tracks, joint, self.reference_of(part))
             solution = solve_joint(problem, start, kernel_px)
@@ -110,21 +101,27 @@ class Parts:
 
     def _answer(self, part: Part, solution: JointSolution) -> PartAnswer:
         state = solution.state
-        objects = [tracks_of_scans(self.objects[part.drive], part.scans)]
+        objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
-        beside = consider(robust, solution.pairs, solution.values, state, self.assumptions).covariance(7)
-        # What moving objects alone tell is not called known: a vehicle that brakes looks like another offset.
+        assumptions = self.problem.config.assumptions
+        beside = consider(robust, solution.pairs, solution.values, state, assumptions).covariance(7)
+        # By static objects alone: a vehicle that brakes looks like another time offset.
         covariance = standing_covariance(robust, solution.pairs)[:7, :7] + beside
         weights = np.bincount(robust.table.sides, robust.table.root_weights**2)
         clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
         return PartAnswer(difference(self.reference_of(part), state), covariance, clusters)
 
+    def _data(self, part: Part) -> tuple[Drive, Tracks]:
+        """The drive and its tracks, of the part's scans alone."""
+        drive, tracks = self.drives[part.drive], self.problem.tracks
+        return drive.part(part.scans), tracks.part(part.drive, part.scans)
+
     def support(self, part: Part, state: State) -> FloatArray:
         """(scans,) how much each scan of a part agrees with a state: matches, counted by robust weight."""
-        drive, tracks = self.drives[part.drive].part(part.scans), self.tracks.part(part.drive, part.scans)
+        drive, tracks = self._data(part)
         kernel = RobustKernel("geman_mcclure", self.kernel_px[-1])
         found = np.zeros(len(part.scans))
-        for own in match_all(edges_of([drive], tracks, self.joint.graph), state, kernel):
+        for own in match_all(edges_of([drive], tracks, self.problem.config.joint.graph), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]
             found += np.bincount(scans, robust_weights(own, state), len(found))
         return found

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
-from sst_graph.batch.lower_edges import LowerEdgesConfig, lower_edge_support, with_lower_edges
+from sst_graph.batch.config import LowerEdgesConfig
+from sst_graph.batch.lower_edges import MIN_CONCENTRATION, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.building import Tracks, associate
@@ -25,7 +26,7 @@ from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT = JointConfig(min_matches=10)
-CONFIG = LowerEdgesConfig(min_support=10.0)
+CONFIG = LowerEdgesConfig()
 
 
 @cache
@@ -75,7 +76,7 @@ def test_used_where_the_labels_agree() -> None:
     drive = street()
     below = with_lower_edges(JointProblem([drive], Tracks([drive]), JOINT), [solved(drive)], CONFIG)
     assert below.joint.graph.lower_edges == (VEHICLE,)
-    assert below.concentration[VEHICLE] > CONFIG.min_concentration
+    assert below.concentration[VEHICLE] > MIN_CONCENTRATION
     truth = standing_street().truth.cTl
     off = [
         np.linalg.norm(truth.localCoordinates(s.state.cTl)[:3])
@@ -91,7 +92,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
     config = replace(CONFIG, use=use)
     tracks = Tracks([drive])
     shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(config)[1]
-    assert shares[VEHICLE] < CONFIG.min_concentration
+    assert shares[VEHICLE] < MIN_CONCENTRATION
     below = with_lower_edges(JointProblem([drive], tracks, JOINT), [(one, centre)], config)
     if use == "always":
         assert below.joint.graph.lower_edges == (VEHICLE,)
@@ -102,5 +103,7 @@ def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
 def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
-    config = LowerEdgesConfig(min_support=1e6)
-    assert lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(config)[1] == {}
+    assert (
+        lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(CONFIG, min_support=1e6)[1]
+        == {}
+    )

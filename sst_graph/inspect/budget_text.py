@@ -1,4 +1,4 @@
-"""Where a result's sigmas come from: matches, motion, and what is taken for granted, as a table."""
+"""Where a result's sigmas come from: matches, motion, and assumptions, as a table."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def estimated_lines(result: CalibrationResult) -> list[str]:
 
 
 def _parts(result: CalibrationResult) -> dict[str, FloatArray]:
-    """(7,) sigmas of each part; empty where the result does not tell them."""
+    """(7,) sigmas of each part; empty where the result has none."""
     stored = result.diagnostics.get(BUDGET)
     if not isinstance(stored, dict):
         return {}

@@ -7,10 +7,10 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.inspect.budget_text import budget_lines, estimated_lines
 from sst_graph.result import CalibrationResult
 
 

@@ -1,4 +1,4 @@
-"""What a result of any method but the joint one says of its frames, in words."""
+"""Information gained by frame, of results of any method but the joint one, as text."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def gained_lines(result: CalibrationResult, gained: Gained | None, all_frames: b
     if gained is None or not gained.gains:
         why = _NOTHING.get(result.method, "it was not written beside this result")
         return [
-            f"what each frame brought cannot be told for this result of method {result.method}: {why}",
+            f"what each frame brought is not known for this result of method {result.method}: {why}",
             "- what to record next is predicted from results of calibrate --method joint only",
         ]
     if gained.kind == "as they came":
@@ -68,7 +68,7 @@ def _arrivals(gains: Sequence[Gain], all_frames: bool) -> list[str]:
         )
     return [
         *lines,
-        "- in their order: a scan that comes late finds less to tell; below zero, the matches turned out to "
+        "- in their order: a later scan adds less; below zero, the matches turned out to "
         "err more, or the estimate moved to where less is known",
     ]
 

@@ -1,0 +1,131 @@
+"""What is reported beside a joint estimate: why it may be wrong altogether, and numbers about the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.assumption_tests import estimated_report
+from sst_graph.batch.lower_edges import WithLowerEdges
+from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.drive.preparation import Drive
+from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
+from sst_graph.hand_eye.solution import difference
+from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
+from sst_graph.inspect.frame_gains import frame_gains
+from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
+from sst_graph.inspect.frame_information import to_document
+
+FloatArray = NDArray[np.float64]
+
+_FAR_SIGMAS = 6.0
+"""Two answers farther apart than this [standard deviations] contradict each other: no sampling error of a
+calibrated covariance reaches so far, and a covariance that is half of what it should be still allows 3."""
+
+
+def label_agreement(problem: CalibrationProblem, solution: JointSolution) -> dict[str, float]:
+    """Share of the boundary points in view that meet a contour, and share of the matches that are close."""
+    close = concentration(solution, problem.joint())
+    return {"explained": explained(solution), "concentration": close}
+
+
+def joint_reasons(
+    problem: CalibrationProblem,
+    solution: JointSolution,
+    solutions: Sequence[JointSolution],
+    covariance: FloatArray,
+    labels: Mapping[str, float],
+) -> tuple[str, ...]:
+    """Why the joint estimate may be wrong altogether; empty where nothing says so.
+
+    Args:
+        solution: the estimate.
+        solutions: from all starts, the one that agrees best with the labels first.
+        covariance: (n, n) of extrinsic and offsets.
+        labels: as :func:`label_agreement` gives them.
+    """
+    searched = problem.config.start.enabled
+    return (
+        *_moving(solution),
+        *(_little_agreement(problem, covariance, labels) if searched else ()),
+        *(_outside_search(problem, solution) if searched else ()),
+        *_alternatives(problem, solution, solutions, covariance),
+    )
+
+
+def unknown_motion_remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
+    """What was assumed of drives whose motion is not known."""
+    if all(drive.lidar_motions for drive in drives):
+        return ()
+    return (
+        "a single scan does not show how the vehicle moved; it was assumed to stand: at 1 m/s every 100 ms "
+        "between scan and image would shift the translation by 10 cm; give its neighbours too, or, if it "
+        "stood, say so (unknown_motion.speed_mps and unknown_motion.turn_deg_per_s 0)",
+    )
+
+
+def joint_diagnostics(
+    problem: CalibrationProblem, estimate: Estimate, lower: WithLowerEdges
+) -> dict[str, Any]:
+    """JSON-able numbers about a joint estimate."""
+    solution, model, drives = estimate.solution, estimate.robust.model, problem.drives
+    frozen = solution.graph, solution.values, solution.pairs, solution.state
+    return {
+        "outer_iterations": solution.outer_iterations,
+        "matches": sum(len(pair) for pair in solution.pairs),
+        "pairs": len(solution.pairs),
+        "mask_bias_px": {
+            f"{drives[d].name}:{c.name.lower()}": bias for (d, c), bias in solution.state.biases_px.items()
+        },
+        "lower_edge_concentration": {c.name.lower(): share for c, share in lower.concentration.items()},
+        "lower_edges": [c.name.lower() for c in lower.joint.graph.lower_edges],
+        "error_model": {"side": model.side, "side_frame": model.side_frame, "match": model.match},
+        "estimated": estimated_report(estimate.robust, solution.state),
+        FRAME_INFORMATION: to_document(frame_gains(*frozen, drives, estimate.robust)),
+    }
+
+
+def _moving(solution: JointSolution) -> Iterator[str]:
+    if not solution.converged:
+        yield f"the outer loop still moved after {solution.outer_iterations} iterations"
+
+
+def _little_agreement(
+    problem: CalibrationProblem, covariance: FloatArray, labels: Mapping[str, float]
+) -> Iterator[str]:
+    """Too few points that match, or matches that are not close."""
+    limit = np.radians(problem.config.observability.rotation_deg)
+    vague = float(np.linalg.eigvalsh(covariance[:3, :3])[-1]) > limit**2
+    yield from poor_fit(labels["explained"], labels["concentration"], not vague)
+
+
+def _outside_search(problem: CalibrationProblem, solution: JointSolution) -> Iterator[str]:
+    search, guess = problem.config.start.search, problem.guess.cTl
+    around = np.zeros(3) if guess is None else guess.translation()
+    far = float(np.linalg.norm(solution.state.cTl.translation() - around))
+    if far > (REACH * search.free_translation_m if guess is None else 1.5 * search.translation_m):
+        what = "the guess" if guess is not None else "the LiDAR"
+        yield f"the answer lies {far:.2f} m from {what}, farther than was searched"
+
+
+def _alternatives(
+    problem: CalibrationProblem,
+    solution: JointSolution,
+    solutions: Sequence[JointSolution],
+    covariance: FloatArray,
+) -> Iterator[str]:
+    """Solutions elsewhere that agree with the labels almost as well."""
+    best, *others = solutions
+    for other in others:
+        step = difference(solution.state, other.state)
+        sigmas = float(np.sqrt(step @ np.linalg.solve(covariance[:7, :7], step)))
+        as_good = agreement(other) > ALTERNATIVE_RATIO * agreement(best)
+        if sigmas > _FAR_SIGMAS and as_good:
+            yield (
+                f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
+                f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "
+                "that explains the labels almost as well: record more varied scenes or give a closer guess"
+            )

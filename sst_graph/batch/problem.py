@@ -1,0 +1,137 @@
+"""What the joint method solves, and an estimate of it with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.answer import Guess
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
+from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
+from sst_graph.covariance.stationary_objects import standing_covariance
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.outer_loop import (
+    KERNELS_PX,
+    NARROW_KERNELS_PX,
+    JointConfig,
+    JointProblem,
+    JointSolution,
+    solve_all,
+)
+from sst_graph.graph.state import State
+from sst_graph.initialization.candidates import StartProblem
+from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
+from sst_graph.objects.tracks import ObjectId, object_tracks
+from sst_graph.stepwise import whole
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CalibrationProblem:
+    """Drives that share one extrinsic, and how they are to be solved.
+
+    Attributes:
+        drives: what is kept of them.
+        tracks: twist tracks; object tracks, too, where objects have mask biases.
+        objects: object tracks of each drive.
+        guess: what is known beforehand.
+        config: settings, the estimated parameters among those of the graph.
+        progress: called with (stage, steps done, steps in all).
+    """
+
+    drives: Sequence[Drive]
+    tracks: Tracks
+    objects: Sequence[dict[ObjectId, int]]
+    guess: Guess
+    config: CalibrationConfig
+    progress: Progress | None = None
+
+    @classmethod
+    def of(
+        cls,
+        drives: Sequence[Drive],
+        guess: Guess,
+        config: CalibrationConfig,
+        progress: Progress | None = None,
+    ) -> CalibrationProblem:
+        """The problem with objects tracked."""
+        config = config.estimating
+        objects = [object_tracks(drive) for drive in drives]
+        by_object = config.joint.graph.object_bias_sigma_px > 0.0
+        tracks = Tracks(drives, objects if by_object else None)
+        return cls(drives, tracks, objects, guess, config, progress)
+
+    def prior_centre(self, state: State) -> State:
+        """What the weak priors of a solution from or at a state are centred on."""
+        return self._start_problem().centre(state)
+
+    def joint(self) -> JointProblem:
+        """The graph's part of the problem."""
+        return JointProblem(self.drives, self.tracks, self.config.joint)
+
+    def start(self) -> Selection:
+        """The best starts of a global search around the guess, compared on a few scans.
+
+        Raises:
+            EstimationError: no candidate leads anywhere.
+        """
+        return whole(select_start_steps(self._start_problem(), self.config.joint.graph, self.config.start))
+
+    def with_joint(self, joint: JointConfig) -> CalibrationProblem:
+        """The problem with other settings of the joint method."""
+        return replace(self, config=replace(self.config, joint=joint))
+
+    def with_lower_edges(self, solutions: Sequence[JointSolution]) -> WithLowerEdges:
+        """Solutions with the lower edges of classes whose labels agree about them.
+
+        Args:
+            solutions: without them, the one that agrees best with the labels first.
+        """
+        kept = [(one, self.prior_centre(one.state)) for one in alternatives(solutions)]
+        return with_lower_edges(self.joint(), kept, self.config.lower_edges, self.progress)
+
+    def solve_from(self, selection: Selection) -> Sequence[JointSolution]:
+        """Solutions from every selected start, the one that agrees best with the labels first.
+
+        Raises:
+            EstimationError: none of them leads anywhere.
+        """
+        clocks = len(self.drives) if self.config.time_offset_per_drive else 1
+        kernels_px = NARROW_KERNELS_PX if self.config.start.enabled else KERNELS_PX
+        starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in selection.starts]
+        centred = [(start, self.prior_centre(start)) for start in starts]
+        return solve_all(self.joint(), centred, kernels_px, self.progress)
+
+    def _start_problem(self) -> StartProblem:
+        """What a start is searched for, without the tracks of objects."""
+        guess = self.guess
+        return StartProblem(self.drives, Tracks(self.drives), self.config.classes, guess.cTl, guess.offset_s)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A solution and its covariance by the matches.
+
+    Attributes:
+        solution: of the joint graph.
+        robust: its cluster-robust covariance.
+        covariance: (n, n) the same of all unknowns, inflated where labels and motion differ.
+        by_static_objects: (n, n) by static objects alone.
+    """
+
+    solution: JointSolution
+    robust: RobustCovariance
+    covariance: FloatArray
+    by_static_objects: FloatArray
+
+    @classmethod
+    def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> Estimate:
+        """The solution with the covariance of its last matches."""
+        robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
+        return cls(solution, robust, robust.matrix, standing_covariance(robust, solution.pairs))

@@ -1,0 +1,164 @@
+"""The covariance of a joint estimate: that of the matches, and what no match shows.
+
+Beside the matches stand the assumptions, motion that nothing measures, and sweeps that the scans leave
+undecided: there the problem is solved again with the point times of each hypothesis that is left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.answer import DriveCovariance
+from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.covariance.considered import Considered, budget, motion_covariance, remainder
+from sst_graph.covariance.unknown_motion import unknown_motion_covariance
+from sst_graph.graph.frozen_problem import FrozenProblem
+from sst_graph.graph.matching import DriveMatches
+from sst_graph.graph.outer_loop import JointConfig, JointSolution
+from sst_graph.odometry.sweep import REMEDY, SweepTiming
+
+FloatArray = NDArray[np.float64]
+
+MATTERS = 0.5
+"""An undecided sweep matters where it makes up more than this share of the sigma claimed for an unknown."""
+
+
+@dataclass(frozen=True)
+class TotalCovariance:
+    """How well a joint estimate is known.
+
+    Attributes:
+        unknowns: (n, n) of the extrinsic and all offsets, by matches and assumptions.
+        covariance: (7, 7) of the extrinsic and the first offset, by everything.
+        by_drive: where drives have an offset each, of the extrinsic and that offset.
+        budget: sigmas (7) by each part, JSON-able.
+        reasons: sweeps that nothing decides and that matter.
+    """
+
+    unknowns: FloatArray
+    covariance: FloatArray
+    by_drive: tuple[DriveCovariance, ...]
+    budget: dict[str, list[float]]
+    reasons: tuple[str, ...] = ()
+
+
+def total_covariance(
+    problem: CalibrationProblem, estimate: Estimate, considered: Considered
+) -> TotalCovariance:
+    """The covariance by matches, assumptions, unknown motion and undecided sweeps.
+
+    Args:
+        considered: what the assumptions add.
+    """
+    solution, joint = estimate.solution, problem.config.joint
+    size = 6 + len(solution.state.offsets_s)
+    # 1. Matches and assumptions.
+    motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph)
+    parts = budget(estimate.covariance, motion, considered)
+    unknowns = estimate.covariance[:size, :size] + considered.covariance(size)
+    # 2. Motion that nothing measures.
+    known = unknowns[:7, :7] + _unknown_motion(problem, solution, float(unknowns[6, 6]))
+    # 3. Sweeps.
+    sweeps = sweep_effects(problem, solution, known)
+    total = known + sweeps.covariance
+    by_drive = _by_drive(problem, estimate, unknowns)
+    return TotalCovariance(unknowns, total, by_drive, parts | remainder(total, unknowns), sweeps.reasons)
+
+
+def _unknown_motion(problem: CalibrationProblem, solution: JointSolution, variance_s2: float) -> FloatArray:
+    """(7, 7) by motion that nothing measures; variance_s2: of the time offset [s^2]."""
+    config = problem.config.unknown_motion
+    return unknown_motion_covariance(solution.pairs, solution.state, variance_s2, config)
+
+
+def _by_drive(
+    problem: CalibrationProblem, estimate: Estimate, unknowns: FloatArray
+) -> tuple[DriveCovariance, ...]:
+    """Of the extrinsic and each drive's own offset, where drives have one each."""
+    drives = problem.drives if len(estimate.solution.state.offsets_s) > 1 else ()
+    found = []
+    for number, drive in enumerate(drives):
+        own = [*range(6), 6 + number]
+        block = unknowns[np.ix_(own, own)]
+        block = block + _unknown_motion(problem, estimate.solution, float(block[6, 6]))
+        static = estimate.by_static_objects[np.ix_(own, own)]
+        found.append(DriveCovariance(drive.name, block, static))
+    return tuple(found)
+
+
+@dataclass(frozen=True)
+class SweepEffects:
+    """Sweeps that nothing decides and that matter, and the (7, 7) covariance that undecided sweeps add."""
+
+    reasons: tuple[str, ...]
+    covariance: FloatArray
+
+
+def sweep_effects(
+    problem: CalibrationProblem, solution: JointSolution, covariance: FloatArray
+) -> SweepEffects:
+    """The effect of every sweep that the scans leave undecided, one drive at a time.
+
+    The covariance is the mean square of the changes under the hypotheses, by their probability.
+
+    Args:
+        covariance: (7, 7) of the answer, without it.
+    """
+    reasons, added = [], np.zeros((7, 7))
+    for number, drive in enumerate(problem.drives):
+        sweep = drive.sweep
+        if sweep is None or sweep.kind != "undecided" or not sweep.others:
+            continue
+        steps = {
+            timing.fraction: sweep_step(solution, {number: timing}, problem.config.joint)
+            for timing in sweep.others
+        }
+        effect = sum(sweep.shares[fraction] * np.outer(step, step) for fraction, step in steps.items())
+        added += effect
+        if np.sqrt(np.diag(effect) / np.diag(covariance + effect)).max() > MATTERS:
+            worst = max(steps.values(), key=lambda step: float((step**2 / np.diag(covariance)).max()))
+            reasons.append(
+                f"{drive.name}: the scans do not show whether its clouds are compensated for the sweep "
+                f"(share of the sweep in the points {sweep.fraction:+.2f} +- {sweep.sigma:.2f}), and "
+                f"it matters: {np.degrees(np.linalg.norm(worst[:3])):.2f} deg, "
+                f"{100.0 * np.linalg.norm(worst[3:6]):.1f} cm, {1e3 * abs(worst[6]):.1f} ms; {REMEDY}"
+            )
+    return SweepEffects(tuple(reasons), added)
+
+
+def sweep_step(
+    solution: JointSolution, timings: Mapping[int, SweepTiming], config: JointConfig
+) -> FloatArray:
+    """(7,) change of extrinsic and (first) offset when the points of some drives have other times.
+
+    On the frozen matches; right perturbation, [rad, m, s].
+
+    Args:
+        timings: by number of the drive; the points of all others keep their times.
+    """
+    retimed = [
+        _retimed(own, timings[own.number]) if own.number in timings else own for own in solution.matches
+    ]
+    before, after = (
+        FrozenProblem(used, solution.state, config.graph).optimum(_ITERATIONS)[0]
+        for used in (solution.matches, retimed)
+    )
+    step = gtsam.Pose3.Logmap(before.cTl.between(after.cTl))
+    return np.append(step, after.scalars[0] - before.scalars[0])
+
+
+_ITERATIONS = 10
+"""Levenberg-Marquardt iterations on frozen matches: they begin at the optimum under the other times."""
+
+
+def _retimed(matches: DriveMatches, timing: SweepTiming) -> DriveMatches:
+    """The matches with times by azimuth for points that shared the stamp."""
+    alignment = matches.alignment
+    offsets_s = timing.offsets_s(alignment.lPs.astype(np.float32)).astype(np.float64)
+    alignment = replace(alignment, base_taus_s=alignment.base_taus_s - offsets_s)
+    return replace(matches, found=replace(matches.found, alignment=alignment))
