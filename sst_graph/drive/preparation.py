@@ -285,8 +285,8 @@ def prepare_drive(
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
-            features = image_features(frame.index, frame.image, classes, config.picture.use)
-            images.append(features.stored_in(store))
+            contours = image_features(frame.index, frame.image, classes, config.picture.use)
+            images.append(contours.stored_in(store))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
     if not scans or not images:
