@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sst_graph.tracker.sums.running_sums import ScoreSums
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
@@ -27,7 +28,6 @@ from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
-from sst_graph.tracker.sums.score_sums import ScoreSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
 
@@ -95,7 +95,7 @@ def leaving(bent: KeptDrive) -> Tracker:
 def _state(tracker: Tracker) -> State:
     """The state at which all matches of a tracker's window were made."""
     assert tracker.smoother is not None
-    points = [entry.score.belief.point for entry in tracker.smoother.entries.values()]
+    points = [entry.linear.belief.point for entry in tracker.smoother.entries.values()]
     assert all(point.cTl.equals(points[0].cTl, 0.0) for point in points)
     state = points[0].state(tracker.classes)
     seen = [(point.tracks, point.object_biases_px.tolist()) for point in points]
@@ -263,9 +263,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
 
-def test_a_checkpoint_holds_what_is_estimated(
-    leaving: Tracker, bent: KeptDrive, tmp_path: Path
-) -> None:
+def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive, tmp_path: Path) -> None:
     assert leaving.smoother is not None and leaving.smoother.sums.recent
     save_checkpoint(leaving, tmp_path / "tracker")
     again = load_checkpoint(tmp_path / "tracker")

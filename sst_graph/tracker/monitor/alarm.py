@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import ErrorModel
 from sst_graph.tracker.config import AlarmConfig
-from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 
 FloatArray = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class StepAlarm:
         """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         self.config = config
         self.object_sigma_px = object_sigma_px
-        self.recent: deque[PairScore] = deque(maxlen=config.frames)
+        self.recent: deque[LinearizedPair] = deque(maxlen=config.frames)
         self.usual: deque[float] = deque(maxlen=config.baseline)
         self.raised = 0
         self.compared: Comparison | None = None
@@ -80,7 +80,7 @@ class StepAlarm:
         self.compared = None
         self.raised = 0
 
-    def check(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float | None:
+    def check(self, scores: Sequence[LinearizedPair], joint: Joint, model: ErrorModel) -> float | None:
         """The statistic with new frames' scores, over its usual size; None while it can't be told."""
         self.recent.extend(scores)
         if not scores or len(self.recent) < self.config.frames:
@@ -95,7 +95,7 @@ class StepAlarm:
             self.usual.append(statistic)
         return value
 
-    def compare(self, scores: Collection[PairScore], joint: Joint, model: ErrorModel) -> Comparison:
+    def compare(self, scores: Collection[LinearizedPair], joint: Joint, model: ErrorModel) -> Comparison:
         """Any frames' scores against an estimate; nothing is learnt from it."""
         return Comparison.of(scores, joint, model, self.object_sigma_px)
 
@@ -139,7 +139,7 @@ class Comparison:
 
     @classmethod
     def of(
-        cls, scores: Collection[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float
+        cls, scores: Collection[LinearizedPair], joint: Joint, model: ErrorModel, object_sigma_px: float
     ) -> Comparison:
         """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         n = joint.core_size

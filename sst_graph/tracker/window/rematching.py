@@ -10,8 +10,8 @@ from sst_graph.covariance.cluster_robust import FloatArray
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.window.gaussian import core_steps
 from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.relinearization import Settling
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.tracker.window.whole_window import Settling
 
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
@@ -24,7 +24,7 @@ def scans_to_match(
     entered: Collection[int],
     covariance: FloatArray,
     config: TrackerConfig,
-    settling: Settling | None = None,
+    settling: WindowRelinearization | None = None,
 ) -> set[int]:
     """The newest, those still without a pair, those that leave next, and some in turn.
 
@@ -57,12 +57,12 @@ def scans_to_match(
 def _judged_anew(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
     """Scans with a pair in which other objects are to be left out than were; the others are forgotten."""
     window, found = matcher.window, []
-    for number in sorted(window.judged_anew & set(smoother.entries)):
+    for number in sorted(window.changed_scans & set(smoother.entries)):
         entry = smoother.entries[number]
         if matcher.left_out(entry.pair, number, smoother.point.offset_s) != entry.left_out:
             found.append(number)
         else:
-            window.judged_anew.discard(number)
+            window.changed_scans.discard(number)
     return found
 
 
@@ -70,7 +70,7 @@ def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, fl
     """How far the estimate has moved since each pair was matched, in standard deviations."""
     if not smoother.entries:
         return {}
-    points = [entry.score.belief.point for entry in smoother.entries.values()]
+    points = [entry.linear.belief.point for entry in smoother.entries.values()]
     steps = core_steps(points, smoother.point)
     squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
     return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -72,7 +72,7 @@ class Window:
             number [m/s].
         persistence: which objects stay where they are, whatever their sightings say.
         velocities: of those that do not.
-        judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
+        changed_scans: scans in which an object has turned out to move, or to stand, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
         origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
@@ -99,7 +99,7 @@ class Window:
         self.moving: dict[int, dict[ObjectName, float]] = {}
         self.persistence = Persistence()
         self.velocities = Velocities()
-        self.judged_anew: set[int] = set()
+        self.changed_scans: set[int] = set()
         self.wTl = gtsam.Pose3()
 
     @property
@@ -151,13 +151,13 @@ class Window:
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
         self._judge(number, features.stamp_ns)
         self.persistence.forget(self.first_scan)
-        self.judged_anew |= self.persistence.add(number, lean, self.wTl)
+        self.changed_scans |= self.persistence.add(number, lean, self.wTl)
         self.velocities.forget(self.first_scan)
-        self.judged_anew |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
+        self.changed_scans |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
         for by_scan in (self.tracks, self.moving):
             for old in [k for k in by_scan if k < self.first_scan]:
                 del by_scan[old]
-        self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
+        self.changed_scans = {k for k in self.changed_scans if k >= self.first_scan}
         return number
 
     def _thin_out(self) -> None:
@@ -223,7 +223,7 @@ class Window:
         if speed > 0.0:
             speeds[sighting.name] = speed
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
-            self.judged_anew.add(sighting.scan)
+            self.changed_scans.add(sighting.scan)
 
     def left_out(
         self, number: int, tau_s: float, reach_m: float
@@ -247,7 +247,7 @@ class Window:
             for name, speed in self.speeds(number).items()
         }
 
-    def restless(self) -> set[int]:
+    def recently_moving(self) -> set[int]:
         """Tracks of the objects that were judged to move in any of their latest sightings, how is not known.
 
         While an object starts or stops, no line fits its places, and it may pass for one that stands.
