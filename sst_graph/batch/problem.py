@@ -12,7 +12,7 @@ from sst_graph.batch.answer import Guess
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
-from sst_graph.covariance.stationary_objects import standing_covariance
+from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.building import Tracks
 from sst_graph.graph.outer_loop import (
@@ -134,4 +134,4 @@ class Estimate:
     def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> Estimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
-        return cls(solution, robust, robust.matrix, standing_covariance(robust, solution.pairs))
+        return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))

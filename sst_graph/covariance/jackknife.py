@@ -66,10 +66,10 @@ def composed(covariance: FloatArray, spread: ObjectSpread | None, flatness: floa
         alone = spread.correction / _OF_TWO
         model = _MODEL_SHARE * max(spread.disagreement(covariance), alone) * covariance
         covariance = model + _OBJECT_SHARE * spread.correction * spread.jackknife
-    return np.asarray(covariance * believed_flatness(flatness) ** 2)
+    return np.asarray(covariance * bounded_ratio(flatness) ** 2)
 
 
-def believed_flatness(flatness: float) -> float:
+def bounded_ratio(flatness: float) -> float:
     """Mean robust weight over mean curvature, within what is believed of it."""
     return min(max(flatness, 1.0), _FLATTEST)
 

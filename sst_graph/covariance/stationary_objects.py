@@ -21,14 +21,14 @@ _ALL = 1.0 - 1e-6
 """Largest share of what is known of a direction that is taken away."""
 
 
-def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) -> FloatArray:
+def static_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) -> FloatArray:
     """(n, n) covariance of the unknowns without the matches of objects that move with a known velocity.
 
     Args:
         robust: with all of them.
         pairs: its matches.
     """
-    moves = np.concatenate([moving_matches(pair) for pair in pairs])
+    moves = np.concatenate([dynamic_matches(pair) for pair in pairs])
     if not moves.any():
         return robust.matrix
     if moves.all():
@@ -40,7 +40,7 @@ def standing_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) 
     return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
 
 
-def moving_matches(pair: PairMatches) -> NDArray[np.bool_]:
+def dynamic_matches(pair: PairMatches) -> NDArray[np.bool_]:
     """(m,) whether the object of each match moves with a known velocity, class by class."""
     found = []
     for matches in pair.matches.values():

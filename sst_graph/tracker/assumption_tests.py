@@ -20,7 +20,7 @@ import numpy as np
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch.assumption_tests import Finding, few_objects
 from sst_graph.covariance.considered import AssumptionConfig
-from sst_graph.covariance.jackknife import believed_flatness
+from sst_graph.covariance.jackknife import bounded_ratio
 from sst_graph.errors import EstimationError
 from sst_graph.graph.elimination import scaled_inverse
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -44,7 +44,7 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
     surplus = np.einsum("nk,nm,mk->k", A, smoother.surplus(with_held=True), A)
     before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
-    curvature = np.maximum(information, 0.0) / believed_flatness(smoother.flatness) + before
+    curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.flatness) + before
     values = score / curvature
     sigmas = np.sqrt(np.maximum(information + surplus, 0.0) + before) / curvature
     sigmas *= few_objects(smoother.objects, config.threshold)

@@ -23,13 +23,17 @@ from sst_graph.tracker.monitor.statistic import Estimate
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.tracker.window.arrivals import Arrivals
-from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.information_log import InformationLog
 from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.relinearization import (
+    RelinearizationSchedule,
+    WindowRelinearization,
+    relinearize_window,
+)
 from sst_graph.tracker.window.rematching import scans_to_match
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.tracker.window.whole_window import Milestones, Settling, settle_window
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,9 +87,9 @@ class OnlineEstimate:
         self.uncertainty = Uncertainty.nothing()
         self.tests = AssumptionTests(config.calibration.assumptions)
         self.entered: deque[int] = deque(maxlen=4 * config.window)
-        self.schedule = Milestones(0, config.window, config.window)
-        self.relinearization: Settling | None = None
-        self.information_log = Arrivals()
+        self.schedule = RelinearizationSchedule(0, config.window, config.window)
+        self.relinearization: WindowRelinearization | None = None
+        self.information_log = InformationLog()
         self.past_epochs = History()
         self.starts = 0
 
@@ -96,7 +100,7 @@ class OnlineEstimate:
         self.tests.run(smoother)
         self.starts += 1
         soon = len(window.scans) + initialization.scans
-        self.schedule = Milestones(window.first_scan, soon, self.config.window)
+        self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.information_log.restart()
         self.information_log.take(window.next_scan - 1, self.reported_covariance())
@@ -215,12 +219,12 @@ class OnlineEstimate:
         """Match the window anew with the frames to come; no scan leaves meanwhile if none has yet."""
         window = self.matcher.window
         window.dynamics.test_all()
-        self.relinearization = Settling(self.matcher)
-        window.held = window.first_scan == self.schedule.first
+        self.relinearization = WindowRelinearization(self.matcher)
+        window.growing = window.first_scan == self.schedule.first
 
     def stop_relinearization(self) -> None:
         """Leave a relinearization of the window, if there is one, as it is."""
-        self.relinearization, self.matcher.window.held = None, False
+        self.relinearization, self.matcher.window.growing = None, False
 
     def _schedule_relinearization(self, scan: int) -> None:
         if self.relinearization is not None and self.relinearization.ended:
@@ -250,10 +254,10 @@ class OnlineEstimate:
             return None
         self.stop_relinearization()
         window.dynamics.test_all()
-        self.matcher.look_below(smoother.point)
+        self.matcher.check_lower_edges(smoother.point)
         live = window.objects.live
         try:
-            converged = settle_window(
+            converged = relinearize_window(
                 smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, FULL_STEPS, live, self._share
             )
             self.uncertainty = Uncertainty.of(smoother)

@@ -81,7 +81,7 @@ def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: G
 
 def _cluster_robust(epoch: RetiredEpoch, point: Point) -> Gaussian:
     """The epoch's Gaussian with its cluster-robust information: H M^-1 H, M = H + surplus."""
-    belief = epoch.belief.at(point)
+    belief = epoch.information.at(point)
     H = belief.information
     diagonal = np.diag(H)
     if not (diagonal > 0.0).any():

@@ -55,7 +55,7 @@ class Uncertainty:
         share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
         inflation = max(1.0, float(share))
         by_static = None
-        static = smoother.information_of_standing()
+        static = smoother.static_information()
         if static is not None:
             wider = scaled_inverse(static)[:7, :7] - naive[:7, :7]
             by_static = matrix[:7, :7] + inflation * wider

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sst_graph.tracker.sums.running_sums import ScoreSums
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
@@ -26,7 +27,6 @@ from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.tracker.answer import current
-from sst_graph.tracker.sums.score_sums import ScoreSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
 
@@ -94,7 +94,7 @@ def leaving(bent: KeptDrive) -> Tracker:
 def _state(tracker: Tracker) -> State:
     """The state at which all matches of a tracker's window were made."""
     assert tracker.estimate.smoother is not None
-    points = [entry.score.belief.point for entry in tracker.estimate.smoother.entries.values()]
+    points = [entry.linear.belief.point for entry in tracker.estimate.smoother.entries.values()]
     assert all(point.cTl.equals(points[0].cTl, 0.0) for point in points)
     state = points[0].state(tracker.matcher.classes)
     seen = [(point.tracks, point.object_biases_px.tolist()) for point in points]

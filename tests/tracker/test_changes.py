@@ -226,7 +226,7 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
         image = frame.image
         if frame.index == STEP:
             monkeypatch.setattr(
-                tracker.inputs.window, "restless", lambda: set(tracker.inputs.window.objects.live)
+                tracker.inputs.window, "recently_moving", lambda: set(tracker.inputs.window.objects.live)
             )
         if frame.index >= STEP:
             image = knocked(image, street, 1.5)

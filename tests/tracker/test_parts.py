@@ -9,14 +9,14 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, SideSums
+from sst_graph.tracker.sums.running_sums import ScoreSums, fit_sides
 
 from sst_graph.covariance.cluster_robust import ErrorModel
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, Comparison, EstimateCovariance
-from sst_graph.tracker.sums.scan_scores import PairScore, SideSums
-from sst_graph.tracker.sums.score_sums import ScoreSums, fit_sides
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
 
 FloatArray = NDArray[np.float64]
@@ -84,7 +84,7 @@ def test_error_model_of_simulated_sides() -> None:
     np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)  # floors: 0.36, 0.32
 
 
-def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
+def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> LinearizedPair:
     """A pair of 200 matches on four sides whose residuals follow the error model (0.25, 0, 1)."""
     J = rng.standard_normal((200, N))
     which = np.repeat(np.arange(4), 50)
@@ -95,14 +95,14 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> PairScore:
     sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     belief = Gaussian(point, J.T @ J, -J.T @ r)
-    return PairScore(belief, belief, J.T @ J, sides, scores.T @ scores, 200)
+    return LinearizedPair(belief, belief, J.T @ J, sides, scores.T @ scores, 200)
 
 
 def _model() -> ErrorModel:
     return ErrorModel(0.25, 0.0, 1.0)
 
 
-def _chi2(scores: list[PairScore], covariance: EstimateCovariance) -> float:
+def _chi2(scores: list[LinearizedPair], covariance: EstimateCovariance) -> float:
     return Comparison.of(scores, covariance, _model(), 0.0).chi2()
 
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sst_graph.tracker.window.relinearization import SCANS
 from streets import TRACKED_STREET, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulatedDrive, simulate
-from sst_graph.tracker.window.whole_window import SCANS
 from sst_graph.types import Frame
 
 
@@ -39,7 +39,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
 
 def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]]) -> None:
     tracker = Tracker.load(begun[0])
-    assert tracker.estimate.relinearization is not None and tracker.inputs.window.held
+    assert tracker.estimate.relinearization is not None and tracker.inputs.window.growing
     # With one frame, lower edges have been checked; the newest scan is matched as it comes.
     assert len(tracker.estimate.relinearization.done) == (SCANS + 1) // 2 + 1
     assert (
@@ -71,7 +71,7 @@ def test_the_window_is_relinearized_with_the_frames_that_come(begun: tuple[Path,
 def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
     once, again, coming = Tracker.load(begun[0]), Tracker.load(begun[0]), begun[1]
     again.estimate.stop_relinearization()
-    assert not again.inputs.window.held and again.add(coming[0]).accepted
+    assert not again.inputs.window.growing and again.add(coming[0]).accepted
     again.estimate.begin_relinearization()
     once.add(coming[0])
     for frame in coming[1:]:

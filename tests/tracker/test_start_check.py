@@ -71,18 +71,18 @@ def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, fram
     tracker, _ = answers(street, frames[:20], None)
     assert tracker.estimate.smoother is not None
     assert (
-        tracker.estimate.smoother.information_of_standing() is None
+        tracker.estimate.smoother.static_information() is None
         and tracker.estimate.uncertainty.by_static is None
     )
     # 1. One object's matches count as those of a moving one.
     smoother = tracker.estimate.smoother
     for scan, entry in smoother.entries.items():
-        seen = sorted(entry.score.places)
-        part = entry.score.belief.without(seen[:1])[0] if seen else entry.score.belief
+        seen = sorted(entry.linear.places)
+        part = entry.linear.belief.without(seen[:1])[0] if seen else entry.linear.belief
         half = dataclasses.replace(part, information=0.5 * part.information)
-        score = dataclasses.replace(entry.score, standing=half)
+        score = dataclasses.replace(entry.linear, standing=half)
         smoother.entries[scan] = dataclasses.replace(entry, score=score)
-    alone, whole = smoother.information_of_standing(), Uncertainty.of(smoother)
+    alone, whole = smoother.static_information(), Uncertainty.of(smoother)
     assert alone is not None and whole.by_static is not None
     assert np.linalg.eigvalsh(whole.by_static - whole.covariance[:7, :7])[0] > -1e-9
     assert (np.diag(whole.by_static) > 1.2 * np.diag(whole.covariance)[:7]).any()

@@ -7,11 +7,11 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
+from sst_graph.tracker.sums.linearized_pair import linearize_pair
+from sst_graph.tracker.window.pending_pairs import MOST, OtherPairing, PendingPairs
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.tracker.sums.scan_scores import score_pair
-from sst_graph.tracker.window.ambiguous_pairs import MOST, Other, Undecided
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 
 POINT = Point(gtsam.Pose3(), 0.05, np.array([0.3]), (4, 7), np.array([0.1, -0.2]))
@@ -39,7 +39,7 @@ def test_the_past_pairs_anew_when_the_offset_passes_the_middle() -> None:
     prior, rest = _tied(0, POINT), _belief(1, POINT)
     used, other = _belief(2, POINT.seen({4: 0})), _belief(3, POINT.seen({7: 0}))
     past = prior.plus(rest).plus(used)
-    undecided = Undecided.none(N).plus(used, Other(other, 0.06, early=False), POINT)
+    undecided = PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT)
     stays, same = undecided.decided(past, 0.0599)
     assert stays is undecided and same is past
     flipped, changed = undecided.decided(past, 0.0601)
@@ -54,7 +54,7 @@ def test_other_pairings_follow_the_point_and_the_objects() -> None:
     """Elsewhere, with one object more and another marginalized out: as if decided before."""
     used, other = _belief(4, POINT.seen({4: 0})), _belief(5, POINT.seen({4: 0}))
     past = _tied(6, POINT).plus(used)
-    undecided = Undecided.none(N).plus(used, Other(other, 0.04, early=True), POINT)
+    undecided = PendingPairs.none(N).plus(used, OtherPairing(other, 0.04, early=True), POINT)
     expected = undecided.decided(past, 0.0)[1]
     step = np.full(N, 1e-3)
     step[:3] = 0.0  # translations add exactly
@@ -79,15 +79,17 @@ def test_other_pairings_follow_the_point_and_the_objects() -> None:
 def test_objects_that_only_the_other_pairing_sees_are_left_out() -> None:
     used, other = _belief(7, POINT.seen({4: 0})), _belief(8, POINT.seen({4: 0, 9: 0}))
     past = _tied(9, POINT).plus(used)
-    found = Undecided.none(N).plus(used, Other(other, 0.06, early=False), POINT).decided(past, 1.0)[1]
+    found = (
+        PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT).decided(past, 1.0)[1]
+    )
     _same(found, _tied(9, POINT).plus(other.without([9])[0]))
 
 
 def test_few_are_kept_and_none_that_would_break_the_past() -> None:
     used, other = _belief(10, POINT), Gaussian(POINT, np.zeros((N, N)), np.zeros(N))
-    undecided = Undecided.none(N)
+    undecided = PendingPairs.none(N)
     for k in range(MOST + 5):
-        undecided = undecided.plus(used, Other(other, float(k), early=False), POINT)
+        undecided = undecided.plus(used, OtherPairing(other, float(k), early=False), POINT)
     assert len(undecided.middles_s) == len(undecided.vector) == MOST
     assert undecided.middles_s[0] == 5.0
     past = _tied(11, POINT)
@@ -135,12 +137,12 @@ def test_the_bent_belief_tells_the_gradient_elsewhere(tracker: Tracker) -> None:
     assert tracker.estimate.smoother is not None
     by_weight, by_curvature = [], []
     for number, entry in tracker.estimate.smoother.entries.items():
-        score = entry.score
+        score = entry.linear
         step = np.zeros(score.belief.point.size)
         step[7:] = 0.4
         there = score.belief.point.moved(step)
         tracks = tracker.inputs.window.tracks[number]
-        fresh = score_pair(
+        fresh = linearize_pair(
             entry.pair, there, tracker.matcher.classes, tracks, tracker.matcher.graph
         ).belief.vector
         own = slice(score.belief.point.core_size, score.belief.point.size)

@@ -102,17 +102,17 @@ def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
 
 
 def test_an_object_that_moved_lately_is_restless() -> None:
-    """Number 3 stops at 1.2 s: it may pass for one that stands, and is restless for a while."""
+    """Number 3 stops at 1.2 s: it may pass for one that stands, and is recently_moving for a while."""
     drive = _drive(40)
-    window, restless = Window(CAMERA, 50), {}
+    window, recently_moving = Window(CAMERA, 50), {}
     for k, scan in enumerate(drive.scans):
         window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
         names = {track: number for (_, number), track in window.tracks[k].items()}
-        restless[k] = {names[track] for track in window.dynamics.recently_moving() if track in names}
-        assert {n for _, n in window.dynamics.path_speeds.get(k, {})} <= restless[k]
-    assert 3 not in {n for _, n in window.dynamics.path_speeds.get(20, {})} and 3 in restless[20]
-    assert 3 not in restless[39] and {1, 2} <= restless[39]
-    assert all(0 not in names for names in restless.values())
+        recently_moving[k] = {names[track] for track in window.dynamics.recently_moving() if track in names}
+        assert {n for _, n in window.dynamics.path_speeds.get(k, {})} <= recently_moving[k]
+    assert 3 not in {n for _, n in window.dynamics.path_speeds.get(20, {})} and 3 in recently_moving[20]
+    assert 3 not in recently_moving[39] and {1, 2} <= recently_moving[39]
+    assert all(0 not in names for names in recently_moving.values())
     # One whose velocity is known at its newest sighting may be asked.
     (one,) = [track for (_, number), track in window.tracks[39].items() if number == 1]
     assert one in window.dynamics.recently_moving()

@@ -26,7 +26,7 @@ from sst_graph.tracker.monitor.statistic import (
     Estimate,
     EstimateCovariance,
 )
-from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
@@ -191,7 +191,7 @@ class ChangeDetector:
         """
         pairs = self.matcher.pairs_at(estimate.point, sorted(scans), _KERNEL)
         scores = [
-            self.matcher.scores_of({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
+            self.matcher.linearized({scan: pairs[scan]}, estimate.point, moving) for scan in sorted(pairs)
         ]
         n = len(scores)
         cuts = range(2, n - 1)
@@ -232,7 +232,7 @@ class ChangeDetector:
         self.scans.extend(views)
         self._before.append(Reference(estimate.point, estimate.covariance, min(views)))
         against = self.reference or self._before[-1]
-        scores = self.matcher.scores(against.point, list(views), _KERNEL, self._moving)
+        scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
         value = self.statistic.add(scores, against.covariance, estimate.model)
         # 3. Keep a reference, or give it up.
         if self.statistic.exceeded > self.max_pending:
@@ -298,7 +298,7 @@ class ChangeDetector:
         comparison = self.statistic.latest
         if unreliable := self.confirmation.unreliable:
             latest = list(self.scans)[-FRAMES:]
-            scores = self.matcher.scores(estimate.point, latest, _KERNEL, {*unreliable, *self._moving})
+            scores = self.matcher.linearized_at(estimate.point, latest, _KERNEL, {*unreliable, *self._moving})
             comparison = None
             if scores:
                 comparison = self.statistic.compare(scores, estimate.covariance, estimate.model)
@@ -321,7 +321,7 @@ class ChangeDetector:
 
         def value(*without: int) -> float:
             return self._value(
-                self.matcher.scores_of(pairs, reference.point, {*without, *self._moving}), against
+                self.matcher.linearized(pairs, reference.point, {*without, *self._moving}), against
             )
 
         # A step shows more clearly with every frame; labels whose errors last do not.
@@ -333,5 +333,5 @@ class ChangeDetector:
         objects = self.matcher.objects_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)
 
-    def _value(self, scores: Collection[PairScore], estimate: Estimate) -> float:
+    def _value(self, scores: Collection[LinearizedPair], estimate: Estimate) -> float:
         return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.covariance.cluster_robust import ErrorModel
-from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 
 FloatArray = NDArray[np.float64]
@@ -97,7 +97,7 @@ class Comparison:
     @classmethod
     def of(
         cls,
-        scores: Collection[PairScore],
+        scores: Collection[LinearizedPair],
         covariance: EstimateCovariance,
         model: ErrorModel,
         object_sigma_px: float,
@@ -146,7 +146,7 @@ class ChangeStatistic:
 
     def __init__(self, threshold: float, object_sigma_px: float = 0.0) -> None:
         self.threshold, self.object_sigma_px = threshold, object_sigma_px
-        self.recent: deque[PairScore] = deque(maxlen=FRAMES)
+        self.recent: deque[LinearizedPair] = deque(maxlen=FRAMES)
         self.usual: deque[float] = deque(maxlen=_USUAL_FRAMES)
         self.exceeded = 0
         self.latest: Comparison | None = None
@@ -158,7 +158,7 @@ class ChangeStatistic:
         self.exceeded = 0
 
     def add(
-        self, scores: Sequence[PairScore], covariance: EstimateCovariance, model: ErrorModel
+        self, scores: Sequence[LinearizedPair], covariance: EstimateCovariance, model: ErrorModel
     ) -> float | None:
         """The statistic with new frames' scores; None while there are too few."""
         self.recent.extend(scores)
@@ -175,7 +175,7 @@ class ChangeStatistic:
         return value
 
     def compare(
-        self, scores: Collection[PairScore], covariance: EstimateCovariance, model: ErrorModel
+        self, scores: Collection[LinearizedPair], covariance: EstimateCovariance, model: ErrorModel
     ) -> Comparison:
         """Scores of any frames against an estimate."""
         return Comparison.of(scores, covariance, model, self.object_sigma_px)

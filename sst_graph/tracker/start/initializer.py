@@ -17,7 +17,7 @@ from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.start.solution import Guess, first_estimate_steps, prior_gaussian
 from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -158,7 +158,7 @@ class InitialGraph:
     def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
         self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
         self.support = None if config.calibration.lower_edges.use == "never" else LowerEdgeSupport()
-        self.found: dict[int, Found] = {}
+        self.found: dict[int, MatchedPair] = {}
 
     def advance(self, matcher: WindowMatcher, work: int | None) -> bool:
         """Some of it (None: all of this pass); whether all scans have been matched."""
@@ -169,9 +169,9 @@ class InitialGraph:
         if support is None:
             self.found |= matcher.match(self.point, some)[0]
         else:
-            self.support = support.plus(matcher.support_below(self.point, some))
+            self.support = support.plus(matcher.lower_edge_support(self.point, some))
         if self.support is not None and not self.waiting:
-            matcher.match_below(self.support)
+            matcher.set_lower_edges(self.support)
             self.support, self.waiting = None, self.chosen
         return not self.waiting
 

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ObjectBeliefs:
+class ObjectInformation:
     """The matches of each object of a frame alone, on extrinsic, offset, mask biases, parameters and its own
     bias if any.
 
@@ -42,7 +42,7 @@ class ObjectBeliefs:
     @classmethod
     def of(
         cls, J: FloatArray, r: FloatArray, roots: FloatArray, track: NDArray[np.intp], point: Point
-    ) -> ObjectBeliefs:
+    ) -> ObjectInformation:
         """From weighted rows J (m, n) at a point, and residuals, roots of the weights, tracks (m,)."""
         order = np.argsort(track, kind="stable")
         bounds = [0, *(np.flatnonzero(np.diff(track[order])) + 1).tolist(), len(track)]
@@ -70,7 +70,7 @@ class ObjectBeliefs:
         }
 
     @classmethod
-    def single(cls, track: int, own: ObjectBelief) -> ObjectBeliefs:
+    def single(cls, track: int, own: ObjectBelief) -> ObjectInformation:
         """One object."""
         belief, biases = own.belief, own.belief.point.object_biases_px
         weights = np.array([own.weight])
@@ -111,7 +111,7 @@ class ObjectSums:
         """Nothing yet, over n unknowns."""
         return cls(np.zeros((n, n)))
 
-    def add(self, objects: ObjectBeliefs) -> None:
+    def add(self, objects: ObjectInformation) -> None:
         """Take in the objects of a frame."""
         for track, own in objects.one_by_one().items():
             self.live[track] = self.live[track].plus(own) if track in self.live else own
@@ -130,7 +130,7 @@ class ObjectSums:
         gone = {track: self.live.pop(track) for track in list(self.live) if track not in seen}
         if not gone:
             return
-        beliefs = [ObjectBeliefs.single(track, own) for track, own in gone.items()]
+        beliefs = [ObjectInformation.single(track, own) for track, own in gone.items()]
         steps = _steps_without(*_summed(beliefs, point), naive, point)
         scores = steps @ information
         self.closed = self.closed + scores.T @ scores
@@ -138,7 +138,7 @@ class ObjectSums:
         self.weight += sum(own.weight for own in gone.values())
         self.weight2 += sum(own.weight**2 for own in gone.values())
 
-    def spread(self, window: Sequence[ObjectBeliefs], naive: FloatArray, point: Point) -> ObjectSpread:
+    def spread(self, window: Sequence[ObjectInformation], naive: FloatArray, point: Point) -> ObjectSpread:
         """How the estimate varies with the objects.
 
         Args:
@@ -146,7 +146,7 @@ class ObjectSums:
             naive: (n, n) inverse of all information.
             point: the estimate.
         """
-        beliefs = [*(ObjectBeliefs.single(track, own) for track, own in self.live.items()), *window]
+        beliefs = [*(ObjectInformation.single(track, own) for track, own in self.live.items()), *window]
         squares, count = naive @ self.closed @ naive, self.count
         weight, weight2 = self.weight, self.weight2
         if beliefs:
@@ -166,14 +166,16 @@ def _restricted(point: Point, track: int) -> Point:
     return point.seen({track: 0}) if track in point.tracks else point.core()
 
 
-def _weights_by_track(beliefs: Sequence[ObjectBeliefs]) -> FloatArray:
+def _weights_by_track(beliefs: Sequence[ObjectInformation]) -> FloatArray:
     """Weight of each object, summed over its frames."""
     tracks = np.concatenate([part.tracks for part in beliefs])
     weights = np.concatenate([part.weights for part in beliefs])
     return np.asarray(np.bincount(np.unique(tracks, return_inverse=True)[1].reshape(-1), weights))
 
 
-def _summed(beliefs: Sequence[ObjectBeliefs], point: Point) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+def _summed(
+    beliefs: Sequence[ObjectInformation], point: Point
+) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
     """(k) tracks, (k, m, m) informations and (k, m) vectors about a point, summed object by object."""
     counts = [len(part.tracks) for part in beliefs]
     information = np.concatenate([part.information for part in beliefs])

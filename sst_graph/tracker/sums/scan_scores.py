@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.covariance.cluster_robust import curvatures_of, unweighted
-from sst_graph.covariance.stationary_objects import moving_matches
+from sst_graph.covariance.static_objects import dynamic_matches
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
@@ -19,7 +19,7 @@ from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, GraphConfig, PairMatc
 from sst_graph.graph.nuisances import columns_beside
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
-from sst_graph.tracker.sums.object_sums import ObjectBeliefs
+from sst_graph.tracker.sums.object_sums import ObjectInformation
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
 
@@ -59,7 +59,7 @@ class SideSums:
 
 
 @dataclass(frozen=True)
-class PairScore:
+class LinearizedPair:
     """What one pair says: its belief, motion marginalised out, and the sums of its matches.
 
     Attributes:
@@ -85,7 +85,7 @@ class PairScore:
     sums: FloatArray
     matches: int
     places: Mapping[int, int] = field(default_factory=dict)
-    objects: ObjectBeliefs | None = None
+    objects: ObjectInformation | None = None
     weight: float = 1.0
     curvature: float = 1.0
     standing: Gaussian | None = None
@@ -116,7 +116,7 @@ def with_share(pair: PairMatches, share: float) -> PairMatches:
     return replace(pair, matches=matches)
 
 
-def score_pair(
+def linearize_pair(
     pair: PairMatches,
     point: Point,
     classes: Sequence[SemanticClass],
@@ -125,7 +125,7 @@ def score_pair(
     share: float = 1.0,
     by_object: bool = True,
     held: Sequence[str] = (),
-) -> PairScore:
+) -> LinearizedPair:
     """Linearize a pair at the point its matches were made at: its silhouettes and its motion.
 
     Args:
@@ -152,7 +152,7 @@ def score_pair(
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
-    return PairScore(
+    return LinearizedPair(
         belief,
         bent,
         share * (J.T @ J),
@@ -160,7 +160,7 @@ def score_pair(
         sides.scores.T @ sides.scores,
         len(pair),
         places,
-        ObjectBeliefs.of(J[:, :n], r, roots, track, point) if by_object else None,
+        ObjectInformation.of(J[:, :n], r, roots, track, point) if by_object else None,
         weight,
         bend,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
@@ -169,7 +169,7 @@ def score_pair(
 
 def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
     """The information of matches of objects that stand; the vector is not of interest."""
-    moves = moving_matches(pair)
+    moves = dynamic_matches(pair)
     if not moves.any():
         return None
     stands = A[~moves]

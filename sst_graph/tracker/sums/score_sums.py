@@ -23,8 +23,8 @@ from sst_graph.covariance.cluster_robust import (
     spread_beyond,
     with_floors,
 )
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, summed_rows
 from sst_graph.tracker.sums.object_sums import ObjectSums
-from sst_graph.tracker.sums.scan_scores import PairScore, summed_rows
 from sst_graph.tracker.window.gaussian import scattered, with_room
 
 FloatArray = NDArray[np.float64]
@@ -41,7 +41,7 @@ class ScoreSums:
         live: running score of each side seen lately, and the scan that saw it last.
         recent: (k, 6) [side, mean, weights, weights2, within, moved] of the latest sides.
         objects: what each object says.
-        weight, curvature: sums over all matches, see :class:`PairScore`.
+        weight, curvature: sums over all matches, see :class:`LinearizedPair`.
         held: how many parameters the belief holds.
     """
 
@@ -62,7 +62,7 @@ class ScoreSums:
         return cls(nothing, nothing, nothing, objects=ObjectSums.empty(n), held=held)
 
     def add(
-        self, score: PairScore, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
+        self, score: LinearizedPair, columns: IntArray, scan: int, memory: int = 50, by_object: bool = True
     ) -> None:
         """Take in a pair that leaves the window; sides not seen for ``memory`` scans are closed.
 
@@ -86,7 +86,7 @@ class ScoreSums:
             self.objects.add(score.objects)
         self.weight, self.curvature = self.weight + score.weight, self.curvature + score.curvature
 
-    def flatness(self, window: Sequence[PairScore] = ()) -> float:
+    def flatness(self, window: Sequence[LinearizedPair] = ()) -> float:
         """Mean robust weight over mean curvature, of all matches."""
         curvature = self.curvature + sum(score.curvature for score in window)
         weight = self.weight + sum(score.weight for score in window)
@@ -106,14 +106,14 @@ class ScoreSums:
         recent = deque(self.recent, self.recent.maxlen)
         return replace(self, live=dict(self.live), recent=recent, objects=self.objects.copy())
 
-    def error_model(self, window: Iterable[PairScore]) -> ErrorModel:
+    def error_model(self, window: Iterable[LinearizedPair]) -> ErrorModel:
         """Variances of the error model from the latest frames."""
         rows = [*self.recent, *(score.sides.rows for score in window)]
         return fit_sides(np.concatenate(rows))
 
     def surplus(
         self,
-        window: Sequence[PairScore],
+        window: Sequence[LinearizedPair],
         columns: Sequence[IntArray],
         model: ErrorModel,
         with_held: bool = False,

@@ -16,7 +16,7 @@ MOST = 2000
 """Latest scans that are kept."""
 
 
-class Arrivals:
+class InformationLog:
     """Covariance after each scan that was taken in.
 
     Attributes:

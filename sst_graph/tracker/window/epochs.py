@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from sst_graph.covariance.cluster_robust import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.graph.building import PairMatches
-from sst_graph.tracker.sums.scan_scores import PairScore
-from sst_graph.tracker.sums.score_sums import ScoreSums
-from sst_graph.tracker.window.ambiguous_pairs import Other
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
+from sst_graph.tracker.sums.running_sums import ScoreSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.pending_pairs import Other
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Found:
     """
 
     pair: PairMatches
-    score: PairScore
+    score: LinearizedPair
     stamp_ns: int
     image: int
     other: Other | None = None
@@ -60,7 +60,7 @@ class Entry:
     stored_apart: ClassVar[bool] = True
 
     pair: PairMatches
-    score: PairScore
+    score: LinearizedPair
     epoch: int
     image: int
     other: Other | None = None
@@ -114,7 +114,7 @@ class EpochSums:
     def copy(self) -> EpochSums:
         return EpochSums(self.belief, self.sums.copy())
 
-    def add(self, score: PairScore, scan: int, sigma_px: float) -> None:
+    def add(self, score: LinearizedPair, scan: int, sigma_px: float) -> None:
         """Take in a pair; objects that are new to the epoch lie within ``sigma_px`` of their class's bias."""
         known = self.belief.point.tracks
         new = {track: place for track, place in score.places.items() if track not in known}

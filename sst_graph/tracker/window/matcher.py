@@ -19,10 +19,10 @@ from sst_graph.graph.matching import DYNAMIC_REACH_M
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import mean_cost
-from sst_graph.tracker.sums.scan_scores import PairScore, score_pair, with_share
-from sst_graph.tracker.window.ambiguous_pairs import REACH_SIGMAS, Other
-from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair, with_share
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.pending_pairs import REACH_SIGMAS, Other
 from sst_graph.tracker.window.window import Window
 from sst_graph.types import SemanticClass
 
@@ -50,18 +50,18 @@ class WindowMatcher:
         """What it knows, without what it has at hand for the present frame."""
         return {**vars(self), "_twists": None, "_last": None}
 
-    def look_below(self, point: Point) -> None:
+    def check_lower_edges(self, point: Point) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree about them."""
         if self.config.calibration.lower_edges.use != "never":
-            self.match_below(self.support_below(point, None))
+            self.set_lower_edges(self.lower_edge_support(point, None))
 
-    def support_below(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
+    def lower_edge_support(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
         """What the edges towards the ground of some scans (None: all) say about their labels at a point."""
         drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         tracks, state = self._tracks(drive, numbers), point.state(self.classes)
         return lower_edge_support([drive], tracks, state, self.config.calibration.joint)
 
-    def match_below(self, support: LowerEdgeSupport) -> None:
+    def set_lower_edges(self, support: LowerEdgeSupport) -> None:
         """Match edges towards the ground from now on, of classes whose labels agree as this support says."""
         chosen, _ = support.agreed(self.config.calibration.lower_edges)
         self.graph = replace(self.config.calibration.joint.graph, lower_edges=chosen)
@@ -73,7 +73,7 @@ class WindowMatcher:
         kernel: RobustKernel | None = None,
         share: float = 1.0,
         offset_sigma_s: float = 0.0,
-    ) -> tuple[dict[int, Found], set[int]]:
+    ) -> tuple[dict[int, MatchedPair], set[int]]:
         """Matches of some scans (None: all) at a point, and the scans that have none.
 
         Args:
@@ -93,7 +93,7 @@ class WindowMatcher:
                 score = self._score(pair, number, point, share, by_object, self.held_names)
                 image = self.window.images[pair.pair.image]
                 out = self.left_out(pair, number, point.offset_s)
-                found[number] = Found(pair, score, stamps[number], image.index, left_out=out)
+                found[number] = MatchedPair(pair, score, stamps[number], image.index, left_out=out)
         for number in self.window.leaving():
             if number in found and offset_sigma_s > 0.0:
                 other = self._other(point, found[number], number, kernel or self.kernel, offset_sigma_s)
@@ -125,7 +125,7 @@ class WindowMatcher:
 
     def scores(
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
-    ) -> list[PairScore]:
+    ) -> list[LinearizedPair]:
         """What some scans say at a point, all their objects but those of the tracks ``without``."""
         return self.scores_of(self.pairs_at(point, chosen, kernel), point, without)
 
@@ -135,7 +135,7 @@ class WindowMatcher:
 
     def scores_of(
         self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
-    ) -> list[PairScore]:
+    ) -> list[LinearizedPair]:
         """What matches of scans, made at a point, say there without the objects of some tracks."""
         if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
@@ -222,9 +222,9 @@ class WindowMatcher:
         share: float,
         by_object: bool,
         held: Sequence[str] = (),
-    ) -> PairScore:
+    ) -> LinearizedPair:
         tracks = self.window.tracks[number]
-        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
+        return linearize_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""

@@ -9,8 +9,8 @@ import numpy as np
 from sst_graph.covariance.cluster_robust import FloatArray
 from sst_graph.tracker.window.gaussian import core_steps
 from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.relinearization import Settling
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.tracker.window.whole_window import Settling
 
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
@@ -30,7 +30,7 @@ def scans_to_match(
     smoother: WindowSmoother,
     entered: Collection[int],
     covariance: FloatArray,
-    settling: Settling | None = None,
+    settling: WindowRelinearization | None = None,
 ) -> set[int]:
     """The newest, those still without a pair, those that leave next, and some in turn.
 
@@ -76,7 +76,7 @@ def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, fl
     """How far the estimate has moved since each pair was matched, in standard deviations."""
     if not smoother.entries:
         return {}
-    points = [entry.score.belief.point for entry in smoother.entries.values()]
+    points = [entry.linear.belief.point for entry in smoother.entries.values()]
     steps = core_steps(points, smoother.point)
     squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
     return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -29,10 +29,10 @@ from sst_graph.graph.state import (
     twist_key,
 )
 from sst_graph.tracker.config import DriftConfig
-from sst_graph.tracker.sums.score_sums import ScoreSums
-from sst_graph.tracker.window.ambiguous_pairs import Undecided
+from sst_graph.tracker.sums.running_sums import ScoreSums
 from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
+from sst_graph.tracker.window.pending_pairs import Undecided
 from sst_graph.tracker.window.smoother_update import Change, TwistFactor, read_point
 from sst_graph.types import SemanticClass
 
@@ -84,7 +84,7 @@ class WindowSmoother:
         self.held_names = held_at_zero(graph.estimate)
         self.prior = self.alone = prior
         self.past = self.bent = prior.holding(len(self.held_names))
-        self.undecided = Undecided.none(len(self.bent.vector))
+        self.undecided = PendingPairs.none(len(self.bent.vector))
         self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, Entry] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
@@ -111,7 +111,7 @@ class WindowSmoother:
     @property
     def matches(self) -> int:
         """Matches of the window."""
-        return sum(entry.score.matches for entry in self.entries.values())
+        return sum(entry.linear.matches for entry in self.entries.values())
 
     def keys(self, epoch: int, tracks: Sequence[int] = ()) -> list[int]:
         """Keys of [E, D, biases..., parameters..., biases of some objects...] of an epoch."""
@@ -155,7 +155,7 @@ class WindowSmoother:
         self.epoch_sums, self._point = change.epoch_sums, change.point
         self.retired += change.retired
         if self.entries or self.sums.recent:
-            self.model = self.sums.error_model([entry.score for entry in self.entries.values()])
+            self.model = self.sums.error_model([entry.linear for entry in self.entries.values()])
 
     def rest_at(self, point: Point) -> None:
         """Answer this estimate until the next update."""
@@ -164,12 +164,12 @@ class WindowSmoother:
     def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What the matches of a pair say."""
         (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
-        at = entry.score.belief.point.nuisances
+        at = entry.linear.belief.point.nuisances
         return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0), at)
 
     def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What odometry says of the twist of a pair's image."""
-        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.belief.point
+        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.linear.belief.point
         return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s)
 
     def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
@@ -271,7 +271,7 @@ class WindowSmoother:
     def information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent, over the
         unknowns of ``past`` and what it holds."""
-        return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
+        return self._onwards(self.past, {scan: entry.linear.belief for scan, entry in self.entries.items()})
 
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
@@ -280,17 +280,17 @@ class WindowSmoother:
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 belief = belief.drifted(self.walk(self._seconds(i)))
-            seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
+            seen = [entry.linear.belief for entry in self.entries.values() if entry.epoch == epoch.number]
             belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
         return belief.vector
 
-    def information_of_standing(self) -> FloatArray | None:
+    def static_information(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
         alone, beliefs = (
             self.alone,
-            {scan: entry.score.by_static_objects for scan, entry in self.entries.items()},
+            {scan: entry.linear.by_static_objects for scan, entry in self.entries.items()},
         )
-        moves = any(entry.score.standing is not None for entry in self.entries.values())
+        moves = any(entry.linear.standing is not None for entry in self.entries.values())
         if not moves and np.array_equal(alone.information, self.past.without_held().information):
             return None
         return self._onwards(alone, beliefs)
@@ -339,7 +339,7 @@ class WindowSmoother:
         Args:
             with_held: over what ``past`` holds, too.
         """
-        scores, point = [entry.score for entry in self.entries.values()], self.past.point
+        scores, point = [entry.linear for entry in self.entries.values()], self.past.point
         held = self.past.held if with_held else 0
         columns = [point.columns(score.belief.point.tracks, held) for score in scores]
         return self.sums.surplus(scores, columns, self.model, with_held)
@@ -347,13 +347,13 @@ class WindowSmoother:
     @property
     def flatness(self) -> float:
         """Mean robust weight over mean curvature, of all matches of past and window."""
-        return self.sums.flatness([entry.score for entry in self.entries.values()])
+        return self.sums.flatness([entry.linear for entry in self.entries.values()])
 
     @property
     def objects(self) -> int:
         """How many objects past and window have seen."""
         sides = [np.array(list(self.sums.live), np.intp)]
-        sides += [entry.score.sides.sides for entry in self.entries.values()]
+        sides += [entry.linear.sides.sides for entry in self.entries.values()]
         live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
         return self.sums.objects.count + len(live)
 
@@ -364,6 +364,6 @@ class WindowSmoother:
             sums = self.epoch_sums.copy() if i == 0 else EpochSums.empty(self.past.point)
             for scan, entry in self.entries.items():
                 if entry.epoch == epoch.number:
-                    sums.add(entry.score, scan, self.graph.object_bias_sigma_px)
+                    sums.add(entry.linear, scan, self.graph.object_bias_sigma_px)
             found.append(sums.retired(epoch.start_ns, self.model))
         return found

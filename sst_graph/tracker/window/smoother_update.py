@@ -105,17 +105,17 @@ class Change:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
             entry = self.entries.pop(scan)
             self._remove.append(self.ids.pop(scan))
-            belief, drift = entry.score.belief, self._smoother.drift
+            belief, drift = entry.linear.belief, self._smoother.drift
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
-            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.score.bent)
-            self.alone = self.alone.plus(entry.score.by_static_objects)
+            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.linear.bent)
+            self.alone = self.alone.plus(entry.linear.by_static_objects)
             if entry.other is not None:
-                self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
+                self.undecided = self.undecided.plus(entry.linear.bent, entry.other, self.past.point)
             columns = self.past.point.columns(belief.point.tracks, belief.held)
-            self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
+            self.sums.add(entry.linear, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
-                self.epoch_sums.add(entry.score, scan, self._smoother.graph.object_bias_sigma_px)
+                self.epoch_sums.add(entry.linear, scan, self._smoother.graph.object_bias_sigma_px)
         for scan in self._dropped & set(self.entries):
             del self.entries[scan]
             self._remove.append(self.ids.pop(scan))
@@ -140,7 +140,7 @@ class Change:
 
     def _marginalize_objects(self) -> None:
         """Objects that the window does not see, and that will not be seen again, leave the unknowns."""
-        seen = {track for entry in self.entries.values() for track in entry.score.places}
+        seen = {track for entry in self.entries.values() for track in entry.linear.places}
         gone = [t for t in self.past.point.tracks if t not in seen and t not in self._alive]
         if not self._smoother.drift.enabled:
             self._close_objects()
@@ -162,13 +162,13 @@ class Change:
         kept = {
             track
             for entry in self.entries.values()
-            if entry.score.objects is not None
-            for track in entry.score.objects.tracks
+            if entry.linear.objects is not None
+            for track in entry.linear.objects.tracks
         }
         kept |= {track for track in self.sums.objects.live if track in self._alive}
         if all(track in kept for track in self.sums.objects.live):
             return
-        seen = [entry.score.belief for entry in self.entries.values()]
+        seen = [entry.linear.belief for entry in self.entries.values()]
         n = self.past.point.size
         information = self.past.information_with(seen)[:n, :n]
         point = self.past.at(self.point).point

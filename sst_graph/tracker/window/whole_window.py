@@ -1,6 +1,6 @@
 """The whole window solved again as the batch does, from a wide kernel to the narrowest.
 
-At the end of a drive at once (:func:`settle_window`); while frames come, a little with each
+At the end of a drive at once (:func:`relinearize_window`); while frames come, a little with each
 (:class:`Settling`).
 """
 
@@ -28,7 +28,7 @@ _PASSES = 2
 
 
 @dataclass
-class Milestones:
+class RelinearizationSchedule:
     """When a running tracker settles: each time it has seen twice as much, and before scans first leave.
 
     A young estimate wanders, and what was matched on the way no longer lies where it would now.
@@ -53,7 +53,7 @@ class Milestones:
         return True
 
 
-def settle_window(
+def relinearize_window(
     smoother: WindowSmoother,
     matcher: WindowMatcher,
     kernel_px: Sequence[float],
@@ -139,7 +139,7 @@ class Settling:
         most = max(1, SCANS - fewer)
         some = waiting[: (most + 1) // 2 if looking else most]
         if below is not None:
-            self.below = below.plus(self._matcher.support_below(point, some))
+            self.below = below.plus(self._matcher.lower_edge_support(point, some))
         self.done.update(some)
         if len(some) == len(waiting):
             self._next()
@@ -151,5 +151,5 @@ class Settling:
         if self.below is None:
             self.passes -= 1
         else:
-            self._matcher.match_below(self.below)
+            self._matcher.set_lower_edges(self.below)
             self.below = None
