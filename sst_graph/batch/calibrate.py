@@ -33,7 +33,7 @@ from sst_graph.batch.sweep_effect import SweepEffects, sweep_effects
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.considered import BUDGET, budget, consider, motion_covariance, remainder
 from sst_graph.covariance.observability import weak_directions
-from sst_graph.covariance.stationary_objects import standing_covariance
+from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.covariance.unknown_motion import unknown_motion_covariance
 from sst_graph.drive.preparation import Drive, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
@@ -186,7 +186,7 @@ def answer_joint(
     contradictions = find_contradictions(parts, config.contradictions)
     # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
-    covariance, by_standing = robust.matrix, standing_covariance(robust, solution.pairs)
+    covariance, by_standing = robust.matrix, static_covariance(robust, solution.pairs)
     labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
     heard = _hear_motion(drives, tracks, labels, guess, config, progress)
     if heard.solution is not solution:
@@ -194,7 +194,7 @@ def answer_joint(
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
-            by_standing = standing_covariance(robust, solution.pairs)
+            by_standing = static_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, consider
 from sst_graph.covariance.contradiction import PartAnswer
-from sst_graph.covariance.stationary_objects import standing_covariance
+from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.robust import RobustKernel
@@ -107,7 +107,7 @@ class Parts:
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
         beside = consider(robust, solution.pairs, solution.values, state, self.assumptions).covariance(7)
         # What moving objects alone tell is not called known: a vehicle that brakes looks like another offset.
-        covariance = standing_covariance(robust, solution.pairs)[:7, :7] + beside
+        covariance = static_covariance(robust, solution.pairs)[:7, :7] + beside
         weights = np.bincount(robust.table.sides, robust.table.root_weights**2)
         clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
         return PartAnswer(difference(self.reference_of(part), state), covariance, clusters)

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
-from sst_graph.covariance.cluster_robust import MatchTable, RobustCovariance
+from sst_graph.covariance.cluster_robust import RobustCovariance
+from sst_graph.covariance.match_table import MatchTable
 from sst_graph.graph.building import GraphConfig, PairMatches, joint_graph
 from sst_graph.graph.elimination import marginal_covariance
 from sst_graph.graph.nuisances import residual_columns
@@ -109,7 +110,7 @@ def columns_of(
 ) -> FloatArray:
     """(m, k) derivatives of all matches' residuals by assumptions' parameters [px per unit], unweighted.
 
-    In the order of :func:`~sst_graph.covariance.cluster_robust.match_table`.
+    In the order of :func:`~sst_graph.covariance.match_table.match_table`.
     """
     blocks = [np.zeros((0, len(names)))]
     for pair in pairs:

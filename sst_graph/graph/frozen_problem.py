@@ -23,6 +23,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.factors.reprojection import evaluate, weigh
 from sst_graph.factors.twist_transfer import transferred
 from sst_graph.graph.building import prior_graph
+from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (
     EXTRINSIC,
@@ -86,9 +87,7 @@ class NormalEquations:
     def covariance(self) -> FloatArray:
         """(n, n) of all unknowns but the twists."""
         _, H, _ = self._reduced(0.0)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-        scaled = np.linalg.inv(H * np.outer(scale, scale) + 1e-14 * np.eye(len(H)))
-        return np.asarray(scaled * np.outer(scale, scale))
+        return information_inverse(H)
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Inverse of the twists' blocks, and H and g with the twists eliminated."""

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
+from sst_graph.graph.linear import unit_scale, with_ridge
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
 from sst_graph.hand_eye.graph import HandEyePriors, HandEyeTerm
 
@@ -114,9 +115,9 @@ def _feigned(term: HandEyeTerm) -> FloatArray:
 
 def _inverse_of_genuine(hessian: FloatArray, feigned: FloatArray) -> FloatArray:
     """(7, 7) inverse of the information without what noise feigns, which stays positive."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    scale = unit_scale(hessian)
     both = np.outer(scale, scale)
-    whitener = np.linalg.inv(np.linalg.cholesky(hessian * both + 1e-14 * np.eye(7)))
+    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * both)))
     values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (feigned * both) @ whitener.T)
     root = whitener.T @ vectors
     return np.asarray((root / np.maximum(values, LEAST_GENUINE)) @ root.T * both)

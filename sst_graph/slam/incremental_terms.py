@@ -192,7 +192,7 @@ class IncrementalTerms:
         matches = self._matches()
         rows = [rows_of(each, self._sides, estimate) for each in matches]
         sums = total(TermSums.of(each, m.information) for each, m in zip(rows, matches, strict=True))
-        sums.add(self._gone)
+        sums = sums + self._gone
         config = self._config.rematch
         errors = fit_errors(rows, config), least_errors(config)
         found, least = (robust_covariance(P, sums, each, self._keys) for each in errors)
@@ -244,7 +244,7 @@ class IncrementalTerms:
         """
         for placed in self._terms:
             if placed.is_gone(estimate):
-                self._gone.add(placed.sums)
+                self._gone = self._gone + placed.sums
         self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
 
     def _matches(self) -> list[TermMatches]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.alarm import Joint
 from sst_graph.tracker.track_update import UNKNOWN_SIGMAS
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -55,7 +55,7 @@ class Known:
         share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
         inflation = max(1.0, float(share))
         by_standing = None
-        alone = smoother.information_of_standing()
+        alone = smoother.static_information()
         if alone is not None:
             wider = scaled_inverse(alone)[:7, :7] - naive[:7, :7]
             by_standing = matrix[:7, :7] + inflation * wider

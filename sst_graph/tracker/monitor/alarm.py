@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
+from sst_graph.covariance.sums import total
 from sst_graph.tracker.config import AlarmConfig
-from sst_graph.tracker.sums.scan_scores import PairScore
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 
 FloatArray = NDArray[np.float64]
 
@@ -69,7 +70,7 @@ class StepAlarm:
         """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         self.config = config
         self.object_sigma_px = object_sigma_px
-        self.recent: deque[PairScore] = deque(maxlen=config.frames)
+        self.recent: deque[LinearizedPair] = deque(maxlen=config.frames)
         self.usual: deque[float] = deque(maxlen=config.baseline)
         self.raised = 0
         self.compared: Comparison | None = None
@@ -80,7 +81,7 @@ class StepAlarm:
         self.compared = None
         self.raised = 0
 
-    def check(self, scores: Sequence[PairScore], joint: Joint, model: ErrorModel) -> float | None:
+    def check(self, scores: Sequence[LinearizedPair], joint: Joint, model: ErrorModel) -> float | None:
         """The statistic with new frames' scores, over its usual size; None while it can't be told."""
         self.recent.extend(scores)
         if not scores or len(self.recent) < self.config.frames:
@@ -95,7 +96,7 @@ class StepAlarm:
             self.usual.append(statistic)
         return value
 
-    def compare(self, scores: Collection[PairScore], joint: Joint, model: ErrorModel) -> Comparison:
+    def compare(self, scores: Collection[LinearizedPair], joint: Joint, model: ErrorModel) -> Comparison:
         """Any frames' scores against an estimate; nothing is learnt from it."""
         return Comparison.of(scores, joint, model, self.object_sigma_px)
 
@@ -139,24 +140,21 @@ class Comparison:
 
     @classmethod
     def of(
-        cls, scores: Collection[PairScore], joint: Joint, model: ErrorModel, object_sigma_px: float
+        cls, scores: Collection[LinearizedPair], joint: Joint, model: ErrorModel, object_sigma_px: float
     ) -> Comparison:
         """object_sigma_px: deviation of a new object's mask bias from its class's [px]."""
         n = joint.core_size
         places = {track: place for score in scores for track, place in score.places.items()}
         order = list(places)
-        H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
-        by_side: dict[int, FloatArray] = {}
+        H, g = np.zeros((n, n + len(order))), np.zeros(n)
         for score in scores:
-            own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
-            H[:, own] += score.belief.information[:n]
-            g += score.belief.vector[:n]
-            M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
-            for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
-                by_side[side] = by_side[side] + row if side in by_side else row
-        if by_side:
-            rows = np.stack(list(by_side.values()))
-            M += model.side * (rows.T @ rows)
+            own = [*range(n), *(n + order.index(track) for track in score.information.point.tracks)]
+            H[:, own] += score.information.information[:n]
+            g += score.information.vector[:n]
+        core = [score.scores.columns(slice(n)) for score in scores]
+        # Without biases of the objects, for these frames may be of few: no less than independent matches.
+        least = replace(model, match=max(1.0, model.match))
+        M = total(n, core, [np.arange(n)] * len(core)).variance(least)
         return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), joint.seeing(places, object_sigma_px))
 
     def chi2(self) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.tracker.config import AlarmConfig
 from sst_graph.tracker.monitor.alarm import Joint, StepAlarm

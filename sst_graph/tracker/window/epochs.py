@@ -8,11 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.graph.building import PairMatches
-from sst_graph.tracker.sums.scan_scores import PairScore
-from sst_graph.tracker.sums.score_sums import ScoreSums
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
+from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.ambiguous_pairs import Other
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.types import SemanticClass
@@ -34,7 +34,7 @@ class Found:
     """
 
     pair: PairMatches
-    score: PairScore
+    score: LinearizedPair
     stamp_ns: int
     image: int
     other: Other | None = None
@@ -57,7 +57,7 @@ class Entry:
     stored_apart: ClassVar[bool] = True
 
     pair: PairMatches
-    score: PairScore
+    score: LinearizedPair
     epoch: int
     image: int
     other: Other | None = None
@@ -86,12 +86,12 @@ class RetiredEpoch:
     Attributes:
         start_ns: first scan's stamp [ns].
         belief: of its pairs alone.
-        surplus: (n, n) variance of its score beyond that of independent matches.
+        excess: (n, n) variance of its score beyond that of independent matches.
     """
 
     start_ns: int
     belief: Gaussian
-    surplus: FloatArray
+    excess: FloatArray
 
 
 @dataclass
@@ -99,32 +99,32 @@ class EpochSums:
     """Belief and score sums of the oldest epoch's retired pairs, for the history."""
 
     belief: Gaussian
-    sums: ScoreSums
+    sums: RunningSums
 
     @classmethod
     def empty(cls, point: Point) -> EpochSums:
         """Nothing yet, about [extrinsic, offset, biases] at a point."""
         point = point.core()
         n = point.size
-        return cls(Gaussian(point, np.zeros((n, n)), np.zeros(n)), ScoreSums.empty(n))
+        return cls(Gaussian(point, np.zeros((n, n)), np.zeros(n)), RunningSums.empty(n))
 
     def copy(self) -> EpochSums:
         return EpochSums(self.belief, self.sums.copy())
 
-    def add(self, score: PairScore, scan: int, sigma_px: float) -> None:
+    def add(self, score: LinearizedPair, scan: int, sigma_px: float) -> None:
         """Take in a pair; objects that are new to the epoch lie within ``sigma_px`` of their class's bias."""
         known = self.belief.point.tracks
         new = {track: place for track, place in score.places.items() if track not in known}
         if new:
             self.belief = self.belief.with_objects(new, sigma_px)
             self.sums.grow(self.belief.point.size)
-        self.belief = self.belief.plus(score.belief)
-        columns = self.belief.point.columns(score.belief.point.tracks)
+        self.belief = self.belief.plus(score.information)
+        columns = self.belief.point.columns(score.information.point.tracks)
         self.sums.add(score, columns, scan, by_object=False)
 
     def retired(self, start_ns: int, model: ErrorModel) -> RetiredEpoch:
         """What stays of the epoch: its objects' biases marginalized out."""
         H = self.belief.information
-        surplus = composed(H + self.sums.surplus([], [], model), None, self.sums.flatness()) - H
+        excess = composed(H + self.sums.excess([], [], model), None, self.sums.weight_curvature_ratio()) - H
         belief, T = self.belief.without(self.belief.point.tracks)
-        return RetiredEpoch(start_ns, belief, T @ surplus @ T.T)
+        return RetiredEpoch(start_ns, belief, T @ excess @ T.T)

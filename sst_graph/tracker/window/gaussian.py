@@ -6,14 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors import custom_factor
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse, scattered
 from sst_graph.graph.state import State, underside_track
 from sst_graph.types import SemanticClass
 
@@ -307,26 +307,6 @@ def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
     parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
     return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
-
-
-def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
-    """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
-    if not places:
-        return [np.zeros((n, n)) for _ in blocks]
-    # Blocks of one size together: a call for each of them would cost more than what it does.
-    order: list[int] = sorted(range(len(places)), key=lambda i: len(places[i]))
-    groups = [list(group) for _, group in groupby(order, key=lambda i: len(places[i]))]
-    columns = [np.array([places[i] for i in group]) for group in groups]
-    where = np.concatenate([(own[:, :, None] * n + own[:, None, :]).reshape(-1) for own in columns])
-    return [
-        np.asarray(np.bincount(where, _in_a_row(some, groups), n * n).reshape(n, n), np.float64)
-        for some in blocks
-    ]
-
-
-def _in_a_row(blocks: Sequence[FloatArray], groups: Sequence[Sequence[int]]) -> FloatArray:
-    """(k,) all entries of blocks, those of each group have one shape."""
-    return np.concatenate([np.array([blocks[i] for i in group]).reshape(-1) for group in groups])
 
 
 def _like(target: Point, source: Point) -> Point:

@@ -17,7 +17,7 @@ from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import PairMatches, Tracks, associate
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import mean_cost
-from sst_graph.tracker.sums.scan_scores import PairScore, score_pair, with_share
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair, with_share
 from sst_graph.tracker.window.ambiguous_pairs import REACH_SIGMAS, Other
 from sst_graph.tracker.window.epochs import Found
 from sst_graph.tracker.window.gaussian import Point
@@ -117,11 +117,11 @@ class WindowMatcher:
         if not pairs or len(pairs[0]) < self.config.min_frame_matches:
             return None
         score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
-        return Other(score.bent, middle_s, early)
+        return Other(score.observed, middle_s, early)
 
     def scores(
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
-    ) -> list[PairScore]:
+    ) -> list[LinearizedPair]:
         """What some scans say at a point, all their objects but those of the tracks ``without``."""
         return self.scores_of(self.pairs_at(point, chosen, kernel), point, without)
 
@@ -131,7 +131,7 @@ class WindowMatcher:
 
     def scores_of(
         self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
-    ) -> list[PairScore]:
+    ) -> list[LinearizedPair]:
         """What matches of scans, made at a point, say there without the objects of some tracks."""
         if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
@@ -217,9 +217,9 @@ class WindowMatcher:
         share: float,
         by_object: bool,
         held: Sequence[str] = (),
-    ) -> PairScore:
+    ) -> LinearizedPair:
         tracks = self.window.tracks[number]
-        return score_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
+        return linearize_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import FloatArray
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.window.gaussian import core_steps
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 from sst_graph.tracker.window.whole_window import Settling
+
+FloatArray = NDArray[np.float64]
 
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
@@ -70,7 +72,7 @@ def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, fl
     """How far the estimate has moved since each pair was matched, in standard deviations."""
     if not smoother.entries:
         return {}
-    points = [entry.score.belief.point for entry in smoother.entries.values()]
+    points = [entry.score.information.point for entry in smoother.entries.values()]
     steps = core_steps(points, smoother.point)
     squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
     return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.graph.building import GraphConfig, motion_factor, silhouettes_factor
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.state import (
     bias_key,
     nuisance_key,
@@ -29,7 +29,7 @@ from sst_graph.graph.state import (
     underside_track,
 )
 from sst_graph.tracker.config import DriftConfig
-from sst_graph.tracker.sums.score_sums import ScoreSums
+from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.ambiguous_pairs import Undecided
 from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
@@ -85,7 +85,7 @@ class WindowSmoother:
         self.prior = self.alone = prior
         self.past = self.bent = prior.holding(len(self.held_names))
         self.undecided = Undecided.none(len(self.bent.vector))
-        self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
+        self.sums = RunningSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, Entry] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
@@ -164,12 +164,12 @@ class WindowSmoother:
     def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What the matches of a pair say."""
         (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
-        at = entry.score.belief.point.nuisances
+        at = entry.score.information.point.nuisances
         return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0), at)
 
     def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
         """What odometry says of the twist of a pair's image."""
-        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.belief.point
+        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.score.information.point
         return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s, self.graph)
 
     def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
@@ -271,7 +271,7 @@ class WindowSmoother:
     def information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent, over the
         unknowns of ``past`` and what it holds."""
-        return self._onwards(self.past, {scan: entry.score.belief for scan, entry in self.entries.items()})
+        return self._onwards(self.past, {scan: entry.score.information for scan, entry in self.entries.items()})
 
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
@@ -280,14 +280,14 @@ class WindowSmoother:
         for i, epoch in enumerate(self._epochs):
             if i > 0:
                 belief = belief.drifted(self.walk(self._seconds(i)))
-            seen = [entry.score.belief for entry in self.entries.values() if entry.epoch == epoch.number]
+            seen = [entry.score.information for entry in self.entries.values() if entry.epoch == epoch.number]
             belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
         return belief.vector
 
-    def information_of_standing(self) -> FloatArray | None:
+    def static_information(self) -> FloatArray | None:
         """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
-        alone, beliefs = self.alone, {scan: entry.score.by_standing for scan, entry in self.entries.items()}
-        moves = any(entry.score.standing is not None for entry in self.entries.values())
+        alone, beliefs = self.alone, {scan: entry.score.by_static for scan, entry in self.entries.items()}
+        moves = any(entry.score.static is not None for entry in self.entries.values())
         if not moves and np.array_equal(alone.information, self.past.without_held().information):
             return None
         return self._onwards(alone, beliefs)
@@ -322,15 +322,15 @@ class WindowSmoother:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        robust = naive + naive @ self.surplus() @ naive
+        robust = naive + naive @ self.excess() @ naive
         spread = None
         if not self.drift.enabled:
             found = [e.score.objects for e in self.entries.values() if e.score.objects is not None]
             spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
-        robust = composed(robust, spread, self.flatness)
+        robust = composed(robust, spread, self.weight_curvature_ratio)
         return 0.5 * (robust + robust.T), naive
 
-    def surplus(self, with_held: bool = False) -> FloatArray:
+    def excess(self, with_held: bool = False) -> FloatArray:
         """(n, n) variance of the score of past and window beyond that of independent matches.
 
         Args:
@@ -338,19 +338,18 @@ class WindowSmoother:
         """
         scores, point = [entry.score for entry in self.entries.values()], self.past.point
         held = self.past.held if with_held else 0
-        columns = [point.columns(score.belief.point.tracks, held) for score in scores]
-        return self.sums.surplus(scores, columns, self.model, with_held)
+        columns = [point.columns(score.information.point.tracks, held) for score in scores]
+        return self.sums.excess(scores, columns, self.model, with_held)
 
     @property
-    def flatness(self) -> float:
+    def weight_curvature_ratio(self) -> float:
         """Mean robust weight over mean curvature, of all matches of past and window."""
-        return self.sums.flatness([entry.score for entry in self.entries.values()])
+        return self.sums.weight_curvature_ratio([entry.score for entry in self.entries.values()])
 
     @property
     def objects(self) -> int:
         """How many objects past and window have seen."""
-        sides = [np.array(list(self.sums.live), np.intp)]
-        sides += [entry.score.sides.sides for entry in self.entries.values()]
+        sides = [self.sums.scores.sides, *(entry.score.scores.sides for entry in self.entries.values())]
         live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
         return self.sums.objects.count + len(live)
 

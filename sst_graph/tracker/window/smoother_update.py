@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.state import object_bias_key, twist_key
 from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Point, with_room
@@ -105,13 +105,13 @@ class Change:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
             entry = self.entries.pop(scan)
             self._remove.append(self.ids.pop(scan))
-            belief, drift = entry.score.belief, self._smoother.drift
+            belief, drift = entry.score.information, self._smoother.drift
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
-            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.score.bent)
-            self.alone = self.alone.plus(entry.score.by_standing)
+            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.score.observed)
+            self.alone = self.alone.plus(entry.score.by_static)
             if entry.other is not None:
-                self.undecided = self.undecided.plus(entry.score.bent, entry.other, self.past.point)
+                self.undecided = self.undecided.plus(entry.score.observed, entry.other, self.past.point)
             columns = self.past.point.columns(belief.point.tracks, belief.held)
             self.sums.add(entry.score, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
@@ -153,7 +153,7 @@ class Change:
 
     def _decide(self) -> None:
         """Pairings of scans that have left, by the time offset that the new matches were made at."""
-        points = [found.score.belief.point for found in self._found.values()]
+        points = [found.score.information.point for found in self._found.values()]
         at = points[0] if points else self._smoother.point
         self.undecided, self.bent = self.undecided.decided(self.bent, at.offset_s)
 
@@ -168,7 +168,7 @@ class Change:
         kept |= {track for track in self.sums.objects.live if track in self._alive}
         if all(track in kept for track in self.sums.objects.live):
             return
-        seen = [entry.score.belief for entry in self.entries.values()]
+        seen = [entry.score.information for entry in self.entries.values()]
         n = self.past.point.size
         information = self.past.information_with(seen)[:n, :n]
         point = self.past.at(self.point).point
