@@ -163,7 +163,7 @@ def main() -> None:
             if step is not None and frame.index >= args.step_at:
                 assert frame.image is not None
                 frame = dataclasses.replace(frame, image=step.applied(frame.image, drive))
-            settling.append(tracker.settling is not None)
+            settling.append(tracker.relinearization is not None)
             update = timed.add(frame)
             started = frame.index if started is None and tracker.started else started
             memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

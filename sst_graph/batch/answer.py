@@ -47,12 +47,12 @@ class DriveKnowledge:
     Attributes:
         drive: its name.
         covariance: (7, 7) of the extrinsic and the drive's own offset.
-        by_standing: (7, 7) the same by objects that stand alone.
+        by_static: (7, 7) the same by objects that stand alone.
     """
 
     drive: str
     covariance: FloatArray
-    by_standing: FloatArray
+    by_static: FloatArray
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Answer:
         frames: that took part.
         doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: what else was missing, for the reader.
-        by_standing: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
+        by_static: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
         drive_offsets: an offset for each drive, where one each was asked for.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
@@ -77,7 +77,7 @@ class Answer:
     frames: tuple[FrameId, ...]
     doubts: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
-    by_standing: FloatArray | None = None
+    by_static: FloatArray | None = None
     drive_offsets: tuple[DriveOffset, ...] = ()
     by_drive: tuple[DriveKnowledge, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
@@ -116,15 +116,17 @@ def _weak_directions(
 ) -> tuple[WeakDirection, ...]:
     """What is not known; where drives have an offset each, of each drive's, named by the drive."""
     if not answer.by_drive:
-        return open_directions(answer.covariance, answer.by_standing, answer.cTl, limits, advice)
+        return open_directions(answer.covariance, answer.by_static, answer.cTl, limits, advice)
     found: list[WeakDirection] = []
     for number, known in enumerate(answer.by_drive):
-        for weak in open_directions(known.covariance, known.by_standing, answer.cTl, limits, advice):
+        for weak in open_directions(known.covariance, known.by_static, answer.cTl, limits, advice):
             if involves_offset(weak):
                 found.append(replace(weak, sentence=f"drive {known.drive!r}: {weak.sentence}"))
             elif number == 0:  # of the extrinsic alone, which all drives share
                 found.append(weak)
     return tuple(sorted(found, key=lambda weak: -weak.sigma))
+
+
 def sweeps_of(drives: Sequence[Drive]) -> dict[str, Any]:
     """What was decided of the sweeps, by name of the drive, as an entry of the diagnostics."""
     found = {drive.name: drive.sweep.to_dict() for drive in drives if drive.sweep is not None}

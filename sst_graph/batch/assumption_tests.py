@@ -185,9 +185,7 @@ class LinearProblem:
             self.state,
             cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
             offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
-            nuisances={
-                name: value for name, value in self.state.nuisances.items() if name not in self.values
-            }
+            nuisances={name: value for name, value in self.state.nuisances.items() if name not in self.values}
             | {finding.assumption.name: finding.value},
         )
 

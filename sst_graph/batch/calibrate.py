@@ -186,7 +186,7 @@ def answer_joint(
     contradictions = find_contradictions(parts, config.contradictions)
     # 5. How sure; where the labels tell everything, the motion is heard too.
     robust = robust_covariance(*_frozen(solution), objects)
-    covariance, by_standing = robust.matrix, static_covariance(robust, solution.pairs)
+    covariance, by_static = robust.matrix, static_covariance(robust, solution.pairs)
     labels = Labels(solution, covariance[:7, :7], contradictions.stretches)
     heard = _hear_motion(drives, tracks, labels, guess, config, progress)
     if heard.solution is not solution:
@@ -194,7 +194,7 @@ def answer_joint(
         robust = robust_covariance(*_frozen(solution), objects)
         covariance = heard.inflation * robust.matrix
         if config.use_motion == "always":
-            by_standing = static_covariance(robust, solution.pairs)
+            by_static = static_covariance(robust, solution.pairs)
     # 6. What is taken for granted: considered in the covariance, and tested.
     frozen = solution.pairs, solution.values, solution.state
     centre = prior_centre(solution.state, guess.cTl, guess.offset_s)
@@ -213,7 +213,7 @@ def answer_joint(
         sweeps.covariance,
         _frames_used(drives, solution),
         remarks=(*_remarks(drives), *heard.remarks),
-        by_standing=by_standing[:7, :7],
+        by_static=by_static[:7, :7],
         doubts=(
             *contradiction_of(findings),
             *_doubts(solution, finals, covariance, evidence, guess, config),
@@ -222,7 +222,7 @@ def answer_joint(
             *sweeps.doubts,
         ),
         drive_offsets=_drive_offsets(drives, solution, covariance),
-        by_drive=_by_drive(drives, solution, covariance, by_standing, config),
+        by_drive=_by_drive(drives, solution, covariance, by_static, config),
         diagnostics={
             **evidence,
             "start_score": contest.score,
@@ -395,14 +395,14 @@ def _by_drive(
     drives: Sequence[Drive],
     solution: JointSolution,
     covariance: FloatArray,
-    by_standing: FloatArray,
+    by_static: FloatArray,
     config: CalibrationConfig,
 ) -> tuple[DriveKnowledge, ...]:
     """What is known of the extrinsic and each drive's own offset, where drives have one each."""
     found = []
     for number in range(len(drives) if len(solution.state.offsets_s) > 1 else 0):
         own = [*range(6), 6 + number]
-        block, standing = covariance[np.ix_(own, own)], by_standing[np.ix_(own, own)]
+        block, standing = covariance[np.ix_(own, own)], by_static[np.ix_(own, own)]
         block = block + _beside_matches(solution, float(block[6, 6]), config)
         found.append(DriveKnowledge(drives[number].name, block, standing))
     return tuple(found)

@@ -149,9 +149,7 @@ def consider(
     return considered(steps, config)
 
 
-def steps_by(
-    names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int
-) -> dict[str, FloatArray]:
+def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int) -> dict[str, FloatArray]:
     """How the first ``size`` unknowns follow parameters that are held at 0: (size,) each, by name.
 
     Args:
@@ -187,9 +185,7 @@ def motion_covariance(
     return np.asarray(robust.bread - marginal_covariance(graph, values, robust.unknowns))
 
 
-def budget(
-    covariance: FloatArray, motion: FloatArray, considered: Considered
-) -> dict[str, list[float]]:
+def budget(covariance: FloatArray, motion: FloatArray, considered: Considered) -> dict[str, list[float]]:
     """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
 
     Args:

@@ -43,7 +43,7 @@ class ObjectSpread:
 
     @property
     def correction(self) -> float:
-        """G / (G - 1), the usual correction of a covariance by G clusters, within :data:`_LARGEST_CORRECTION`."""
+        """G / (G - 1), the usual correction of a covariance by G clusters, and bounded."""
         return min(self.number / max(self.number - 1.0, 1e-9), _LARGEST_CORRECTION)
 
     def disagreement(self, covariance: FloatArray) -> float:
@@ -75,8 +75,8 @@ def composed(
 
 
 def curvature_ratio(weight: float, curvature: float) -> float:
-    """Sum of robust weights over that of the loss's second derivatives: 1 for least squares, inf where the sum
-    of the latter is not positive."""
+    """Sum of robust weights over that of the loss's second derivatives: 1 for least squares, inf where the
+    second sum is not positive."""
     return weight / curvature if curvature > 0.0 else np.inf
 
 

@@ -89,7 +89,7 @@ def weak_directions(
 
 def open_directions(
     covariance: FloatArray,
-    by_standing: FloatArray | None,
+    by_static: FloatArray | None,
     cTl: gtsam.Pose3,
     config: ObservabilityConfig,
     advice: Advice = SILHOUETTES,
@@ -98,12 +98,12 @@ def open_directions(
 
     Args:
         covariance: (7, 7) of the answer.
-        by_standing: (7, 7) by objects that stand alone, where that is asked, too.
+        by_static: (7, 7) by objects that stand alone, where that is asked, too.
     """
     weak = weak_directions(covariance, cTl, config, advice)
-    if weak or by_standing is None:
+    if weak or by_static is None:
         return weak
-    return inseparable_directions(by_standing, cTl, config)
+    return inseparable_directions(by_static, cTl, config)
 
 
 def inseparable_directions(

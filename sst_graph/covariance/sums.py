@@ -1,7 +1,7 @@
 """The sums over matches that the cluster-robust covariance is made of: they grow, whoever fills them.
 
-With a match's whitened Jacobian row J, robust weight w and a = sqrt(w) J, an error e of its residual moves the
-gradient by its score, sqrt(w) a e. Under the error model (:mod:`sst_graph.covariance.error_model`) the
+With a match's whitened Jacobian row J, robust weight w and a = sqrt(w) J, an error e of its residual changes
+the gradient by its score, sqrt(w) a e. Under the error model (:mod:`sst_graph.covariance.error_model`) the
 gradient of all matches varies by
 
     M = match * sum a a' + side_frame * sum s_kf s_kf' + side * sum s_k s_k',
@@ -38,7 +38,8 @@ class ScoreSums:
     Attributes:
         independent: (n, n) variance of the score if every match errs by itself, A above.
         side_frames: (n, n) the same by a unit error of each side in each frame.
-        closed: (n, n) the same by a unit error, kept over all frames, of each side that no frame will see again.
+        closed: (n, n) the same by a unit error that a side keeps over all frames, of sides that are closed:
+            no frame will see them again.
         sides: (k,) numbers of the other sides, rising.
         scores: (k, n) sum of sqrt(w) a of each of them.
     """
@@ -56,9 +57,7 @@ class ScoreSums:
         return cls(nothing, nothing, nothing, np.zeros(0, np.intp), np.zeros((0, n)))
 
     @classmethod
-    def of(
-        cls, J: FloatArray | csr_array, roots: FloatArray, sides: IntArray, frames: IntArray
-    ) -> ScoreSums:
+    def of(cls, J: FloatArray | csr_array, roots: FloatArray, sides: IntArray, frames: IntArray) -> ScoreSums:
         """Of matches, from rows a (m, n), roots of the weights, sides and numbers of the frames (m,)."""
         first, which = by_side_and_frame(sides, frames)
         by_frame = _members(which, len(first), roots) @ J

@@ -62,7 +62,6 @@ def marginal_covariance(
     are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
     """
     own, groups = _information(graph, values, unknowns)
-    n = unknowns.size
     # Scaled to a unit diagonal, that of the motion too.
     diagonal = np.diag(own).copy()
     for group in groups:

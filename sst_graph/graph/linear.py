@@ -18,8 +18,8 @@ IntArray = NDArray[np.intp]
 _LEAST_DIAGONAL = 1e-300
 """Stands for a diagonal entry of 0: its square root can be divided by."""
 _RIDGE = 1e-14
-"""Added to a unit diagonal before it is factorized: above rounding, and so small that a sigma changes by more than
-one in a million only where it is ten thousand times that of the unknown by itself."""
+"""Added to a unit diagonal before it is factorized: above rounding, and so small that a sigma changes by more
+than one in a million only where it is ten thousand times that of the unknown by itself."""
 
 
 def unit_scale(matrix: FloatArray) -> FloatArray:

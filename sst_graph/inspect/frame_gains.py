@@ -68,9 +68,7 @@ class CovarianceSums:
         """These frames and one more; its scores are in its own columns."""
         information, every = self.information.copy(), np.arange(len(self.information))
         information[np.ix_(term.columns, term.columns)] += term.information
-        return CovarianceSums(
-            information, total(len(every), (self.scores, scores), (every, term.columns))
-        )
+        return CovarianceSums(information, total(len(every), (self.scores, scores), (every, term.columns)))
 
     def covariance(self, model: ErrorModel) -> FloatArray:
         """(n, n) cluster-robust covariance."""

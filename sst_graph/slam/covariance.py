@@ -177,14 +177,14 @@ def rows_of(matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> T
 
 
 def least_errors(config: RematchConfig) -> ErrorModel:
-    """What is known of the errors before any residual: variances of a side [px^2], and of a match over what its
-    factor gives it."""
+    """What is known of the errors before any residual: variances of a side [px^2], and of a match over what
+    its factor gives it."""
     return ErrorModel(config.side_sigma_px**2, 0.0, 1.0)
 
 
 def fit_errors(rows: Sequence[TermRows], config: RematchConfig) -> ErrorModel:
-    """Errors of sides [px^2] and matches (over what their factors give them) by the residuals, and at least as
-    large as is known beforehand."""
+    """Errors of sides [px^2] and matches (over what their factors give them) by the residuals, and at least
+    as large as is known beforehand."""
     joined, least = TermRows.joined(rows), least_errors(config)
     if not len(joined):
         return least

@@ -56,7 +56,11 @@ def tracker_result(
             "error_model": None
             if model is None
             else {"side": model.side, "side_frame": model.side_frame, "match": model.match},
-            **({} if tracker.config.drift.enabled else {KEY: to_document(tracker.arrivals.gained(drive))}),
+            **(
+                {}
+                if tracker.config.drift.enabled
+                else {KEY: to_document(tracker.information_log.gained(drive))}
+            ),
         },
     )
 

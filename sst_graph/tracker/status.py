@@ -25,14 +25,14 @@ class Known:
     Attributes:
         joint: cluster-robust covariance of all unknowns.
         inflation: how much larger it is than that of independent matches.
-        by_standing: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
+        by_static: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
             object moves.
         steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
     """
 
     joint: Joint
     inflation: float = 1.0
-    by_standing: FloatArray | None = None
+    by_static: FloatArray | None = None
     steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
@@ -54,13 +54,13 @@ class Known:
         m = smoother.past.point.core_size
         share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
         inflation = max(1.0, float(share))
-        by_standing = None
+        by_static = None
         alone = smoother.static_information()
         if alone is not None:
             wider = scaled_inverse(alone)[:7, :7] - naive[:7, :7]
-            by_standing = matrix[:7, :7] + inflation * wider
+            by_static = matrix[:7, :7] + inflation * wider
         steps = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
-        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_standing, steps)
+        return cls(Joint(matrix, smoother.past.point.tracks, m), inflation, by_static, steps)
 
     @property
     def covariance(self) -> FloatArray:

@@ -26,7 +26,7 @@ from sst_graph.tracker.storage.resume import FirstFrames, Setup
 from sst_graph.tracker.storage.snapshot import Snapshot
 from sst_graph.tracker.track_update import Sensor, TrackUpdate
 from sst_graph.tracker.update import Tracking
-from sst_graph.tracker.window.whole_window import settle_window
+from sst_graph.tracker.window.relinearization import relinearize_window
 from sst_graph.types import CameraImage, Frame, Scan
 from sst_graph.validation import LATEST_NS, checked_image, checked_scan
 
@@ -225,12 +225,12 @@ class Tracker(Tracking):
         smoother = self.smoother
         if smoother is None:
             return False
-        self.stop_settling()
-        self.window.judge_all()
-        self.matcher.look_below(smoother.point)
+        self.stop_relinearization()
+        self.window.test_all_objects()
+        self.matcher.check_lower_edges(smoother.point)
         alive = self.window.objects.live
         try:
-            rests = settle_window(
+            rests = relinearize_window(
                 smoother, self.matcher, narrowed(joint).kernel_px, most, joint.full_steps, alive, self._share
             )
             self.known = Known.of(smoother)
@@ -240,7 +240,7 @@ class Tracker(Tracking):
             return False
         self.entered.extend(set(smoother.entries) - set(self.entered))
         if at_last:
-            self.trial.look_last(self.watch, smoother, self.known, self.window.restless())
+            self.trial.look_last(self.watch, smoother, self.known, self.window.recently_moving())
         self.settled = True
         return rests
 

@@ -31,12 +31,12 @@ from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.start.steps import EXPECTED, Started, Starting
 from sst_graph.tracker.status import Known
 from sst_graph.tracker.track_update import TrackStatus, TrackUpdate
-from sst_graph.tracker.window.arrivals import Arrivals
 from sst_graph.tracker.window.gaussian import Point
+from sst_graph.tracker.window.information_log import InformationLog
 from sst_graph.tracker.window.matcher import WindowMatcher
+from sst_graph.tracker.window.relinearization import RelinearizationSchedule, WindowRelinearization
 from sst_graph.tracker.window.rematching import scans_to_match
 from sst_graph.tracker.window.smoother import WindowSmoother
-from sst_graph.tracker.window.whole_window import Milestones, Settling
 from sst_graph.tracker.window.window import Window
 from sst_graph.types import CameraImage, RelativeMotion, Scan
 
@@ -69,9 +69,9 @@ class Tracking:
         self.adoption = Adoption(self.config.adoption)
         self.history_store = History(self.config.drift.history)
         self.entered: deque[int] = deque(maxlen=4 * self.config.window)
-        self.milestones = Milestones(0, self.config.window, self.config.window)
-        self.settling: Settling | None = None
-        self.arrivals = Arrivals()
+        self.relinearization_schedule = RelinearizationSchedule(0, self.config.window, self.config.window)
+        self.relinearization: WindowRelinearization | None = None
+        self.information_log = InformationLog()
         self.trial = Trial(self.config)
         self.tests = AssumptionTests(calibration.assumptions)
         self.doubt = ""
@@ -198,7 +198,7 @@ class Tracking:
     def begin(self, started: Started, stamp_ns: int) -> TrackUpdate:
         """Go on from an estimate, if the frames that it is made of agree with it."""
         smoother, known, window = started.smoother, started.known, self.window
-        if why := self.trial.check(self.watch, smoother, known, window.restless()):
+        if why := self.trial.check(self.watch, smoother, known, window.recently_moving()):
             return self._refuse_start(stamp_ns, len(window.scans) // 2, why)
         self.known, self.smoother = known, smoother
         self.tests.look(smoother)
@@ -208,10 +208,10 @@ class Tracking:
         self.watch.begin()
         self.adoption.restart()
         soon = len(window.scans) + started.scans
-        self.milestones = Milestones(window.first_scan, soon, self.config.window)
+        self.relinearization_schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
-        self.arrivals.restart()
-        self.arrivals.take(window.next_scan - 1, self.reported())
+        self.information_log.restart()
+        self.information_log.add(window.next_scan - 1, self.reported())
         _LOG.info("tracker: started over %d scans", started.scans)
         return self.answer(stamp_ns)
 
@@ -230,16 +230,21 @@ class Tracking:
         before = smoother.point
         # 1. Matches at the present estimate: new scans, those about to leave, and some in turn.
         chosen = scans_to_match(
-            number, self.matcher, smoother, self.entered, self.covariance, self.config, self.settling
+            number, self.matcher, smoother, self.entered, self.covariance, self.config, self.relinearization
         )
         sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
         found, missing = self.matcher.match(before, chosen, None, self._share, sigma_s)
         waiting = [scan for scan in chosen if scan not in smoother.entries and scan not in self.entered]
         new = [scan for scan in waiting if scan in found]
         # 2. New frames, before they are used, against the estimate and against the calibration in use.
-        restless, matches = self.window.restless(), {scan: len(found[scan].pair) for scan in new}
-        chi2 = self.watch.take(sorted(waiting), matches, before, self.known.joint, smoother.model, restless)
-        changed, self.doubt = self.watch.verdict(before, smoother.model, restless)
+        recently_moving, matches = (
+            self.window.recently_moving(),
+            {scan: len(found[scan].pair) for scan in new},
+        )
+        chi2 = self.watch.take(
+            sorted(waiting), matches, before, self.known.joint, smoother.model, recently_moving
+        )
+        changed, self.doubt = self.watch.verdict(before, smoother.model, recently_moving)
         if changed is not None:
             since = self.watch.since
             if self.trial.over(number):
@@ -252,38 +257,42 @@ class Tracking:
         first = self.window.first_scan
         if new or not missing <= {number}:
             smoother.update(found, missing, first, self.window.objects.live)
-            self.window.judged_anew -= chosen
+            self.window.changed_scans -= chosen
         self.entered.extend(new)
-        self._begin_or_end_settling(number)
+        self._begin_or_end_relinearization(number)
         self.known = Known.of(smoother)
         if new:
-            self.arrivals.take(number, self.reported())
+            self.information_log.add(number, self.reported())
         # 4. Does a new start hold, and what is taken for granted?
-        self.trial.look_again(number, self.watch, smoother, self.known, restless)
+        self.trial.look_again(number, self.watch, smoother, self.known, recently_moving)
         self.tests.take(number, smoother)
         # 5. A candidate that shows itself is adopted.
         self.history_store.take(smoother)
         reason = "" if new else "no match: no scan met an image that shows the same objects"
         return self.answer(stamp_ns, reason, chi2=chi2, offer=bool(new) and not self.doubt)
 
-    def begin_settling(self) -> None:
+    def begin_relinearization(self) -> None:
         """Settle with the frames to come; no scan leaves the window meanwhile if none has yet."""
-        self.window.judge_all()
-        self.settling = Settling(self.matcher, self.config.settle_scans)
-        self.window.held = self.window.first_scan == self.milestones.first
+        self.window.test_all_objects()
+        self.relinearization = WindowRelinearization(self.matcher, self.config.settle_scans)
+        self.window.growing = self.window.first_scan == self.relinearization_schedule.first
 
-    def stop_settling(self) -> None:
+    def stop_relinearization(self) -> None:
         """Leave a settling, if there is one, as it is."""
-        self.settling, self.window.held = None, False
+        self.relinearization, self.window.growing = None, False
 
-    def _begin_or_end_settling(self, number: int) -> None:
+    def _begin_or_end_relinearization(self, number: int) -> None:
         """Begin to settle where it is time to."""
-        if self.settling is not None and self.settling.ended:
+        if self.relinearization is not None and self.relinearization.ended:
             # What came while it settled has been matched, too.
-            self.milestones.reached(number)
-            self.stop_settling()
-        elif self.settling is None and not self.config.drift.enabled and self.milestones.reached(number):
-            self.begin_settling()
+            self.relinearization_schedule.reached(number)
+            self.stop_relinearization()
+        elif (
+            self.relinearization is None
+            and not self.config.drift.enabled
+            and self.relinearization_schedule.reached(number)
+        ):
+            self.begin_relinearization()
 
     @property
     def _share(self) -> float:
@@ -324,7 +333,7 @@ class Tracking:
 
     def _begin_anew(self, guess: Guess, keep: int) -> None:
         """Give up the estimate and all scans but the last few."""
-        self.stop_settling()
+        self.stop_relinearization()
         self.smoother, self.doubt, self.known = None, "", Known.nothing()
         self.tests.restart()
         self.window.keep_scans(keep)
@@ -343,7 +352,7 @@ class Tracking:
         weak: tuple[WeakDirection, ...] = ()
         since, contradictions = self.watch.confirmation, contradiction_of(self.tests.findings)
         if self.smoother is not None:
-            weak = open_directions(covariance, self.known.by_standing, point.cTl, config.observability)
+            weak = open_directions(covariance, self.known.by_static, point.cTl, config.observability)
             late = self.trial.on or since.turn_s > alarm.confirm_s or since.offset_s > alarm.confirm_offset_s
             status = "unobservable" if weak else "unconfirmed" if late else "ok"
             status = "contradicted" if contradictions else status

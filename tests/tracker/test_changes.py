@@ -211,7 +211,7 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
         assert frame.image is not None
         image = frame.image
         if frame.index == STEP:
-            monkeypatch.setattr(tracker.window, "restless", lambda: set(tracker.window.objects.live))
+            monkeypatch.setattr(tracker.window, "recently_moving", lambda: set(tracker.window.objects.live))
         if frame.index >= STEP:
             image = knocked(image, street, 1.5)
         update = tracker.add(dataclasses.replace(frame, image=image))

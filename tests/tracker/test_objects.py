@@ -1,4 +1,7 @@
-"""Leaving out objects one by one: in the window, after it, and after the objects are gone; milestones."""
+"""Leaving out objects one by one: in the window, after it, and after the objects are gone.
+
+And when the window is relinearized.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ import numpy as np
 import pytest
 
 from sst_graph.covariance.jackknife import ObjectSpread, composed
-from sst_graph.tracker.sums.object_sums import ObjectBeliefs, ObjectSums
+from sst_graph.tracker.sums.object_sums import ObjectInformation, ObjectSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
-from sst_graph.tracker.window.whole_window import Milestones
+from sst_graph.tracker.window.relinearization import RelinearizationSchedule
 
 TRACKS = (4, 7, 9)
 N = 8 + len(TRACKS)
@@ -19,7 +22,7 @@ def _point() -> Point:
     return Point(gtsam.Pose3(), 0.05, np.array([0.4]), TRACKS, np.array([0.1, -0.3, 0.2]))
 
 
-def _frame(seed: int, at: Point) -> tuple[ObjectBeliefs, dict[int, tuple[np.ndarray, np.ndarray]]]:
+def _frame(seed: int, at: Point) -> tuple[ObjectInformation, dict[int, tuple[np.ndarray, np.ndarray]]]:
     """Twenty rows on each object; by track the full rows (20, N) and residuals."""
     rng, rows, residuals, track, parts = np.random.default_rng(seed), [], [], [], {}
     for k, name in enumerate(TRACKS):
@@ -32,7 +35,7 @@ def _frame(seed: int, at: Point) -> tuple[ObjectBeliefs, dict[int, tuple[np.ndar
         track += [name] * 20
     stacked = np.concatenate(rows), np.concatenate(residuals), np.array(track, dtype=np.intp)
     J, r, tracks = stacked
-    return ObjectBeliefs.of(J, r, np.ones(len(r)), tracks, at), parts
+    return ObjectInformation.of(J, r, np.ones(len(r)), tracks, at), parts
 
 
 def _whole(*frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
@@ -103,7 +106,7 @@ def test_one_object_cannot_be_left_out() -> None:
     """What the others would say without it is not known: the correction is the largest."""
     point = Point(gtsam.Pose3(), 0.0, np.zeros(1))
     J, r = np.eye(8), np.ones(8)
-    frame = ObjectBeliefs.of(J, r, np.ones(8), np.zeros(8, dtype=np.intp), point)
+    frame = ObjectInformation.of(J, r, np.ones(8), np.zeros(8, dtype=np.intp), point)
     spread = ObjectSums.empty(8).spread([frame], 0.5 * np.eye(8), point)
     assert not spread.jackknife.any() and spread.number == 1.0
     several = ObjectSpread(spread.jackknife, 5.0)
@@ -148,7 +151,7 @@ def test_the_number_of_objects_counts_those_gone() -> None:
     ("start", "window", "times"),
     [(12, 60, [24, 48, 60, 120, 240]), (30, 60, [60, 120, 240]), (70, 60, [140])],
 )
-def test_settling_gets_rarer(start: int, window: int, times: list[int]) -> None:
-    milestones = Milestones(100, 2 * start, window)
-    reached = [seen for seen in range(start, 260) if milestones.reached(99 + seen)]
+def test_relinearization_gets_rarer(start: int, window: int, times: list[int]) -> None:
+    schedule = RelinearizationSchedule(100, 2 * start, window)
+    reached = [seen for seen in range(start, 260) if schedule.reached(99 + seen)]
     assert reached == times

@@ -28,9 +28,9 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     tracker = tracker_from_truth(street, config)
     frames = list(street)
     for k, frame in enumerate(frames):
-        settled = tracker.settling is not None
+        settled = tracker.relinearization is not None
         tracker.add(frame)
-        if settled and tracker.settling is not None:
+        if settled and tracker.relinearization is not None:
             path = tmp_path_factory.mktemp("tracker") / "settling.npz"
             save_checkpoint(tracker, path)
             return path, frames[k + 1 :]
@@ -39,10 +39,10 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
 
 def test_a_checkpoint_keeps_the_settling(begun: tuple[Path, list[Frame]]) -> None:
     tracker = load_checkpoint(begun[0])
-    assert tracker.settling is not None and tracker.window.held
+    assert tracker.relinearization is not None and tracker.window.growing
     # With one frame, edges towards the ground have been looked at; the newest scan is matched as it comes.
-    assert len(tracker.settling.done) == (tracker.config.settle_scans + 1) // 2 + 1
-    assert tracker.settling.below is not None and tracker.settling.below.narrow
+    assert len(tracker.relinearization.done) == (tracker.config.settle_scans + 1) // 2 + 1
+    assert tracker.relinearization.below is not None and tracker.relinearization.below.narrow
 
 
 def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, list[Frame]]) -> None:
@@ -53,9 +53,9 @@ def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, 
         # Nothing leaves before it is settled, though the window is full.
         assert tracker.window.first_scan == oldest
         sizes.append(len(tracker.window.scans))
-        if tracker.settling is None:
+        if tracker.relinearization is None:
             break
-    assert tracker.settling is None and sizes[-1] > tracker.config.window
+    assert tracker.relinearization is None and sizes[-1] > tracker.config.window
     assert tracker.smoother is not None
     assert set(tracker.smoother.entries) == {number for number, _ in tracker.window.scans}
     # What was held leaves two at a time.
@@ -68,12 +68,12 @@ def test_a_running_tracker_settles_with_the_frames_that_come(begun: tuple[Path, 
 
 def test_a_settling_that_was_begun_again_ends_alike(begun: tuple[Path, list[Frame]]) -> None:
     once, again, coming = load_checkpoint(begun[0]), load_checkpoint(begun[0]), begun[1]
-    again.stop_settling()
-    assert not again.window.held and again.add(coming[0]).accepted
-    again.begin_settling()
+    again.stop_relinearization()
+    assert not again.window.growing and again.add(coming[0]).accepted
+    again.begin_relinearization()
     once.add(coming[0])
     for frame in coming[1:]:
         once.add(frame)
         again.add(frame)
-    assert once.settling is None and again.settling is None
+    assert once.relinearization is None and again.relinearization is None
     assert sigmas_apart(once, again.point.cTl, again.point.offset_s) < 0.5

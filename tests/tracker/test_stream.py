@@ -20,7 +20,7 @@ from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.storage.checkpoint import load_checkpoint, save_checkpoint
-from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.types import Frame
 
 
@@ -166,7 +166,7 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
     pair = dataclasses.replace(entry.pair, l_twist=broken)
     before, entries = smoother.point, dict(smoother.entries)
     with pytest.raises(EstimationError, match="covariance"):
-        smoother.update({scan: Found(pair, entry.score, 0, entry.image)}, set(), 0)
+        smoother.update({scan: MatchedPair(pair, entry.linear, 0, entry.image)}, set(), 0)
     assert smoother.point is before and smoother.entries == entries
     assert tracker.add(frames[20]).accepted
 

@@ -69,27 +69,27 @@ def test_what_only_moving_objects_tell_is_not_called_known(
     """Every object of one side passes for one that moves: the standing ones alone know less, and decide."""
     tracker, _ = told(street, frames[:20], None)
     assert tracker.smoother is not None
-    assert tracker.smoother.information_of_standing() is None and tracker.known.by_standing is None
+    assert tracker.smoother.static_information() is None and tracker.known.by_static is None
     # 1. One object's matches are taken for those of a moving one.
     smoother = tracker.smoother
     for scan, entry in smoother.entries.items():
-        seen = sorted(entry.score.places)
-        part = entry.score.belief.without(seen[:1])[0] if seen else entry.score.belief
+        seen = sorted(entry.linear.places)
+        part = entry.linear.information.without(seen[:1])[0] if seen else entry.linear.information
         half = dataclasses.replace(part, information=0.5 * part.information)
-        score = dataclasses.replace(entry.score, standing=half)
-        smoother.entries[scan] = dataclasses.replace(entry, score=score)
-    alone, whole = smoother.information_of_standing(), Known.of(smoother)
-    assert alone is not None and whole.by_standing is not None
-    assert np.linalg.eigvalsh(whole.by_standing - whole.covariance[:7, :7])[0] > -1e-9
-    assert (np.diag(whole.by_standing) > 1.2 * np.diag(whole.covariance)[:7]).any()
+        linear = dataclasses.replace(entry.linear, static=half)
+        smoother.entries[scan] = dataclasses.replace(entry, linear=linear)
+    alone, whole = smoother.static_information(), Known.of(smoother)
+    assert alone is not None and whole.by_static is not None
+    assert np.linalg.eigvalsh(whole.by_static - whole.covariance[:7, :7])[0] > -1e-9
+    assert (np.diag(whole.by_static) > 1.2 * np.diag(whole.covariance)[:7]).any()
     # 2. What they cannot separate is not called known, though the whole covariance is small.
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     joint = dataclasses.replace(whole.joint, matrix=whole.joint.matrix.copy())
     joint.matrix[:7, :], joint.matrix[:, :7] = 0.0, 0.0
     joint.matrix[:7, :7] = good
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
-    for by_standing, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
-        monkeypatch.setattr(tracker, "known", Known(joint, 1.0, by_standing))
+    for by_static, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
+        monkeypatch.setattr(tracker, "known", Known(joint, 1.0, by_static))
         update = tracker.current()
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)

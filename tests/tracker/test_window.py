@@ -73,7 +73,7 @@ def test_objects_are_judged_as_the_batch_judges_them() -> None:
     tracks = object_tracks(drive)
     speeds = moving_objects(drive, tracks)
     window = _window(drive, 40)
-    window.judge_all()
+    window.test_all_objects()
     found, moving = window.objects_of(range(30))
     assert found == tracks
     assert {number for _, _, number in speeds} == {1, 2, 3, 4}
@@ -83,15 +83,15 @@ def test_objects_are_judged_as_the_batch_judges_them() -> None:
         assert moving[name].unknown_mps == pytest.approx(mover.unknown_mps)
 
 
-def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
+def test_an_object_that_starts_to_move_changes_past_scans() -> None:
     drive = _drive(30)
     window = Window(CAMERA, 40)
     noticed, later = None, set[int]()
     for k, scan in enumerate(drive.scans):
-        window.judged_anew.clear()
+        window.changed_scans.clear()
         window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
         if noticed is not None:
-            later |= window.judged_anew
+            later |= window.changed_scans
         elif (VEHICLE, 2) in window.moving.get(k, {}):
             noticed = k
     assert noticed is not None and 10 < noticed < 18
@@ -101,22 +101,22 @@ def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
 
 
 def test_an_object_that_moved_lately_is_restless() -> None:
-    """Number 3 stops at 1.2 s: it may pass for one that stands, and is restless for a while."""
+    """Number 3 stops at 1.2 s: it may pass for one that stands, and is recently_moving for a while."""
     drive = _drive(40)
-    window, restless = Window(CAMERA, 50), {}
+    window, recently_moving = Window(CAMERA, 50), {}
     for k, scan in enumerate(drive.scans):
         window.add_scan(scan, drive.lidar_motions[k - 1] if k else None)
         names = {track: number for (_, number), track in window.tracks[k].items()}
-        restless[k] = {names[track] for track in window.restless() if track in names}
-        assert {n for _, n in window.moving.get(k, {})} <= restless[k]
-    assert 3 not in {n for _, n in window.moving.get(20, {})} and 3 in restless[20]
-    assert 3 not in restless[39] and {1, 2} <= restless[39]
-    assert all(0 not in names for names in restless.values())
+        recently_moving[k] = {names[track] for track in window.recently_moving() if track in names}
+        assert {n for _, n in window.moving.get(k, {})} <= recently_moving[k]
+    assert 3 not in {n for _, n in window.moving.get(20, {})} and 3 in recently_moving[20]
+    assert 3 not in recently_moving[39] and {1, 2} <= recently_moving[39]
+    assert all(0 not in names for names in recently_moving.values())
     # One whose velocity is known at its newest sighting may be asked.
     (one,) = [track for (_, number), track in window.tracks[39].items() if number == 1]
-    assert one in window.restless()
+    assert one in window.recently_moving()
     window.velocities.found[one] = {39: ObjectVelocity(np.array([6.0, 0.0, 0.0]), 0.2)}
-    assert one not in window.restless()
+    assert one not in window.recently_moving()
 
 
 def test_nothing_grows_with_the_drive() -> None:
@@ -125,7 +125,7 @@ def test_nothing_grows_with_the_drive() -> None:
         first = window.first_scan
         assert len(window.scans) == 10
         assert min([*window.tracks, *window.moving]) >= first
-        kept = [s for seen in window.sightings.values() for s in seen]
+        kept = [s for seen in window.detections.values() for s in seen]
         assert window.last_stamp_ns is not None
         assert min(s.stamp_ns for s in kept) >= window.last_stamp_ns - 1_600_000_000
     assert len(long.objects.live) == len(short.objects.live) == 4

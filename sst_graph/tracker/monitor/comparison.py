@@ -79,7 +79,7 @@ class Watch:
         point: Point,
         joint: Joint,
         model: ErrorModel,
-        restless: Collection[int],
+        recently_moving: Collection[int],
     ) -> float | None:
         """The statistic of the latest frames with some new ones; None while it can't be told.
 
@@ -88,7 +88,7 @@ class Watch:
                 compared before are compared.
             matches: how many matches scans have under the narrow kernel.
             point, joint: the estimate, which has not heard them, and its covariance.
-            restless: tracks of objects that moved lately; they are not asked.
+            recently_moving: tracks of objects that moved lately; they are not asked.
         """
         if not self.config.enabled:
             return None
@@ -98,7 +98,7 @@ class Watch:
         if not new:
             return None
         # 1. Scans that have an image: does what ought to be in view meet its labels?
-        views = self.matcher.in_view(point, new, restless)
+        views = self.matcher.in_view(point, new, recently_moving)
         for scan, counts in views.items():
             large = frozenset(track for track, count in counts.items() if count >= _LEAST_IN_VIEW)
             if large:
@@ -110,11 +110,11 @@ class Watch:
         self.scans.extend(views)
         self._latest.append(Before(point, joint, min(views)))
         against = self.kept or self._latest[-1]
-        scores = self.matcher.scores(against.point, list(views), self._kernel, restless)
+        scores = self.matcher.linearized_at(against.point, list(views), self._kernel, recently_moving)
         value = self.alarm.check(scores, against.joint, model)
         # 3. Keep an estimate, or let it go.
         if self.alarm.raised > self.config.patience:
-            self.confirmation.suspects |= self.matcher.objects_of(self.scans) - set(restless)
+            self.confirmation.suspects |= self.matcher.objects_of(self.scans) - set(recently_moving)
             self.restart()
         elif not self.alarm.raised:
             self.kept = None
@@ -122,7 +122,7 @@ class Watch:
             self.kept = self._latest[0]
         # 4. What do they confirm?
         if value is not None and not self.alarm.raised and not self.far:
-            self._confirm(point, joint, model, restless)
+            self._confirm(point, joint, model, recently_moving)
         return value
 
     def disagreement(
@@ -131,7 +131,7 @@ class Watch:
         point: Point,
         joint: Joint,
         model: ErrorModel,
-        restless: Collection[int],
+        recently_moving: Collection[int],
     ) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
@@ -142,7 +142,9 @@ class Watch:
             scans: in the order of time.
         """
         pairs = self.matcher.pairs_at(point, scans, self._kernel)
-        scores = [self.matcher.scores_of({scan: pairs[scan]}, point, restless) for scan in sorted(pairs)]
+        scores = [
+            self.matcher.linearized({scan: pairs[scan]}, point, recently_moving) for scan in sorted(pairs)
+        ]
         n, few = len(scores), self.config.frames
         cuts = range(2, n - 1)
         parts = {
@@ -154,12 +156,14 @@ class Watch:
         values = [self.alarm.value(self.alarm.compare(some, joint, model)) for some in found if some]
         return max(values, default=0.0)
 
-    def _confirm(self, point: Point, joint: Joint, model: ErrorModel, restless: Collection[int]) -> None:
+    def _confirm(
+        self, point: Point, joint: Joint, model: ErrorModel, recently_moving: Collection[int]
+    ) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
         config, compared = self.config, self.alarm.compared
         if suspects := self.confirmation.suspects:
             latest = list(self.scans)[-config.frames :]
-            scores = self.matcher.scores(point, latest, self._kernel, {*suspects, *restless})
+            scores = self.matcher.linearized_at(point, latest, self._kernel, {*suspects, *recently_moving})
             compared = self.alarm.compare(scores, joint, model) if scores else None
             if compared is not None and self.alarm.value(compared) > config.chi2:
                 return
@@ -188,7 +192,9 @@ class Watch:
         """How many of the latest frames are surely from after a change."""
         return self.config.lost if self.lost else self.alarm.raised
 
-    def verdict(self, point: Point, model: ErrorModel, restless: Collection[int]) -> tuple[Point | None, str]:
+    def verdict(
+        self, point: Point, model: ErrorModel, recently_moving: Collection[int]
+    ) -> tuple[Point | None, str]:
         """Near which estimate to begin again, where the calibration has changed; else what is doubtful.
 
         Args:
@@ -197,7 +203,7 @@ class Watch:
         if self.lost:
             return point, ""
         if self.alarm.alarm:
-            before = self._contradicted(model, restless)
+            before = self._contradicted(model, recently_moving)
             if before is not None:
                 return before.point, ""
             return None, "a single object says that the calibration has changed: a step, or its labels"
@@ -209,7 +215,7 @@ class Watch:
         earlier = [before for before in known if before.scan <= scan]
         return earlier[-1].point if earlier else known[0].point if known else None
 
-    def _contradicted(self, model: ErrorModel, restless: Collection[int]) -> Before | None:
+    def _contradicted(self, model: ErrorModel, recently_moving: Collection[int]) -> Before | None:
         """The estimate from before a doubt, if all frames since say that the calibration has changed.
 
         They must do so with any one object left out, too. Where a single object says so, its labels may
@@ -223,7 +229,7 @@ class Watch:
         pairs = self.matcher.pairs_at(kept.point, scans, self._kernel)
 
         def value(*without: int) -> float:
-            scores = self.matcher.scores_of(pairs, kept.point, {*without, *restless})
+            scores = self.matcher.linearized(pairs, kept.point, {*without, *recently_moving})
             return self.alarm.value(self.alarm.compare(scores, kept.joint, model))
 
         # A step shows more clearly with every frame; labels whose errors last do not.
@@ -232,5 +238,5 @@ class Watch:
         if more >= 1.0 and whole > config.alone * threshold:
             return kept
         least = max(threshold, config.others * whole)
-        asked = self.matcher.objects_of(scans) - set(restless)
+        asked = self.matcher.objects_of(scans) - set(recently_moving)
         return kept if whole > least and all(value(track) > least for track in asked) else None

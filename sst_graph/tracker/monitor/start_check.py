@@ -37,11 +37,13 @@ class Trial:
         """Whether a contradiction is a change of the calibration from this scan on, not a bad start."""
         return scan - self.first >= self.alarm.warm_up or self.refused >= _MOST_REFUSED
 
-    def check(self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]) -> str:
+    def check(
+        self, watch: Watch, smoother: WindowSmoother, known: Known, recently_moving: Collection[int]
+    ) -> str:
         """In what way frames contradict the estimate that was made of them; empty where they do not."""
         if not self.alarm.enabled or self.refused >= _MOST_REFUSED:
             return ""
-        value = self._contradiction(watch, smoother, known, restless)
+        value = self._contradiction(watch, smoother, known, recently_moving)
         if not value:
             return ""
         return f"frames of the start contradict each other (chi-square {value:.0f}): it begins anew"
@@ -51,16 +53,21 @@ class Trial:
         watch: Watch,
         smoother: WindowSmoother,
         known: Known,
-        restless: Collection[int],
+        recently_moving: Collection[int],
         limit: float | None = None,
     ) -> float:
         """The statistic of the frames in the graph, where it is past the limit (a start's own); else 0."""
         scans = sorted(smoother.entries)
-        value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, restless)
+        value = watch.disagreement(scans, smoother.point, known.joint, smoother.model, recently_moving)
         return value if value > (self.alarm.start_chi2 if limit is None else limit) else 0.0
 
     def look_again(
-        self, scan: int, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+        self,
+        scan: int,
+        watch: Watch,
+        smoother: WindowSmoother,
+        known: Known,
+        recently_moving: Collection[int],
     ) -> None:
         """The same when half as many frames again have come, and then each time after twice as many.
 
@@ -69,24 +76,24 @@ class Trial:
         """
         if self.on and scan - self.first >= self.after:
             self.after *= 2
-            self._look(watch, smoother, known, restless)
+            self._look(watch, smoother, known, recently_moving)
 
     def look_last(
-        self, watch: Watch, smoother: WindowSmoother, known: Known, restless: Collection[int]
+        self, watch: Watch, smoother: WindowSmoother, known: Known, recently_moving: Collection[int]
     ) -> None:
         """At the end of a drive, the same of all frames in the graph for a start that no frame came after.
 
         They are more, in more parts, than a start is made of: they contradict it as new frames would.
         """
-        self._look(watch, smoother, known, restless, self.alarm.chi2)
+        self._look(watch, smoother, known, recently_moving, self.alarm.chi2)
 
     def _look(
         self,
         watch: Watch,
         smoother: WindowSmoother,
         known: Known,
-        restless: Collection[int],
+        recently_moving: Collection[int],
         limit: float | None = None,
     ) -> None:
-        if self.on and not self._contradiction(watch, smoother, known, restless, limit):
+        if self.on and not self._contradiction(watch, smoother, known, recently_moving, limit):
             self.refused, self.on = 0, False

@@ -17,7 +17,7 @@ from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.start.solution import Guess, estimating_first, prior_belief
 from sst_graph.tracker.status import Known
-from sst_graph.tracker.window.epochs import Found
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -121,7 +121,7 @@ class Entering:
     def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
         self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
         self.below = None if config.calibration.undersides.use == "never" else UndersideSupport()
-        self.found: dict[int, Found] = {}
+        self.found: dict[int, MatchedPair] = {}
 
     def advance(self, matcher: WindowMatcher, work: int | None) -> bool:
         """Some of it (None: all of this pass); whether all scans have been matched."""
@@ -132,9 +132,9 @@ class Entering:
         if below is None:
             self.found |= matcher.match(self.point, some)[0]
         else:
-            self.below = below.plus(matcher.support_below(self.point, some))
+            self.below = below.plus(matcher.lower_edge_support(self.point, some))
         if self.below is not None and not self.waiting:
-            matcher.match_below(self.below)
+            matcher.set_lower_edges(self.below)
             self.below, self.waiting = None, self.chosen
         return not self.waiting
 

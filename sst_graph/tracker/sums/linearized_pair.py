@@ -28,8 +28,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _LEAST_CURVATURE = 0.2
-"""Least mean curvature, over the mean weight, in the observed information: it stays positive where most matches
-lie beyond the inflection of the robust loss."""
+"""Least mean curvature, over the mean weight, in the observed information: it stays positive where most
+matches lie beyond the inflection of the robust loss."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class LinearizedPair:
         information: Gaussian on [extrinsic, offset, biases, parameters, and the biases of the objects it
             sees]; behind these it may hold parameters of assumptions.
         observed: the same with the robust loss's second derivatives in place of the weights (observed
-            information): how the gradient of matches that cannot be made anew follows an estimate that moves on.
+            information): how the gradient of matches that are kept follows an estimate that moves on.
         scores: sums of the matches' scores, in the columns of the Gaussian, what it holds included.
         residuals: of the matches, by side.
         matches: number of matches.

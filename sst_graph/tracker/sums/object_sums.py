@@ -21,8 +21,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectInformation:
-    """The matches of each object of a frame by themselves, on extrinsic, offset, mask biases, parameters and the
-    object's own bias if it has one.
+    """The matches of each object of a frame by themselves, on extrinsic, offset, mask biases, parameters and
+    the object's own bias if it has one.
 
     Attributes:
         point: where the frame is linearized.
@@ -74,7 +74,9 @@ class ObjectInformation:
         """One object."""
         gaussian, biases = own.gaussian, own.gaussian.point.object_biases_px
         weights = np.array([own.weight])
-        return cls(gaussian.point, (track,), gaussian.information[None], gaussian.vector[None], biases, weights)
+        return cls(
+            gaussian.point, (track,), gaussian.information[None], gaussian.vector[None], biases, weights
+        )
 
 
 @dataclass(frozen=True)
@@ -173,7 +175,9 @@ def _weights_by_track(parts: Sequence[ObjectInformation]) -> FloatArray:
     return np.asarray(np.bincount(np.unique(tracks, return_inverse=True)[1].reshape(-1), weights))
 
 
-def _summed(parts: Sequence[ObjectInformation], point: Point) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+def _summed(
+    parts: Sequence[ObjectInformation], point: Point
+) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
     """(k) tracks, (k, m, m) informations and (k, m) vectors about a point, summed object by object."""
     counts = [len(part.tracks) for part in parts]
     information = np.concatenate([part.information for part in parts])
@@ -197,5 +201,7 @@ def _steps_without(
 ) -> FloatArray:
     """(k, n) how far the linearized estimate moves without each of the objects."""
     core, m = point.core_size, informations.shape[1]
-    columns = np.array([[*range(core), *([core + point.tracks.index(t)] if m > core else [])] for t in tracks])
+    columns = np.array(
+        [[*range(core), *([core + point.tracks.index(t)] if m > core else [])] for t in tracks]
+    )
     return steps_without(informations, -vectors, columns, naive)

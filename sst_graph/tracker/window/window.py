@@ -30,20 +30,20 @@ from sst_graph.types import RelativeMotion, SemanticClass
 FloatArray = NDArray[np.float64]
 
 _SPEED_CHANGE = 0.2
-"""Speeds of an object that differ by more than this fraction are a new judgement."""
+"""Speeds of an object that differ by more than this fraction make its scans be matched again."""
 
-_RESTLESS_MPS = 0.6
-"""Objects that pass for slower than this have not moved: half of their points are where they were."""
+_RECENTLY_MOVING_MPS = 0.6
+"""Objects with an estimated speed below this have not moved: half of their points are where they were."""
 
 OBJECT_MEMORY = 50
 """Scans after which an object that was not seen again is another one."""
 MOVING = MovingConfig()
-"""What counts as an object that moves by itself, as in the batch."""
+"""What counts as a dynamic object, as in the batch."""
 _REACH_NS = round(MOVING.window_s * 1e9)
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Detection:
     """An object in a scan.
 
     Attributes:
@@ -65,14 +65,13 @@ class Window:
     Attributes:
         size: most scans, but while nothing may leave.
         sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
-        held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
+        growing: no scan leaves; afterwards two leave with each that comes, until ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
-        sightings: the latest ones of each track, in the order of time.
-        moving: speed of the objects of a scan whose sightings say that they move by themselves, by the scan's
-            number [m/s].
-        persistence: which objects stay where they are, whatever their sightings say.
-        velocities: of those that do not.
-        judged_anew: scans in which an object has turned out to move, or to stand, since they were matched.
+        detections: the latest ones of each track, in the order of time.
+        moving: speed of the objects that are dynamic by their detections, by the scan's number [m/s].
+        persistence: which objects are static, whatever their detections are.
+        velocities: of those that are dynamic.
+        changed_scans: scans in which an object has become dynamic, or static, since they were matched.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
         origin_ns: stamp of the first image, from which a clock's skew counts; None before there is one.
     """
@@ -88,18 +87,18 @@ class Window:
 
     def restart(self) -> None:
         """Forget all scans, images and motions; numbers go on."""
-        self.held = False
+        self.growing = False
         self.origin_ns: int | None = None
         self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
         self.images: list[ImageFeatures] = []
         self.motions: deque[RelativeMotion] = deque()
         self.tracks: dict[int, dict[ObjectName, int]] = {}
-        self.sightings: dict[int, list[Sighting]] = {}
+        self.detections: dict[int, list[Detection]] = {}
         self.moving: dict[int, dict[ObjectName, float]] = {}
         self.persistence = Persistence()
         self.velocities = Velocities()
-        self.judged_anew: set[int] = set()
+        self.changed_scans: set[int] = set()
         self.wTl = gtsam.Pose3()
 
     @property
@@ -129,8 +128,8 @@ class Window:
 
     def leaving(self) -> list[int]:
         """The scans that leave when the next one comes, oldest first."""
-        surplus = 0 if self.held else min(2, len(self.scans) + 1 - self.size)
-        return [self.scans[i][0] for i in range(surplus)]
+        count = 0 if self.growing else min(2, len(self.scans) + 1 - self.size)
+        return [self.scans[i][0] for i in range(count)]
 
     def add_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
         """Keep a scan and the motion that led to it; its number."""
@@ -149,15 +148,15 @@ class Window:
         self.scans.append((number, lean))
         self._thin_out()
         self.tracks[number] = self.objects.add(features.boundaries, self.wTl)
-        self._judge(number, features.stamp_ns)
+        self._test_objects(number, features.stamp_ns)
         self.persistence.forget(self.first_scan)
-        self.judged_anew |= self.persistence.add(number, lean, self.wTl)
+        self.changed_scans |= self.persistence.add(number, lean, self.wTl)
         self.velocities.forget(self.first_scan)
-        self.judged_anew |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
+        self.changed_scans |= self.velocities.add(number, lean, self.tracks[number], self.wTl)
         for by_scan in (self.tracks, self.moving):
             for old in [k for k in by_scan if k < self.first_scan]:
                 del by_scan[old]
-        self.judged_anew = {k for k in self.judged_anew if k >= self.first_scan}
+        self.changed_scans = {k for k in self.changed_scans if k >= self.first_scan}
         return number
 
     def _thin_out(self) -> None:
@@ -173,62 +172,62 @@ class Window:
             )
             self.scans[-1 - self.sampled] = (number, thin)
 
-    def _judge(self, number: int, stamp_ns: int) -> None:
-        """Which objects of the latest scans move: as the batch judges, from the sightings so far."""
+    def _test_objects(self, number: int, stamp_ns: int) -> None:
+        """Which objects of the latest scans are dynamic: the batch's test, from the detections so far."""
         for name, track in self.tracks[number].items():
             centre = self.objects.live[track][1][:2]
-            self.sightings.setdefault(track, []).append(Sighting(number, name, stamp_ns, centre))
-        for track, seen in list(self.sightings.items()):
-            seen = [sighting for sighting in seen if stamp_ns - sighting.stamp_ns <= 2 * _REACH_NS]
-            self.sightings[track] = seen
+            self.detections.setdefault(track, []).append(Detection(number, name, stamp_ns, centre))
+        for track, seen in list(self.detections.items()):
+            seen = [detection for detection in seen if stamp_ns - detection.stamp_ns <= 2 * _REACH_NS]
+            self.detections[track] = seen
             if not seen:
-                del self.sightings[track]
+                del self.detections[track]
             elif seen[-1].scan >= number - 1:
-                self._judge_track(seen, stamp_ns - _REACH_NS, whole=seen[-1].scan < number)
+                self._test_track(seen, stamp_ns - _REACH_NS, whole=seen[-1].scan < number)
 
-    def judge_all(self) -> None:
-        """Judge all latest sightings by what is around them, as at the end of a drive."""
+    def test_all_objects(self) -> None:
+        """Test all latest detections by those around them, as at the end of a drive."""
         self.velocities.judge_all()
-        for seen in self.sightings.values():
-            self._judge_track(seen, self.scans[-1][1].stamp_ns - _REACH_NS, whole=True)
+        for seen in self.detections.values():
+            self._test_track(seen, self.scans[-1][1].stamp_ns - _REACH_NS, whole=True)
 
-    def _judge_track(self, seen: Sequence[Sighting], since_ns: int, whole: bool) -> None:
-        """Speeds of one object in its sightings since a stamp, each from those around it.
+    def _test_track(self, seen: Sequence[Detection], since_ns: int, whole: bool) -> None:
+        """Speeds of one object in its detections since a stamp, each from those around it.
 
-        A sighting is judged when it is new, when all that is around it has been seen, and when the newest
-        one is judged otherwise than the one before; with ``whole``, now.
+        A detection is tested when it is new, when all those around it are there, and when the newest one is
+        found dynamic and the one before static or the other way; with ``whole``, now.
         """
-        recent = [i for i, sighting in enumerate(seen) if sighting.stamp_ns >= since_ns]
+        recent = [i for i, detection in enumerate(seen) if detection.stamp_ns >= since_ns]
         if not recent:
             return
-        centres = np.stack([sighting.centre for sighting in seen])
-        stamps = np.array([sighting.stamp_ns for sighting in seen], dtype=np.int64)
+        centres = np.stack([detection.centre for detection in seen])
+        stamps = np.array([detection.stamp_ns for detection in seen], dtype=np.int64)
         # A line fitted to n places rises by less than 1.5 times their spread.
         never = 1.5 * float(np.linalg.norm(np.ptp(centres, axis=0))) < MOVING.min_travel_m
         before = self._speed(seen[recent[-2]]) if len(recent) > 1 else 0.0
         for i in (recent[-1], recent[0], *recent[1:-1]):
             near = np.abs(stamps - stamps[i]) <= _REACH_NS
             times = np.asarray((stamps[near] - stamps[i]) * 1e-9, np.float64)
-            self._decide(seen[i], 0.0 if never else speed_of(times, centres[near], MOVING))
+            self._set_speed(seen[i], 0.0 if never else speed_of(times, centres[near], MOVING))
             if not whole and i == recent[0] and (before > 0.0) == (self._speed(seen[-1]) > 0.0):
                 break
 
-    def _speed(self, sighting: Sighting) -> float:
-        return self.moving.get(sighting.scan, {}).get(sighting.name, 0.0)
+    def _speed(self, detection: Detection) -> float:
+        return self.moving.get(detection.scan, {}).get(detection.name, 0.0)
 
-    def _decide(self, sighting: Sighting, speed: float) -> None:
-        before = self._speed(sighting)
-        speeds = self.moving.setdefault(sighting.scan, {})
-        speeds.pop(sighting.name, None)
+    def _set_speed(self, detection: Detection, speed: float) -> None:
+        before = self._speed(detection)
+        speeds = self.moving.setdefault(detection.scan, {})
+        speeds.pop(detection.name, None)
         if speed > 0.0:
-            speeds[sighting.name] = speed
+            speeds[detection.name] = speed
         if abs(speed - before) > _SPEED_CHANGE * max(speed, before):
-            self.judged_anew.add(sighting.scan)
+            self.changed_scans.add(detection.scan)
 
     def left_out(
         self, number: int, tau_s: float, reach_m: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
-        """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
+        """The dynamic objects of a scan, with the tenths of their weight that they lose in an interval."""
         lost = [
             (c, name, round(10.0 * (1.0 - standing_share(mover.unknown_mps, tau_s, reach_m))))
             for (c, name), mover in self.movers(number).items()
@@ -236,33 +235,35 @@ class Window:
         return frozenset(entry for entry in lost if entry[2] > 0)
 
     def speeds(self, number: int) -> dict[ObjectName, float]:
-        """Speed of the objects of a scan that move by themselves [m/s]."""
+        """Speed of the dynamic objects of a scan [m/s]."""
         others = higher_speeds(self.persistence.speeds(number), self.velocities.speeds(number))
         return higher_speeds(self.moving.get(number, {}), others)
 
     def movers(self, number: int) -> dict[ObjectName, Mover]:
-        """The objects of a scan that move by themselves."""
+        """The dynamic objects of a scan."""
         return {
             name: Mover(speed, self.velocities.of(number, name))
             for name, speed in self.speeds(number).items()
         }
 
-    def restless(self) -> set[int]:
-        """Tracks of the objects that were judged to move in any of their latest sightings, how is not known.
+    def recently_moving(self) -> set[int]:
+        """Tracks of the objects that were dynamic in any of their latest detections, at an unknown velocity.
 
-        While an object starts or stops, no line fits its places, and it may pass for one that stands.
+        While an object starts or stops, no line fits its positions, and the test may find it static.
         """
-        numbers = {sighting.scan for seen in self.sightings.values() for sighting in seen}
+        numbers = {detection.scan for seen in self.detections.values() for detection in seen}
         speeds = {number: self.speeds(number) for number in numbers}
         return {
             track
-            for track, seen in self.sightings.items()
-            if any(speeds[sighting.scan].get(sighting.name, 0.0) > _RESTLESS_MPS for sighting in seen)
+            for track, seen in self.detections.items()
+            if any(
+                speeds[detection.scan].get(detection.name, 0.0) > _RECENTLY_MOVING_MPS for detection in seen
+            )
             and self.velocities.of(seen[-1].scan, seen[-1].name) is None
         }
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, Mover]]:
-        """Tracks of the objects of some scans, and the moving ones, by the scan's position."""
+        """Tracks of the objects of some scans, and the dynamic ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}
         movers: dict[ObjectId, Mover] = {}
         for position, number in enumerate(numbers):

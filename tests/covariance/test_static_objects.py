@@ -1,4 +1,4 @@
-"""What objects that stand tell alone."""
+"""The covariance by static objects alone."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from streets import prepared_street, standing_street
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.answer import Answer, Guess, result_of
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
-from sst_graph.covariance.stationary_objects import standing_covariance
+from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate, joint_graph
 from sst_graph.graph.state import State
@@ -60,7 +60,7 @@ def test_it_is_the_covariance_without_the_others() -> None:
     track = int(seen[counts.argmax()])
     given = [moving(pair, track) for pair in pairs]
     robust = robust_of(given, state, tracks)
-    alone = standing_covariance(robust, given)[:7, :7]
+    alone = static_covariance(robust, given)[:7, :7]
     expected = robust_of([without(pair, track) for pair in pairs], state, tracks).matrix[:7, :7]
     ratios = np.sqrt(np.diag(alone) / np.diag(expected))
     assert (np.abs(ratios[:6] - 1.0) < 0.15).all()
@@ -70,14 +70,14 @@ def test_it_is_the_covariance_without_the_others() -> None:
 def test_where_nothing_moves_it_is_the_whole_one() -> None:
     state, pairs, tracks = matched()
     robust = robust_of(pairs, state, tracks)
-    assert standing_covariance(robust, pairs) is robust.matrix
+    assert static_covariance(robust, pairs) is robust.matrix
 
 
 def test_what_only_moving_objects_tell_is_not_called_known() -> None:
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
-    for by_standing, status in ((None, "ok"), (good, "ok"), (good + np.outer(step, step), "unobservable")):
-        answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_standing=by_standing)
+    for by_static, status in ((None, "ok"), (good, "ok"), (good + np.outer(step, step), "unobservable")):
+        answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_static=by_static)
         result = result_of(answer, [prepared_street()], Guess(gtsam.Pose3()), CalibrationConfig())
         assert result.status == status
     assert "by what stands alone" in result.reasons[0] and len(result.weak_directions) == 1
