@@ -47,7 +47,7 @@ class DriveKnowledge:
     Attributes:
         drive: its name.
         covariance: (7, 7) of the extrinsic and the drive's own offset.
-        by_static: (7, 7) the same by objects that stand alone.
+        by_static: (7, 7) the same by static objects alone.
     """
 
     drive: str
@@ -65,7 +65,7 @@ class Answer:
         frames: that took part.
         doubts: why the estimate may be wrong altogether; any makes the status ``not_converged``.
         remarks: what else was missing, for the reader.
-        by_static: (7, 7) covariance by objects that stand alone, and the motion where it is always heard.
+        by_static: (7, 7) covariance by static objects alone, and the motion where it is always heard.
         drive_offsets: an offset for each drive, where one each was asked for.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.

@@ -1,4 +1,4 @@
-"""Which combinations of the seven unknowns the data do not tell, in words."""
+"""Which combinations of the seven unknowns the data do not determine, in words."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from sst_graph.result import DIRECTION_SCALES, WeakDirection
 FloatArray = NDArray[np.float64]
 
 _TAKES_PART = 0.1
-"""Least part of a weak direction's unit vector that is worth a word."""
+"""Least part of a weak direction's unit vector that is named."""
+_PAIR_CORRELATION = 0.98
+"""Translation and time offset of at least this multiple correlation hardly separate, as at constant speed: what
+separates them is small, ..."""
+_PAIR_SHARE = 0.5
+"""... and their sigmas must be within this share of the limits."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What to record so that a direction is told, by what is weak in it.
+    """What to record so that a direction is determined, by what is weak in it.
 
     Attributes:
         together: translation against time offset.
@@ -56,16 +61,11 @@ class ObservabilityConfig(Settings):
         rotation_deg: of any rotation [deg].
         translation_m: of any translation [m].
         offset_s: of the time offset [s].
-        pair_correlation: a translation and the time offset that are correlated as closely as this hardly
-            separate, as at constant speed: what does separate them is small ...
-        pair_share: ... and must tell them to this share of the limits.
     """
 
     rotation_deg: float = setting(0.5, at_least=1e-30, at_most=180.0)
     translation_m: float = setting(0.05, at_least=1e-30, at_most=1000.0)
     offset_s: float = setting(0.01, at_least=1e-30, at_most=1000.0)
-    pair_correlation: float = setting(0.98, at_least=0.0, at_most=2.0)
-    pair_share: float = setting(0.5, at_least=0.001, at_most=1.0)
 
 
 def weak_directions(
@@ -94,11 +94,12 @@ def open_directions(
     config: ObservabilityConfig,
     advice: Advice = SILHOUETTES,
 ) -> tuple[WeakDirection, ...]:
-    """Directions that are not known: by the covariance or, where that is well, by what stands alone.
+    """Directions that are not known: by the covariance or, where that is within the limits, by static
+    objects alone.
 
     Args:
         covariance: (7, 7) of the answer.
-        by_static: (7, 7) by objects that stand alone, where that is asked, too.
+        by_static: (7, 7) by static objects alone, where dynamic ones are among the matches.
     """
     weak = weak_directions(covariance, cTl, config, advice)
     if weak or by_static is None:
@@ -109,17 +110,17 @@ def open_directions(
 def inseparable_directions(
     covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
 ) -> tuple[WeakDirection, ...]:
-    """Directions along which objects that stand cannot tell the time offset from the translation.
+    """Directions along which static objects do not separate the time offset from the translation.
 
     None unless the two are correlated as closely as at constant speed.
 
     Args:
-        covariance: (7, 7) by what stands alone.
+        covariance: (7, 7) by static objects alone.
     """
-    if _paired(covariance) < config.pair_correlation:
+    if _paired(covariance) < _PAIR_CORRELATION:
         return ()
     return tuple(
-        replace(direction, sentence=f"by what stands alone, {direction.sentence}")
+        replace(direction, sentence=f"by static objects alone, {direction.sentence}")
         for direction in weak_directions(covariance, cTl, config)
         if min(abs(float(direction.vector[6])), float(np.linalg.norm(direction.vector[3:6]))) > _TAKES_PART
     )
@@ -133,8 +134,8 @@ def involves_offset(direction: WeakDirection) -> bool:
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
     limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
-    if _paired(covariance) >= config.pair_correlation:
-        limits[3:] *= config.pair_share
+    if _paired(covariance) >= _PAIR_CORRELATION:
+        limits[3:] *= _PAIR_SHARE
     return limits
 
 

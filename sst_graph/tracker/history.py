@@ -78,7 +78,7 @@ def _passed(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: Gau
 
 def _honest(epoch: RetiredEpoch, point: Point) -> Gaussian:
     """The epoch's belief with its cluster-robust information: H M^-1 H, M = H + excess."""
-    belief = epoch.belief.at(point)
+    belief = epoch.information.at(point)
     H = belief.information
     diagonal = np.diag(H)
     if not (diagonal > 0.0).any():

@@ -25,7 +25,7 @@ class Known:
     Attributes:
         joint: cluster-robust covariance of all unknowns.
         inflation: how much larger it is than that of independent matches.
-        by_static: (7, 7) covariance of extrinsic and offset by objects that stand alone; None where no
+        by_static: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
             object moves.
         steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
     """

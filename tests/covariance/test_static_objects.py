@@ -80,4 +80,4 @@ def test_what_only_moving_objects_tell_is_not_called_known() -> None:
         answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_static=by_static)
         result = result_of(answer, [prepared_street()], Guess(gtsam.Pose3()), CalibrationConfig())
         assert result.status == status
-    assert "by what stands alone" in result.reasons[0] and len(result.weak_directions) == 1
+    assert "by static objects alone" in result.reasons[0] and len(result.weak_directions) == 1

@@ -197,7 +197,7 @@ def test_what_one_object_alone_tells_is_a_doubt(street: SimulatedDrive, frames: 
 
 def _sure_tracker(street: SimulatedDrive, alarm: AlarmConfig) -> Tracker:
     """A tracker that calls any estimate observable."""
-    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, offset_s=10.0, pair_correlation=2.0)
+    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, offset_s=10.0)
     calibration = dataclasses.replace(EARLY_START.calibration, observability=limits)
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration, alarm=alarm))
 

@@ -1,4 +1,4 @@
-"""Steps among the frames of a start and right after it; what a tracker knows by what stands alone."""
+"""Steps among the frames of a start and right after it; the estimate by static objects alone."""
 
 from __future__ import annotations
 
@@ -93,4 +93,4 @@ def test_what_only_moving_objects_tell_is_not_called_known(
         update = tracker.current()
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)
-    assert "by what stands alone" in update.weak_directions[0].sentence
+    assert "by static objects alone" in update.weak_directions[0].sentence
