@@ -16,8 +16,8 @@ FloatArray = NDArray[np.float64]
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
 _PAIR_CORRELATION = 0.98
-"""Translation and time offset of at least this multiple correlation hardly separate, as at constant speed: what
-separates them is small, ..."""
+"""Translation and time offset of at least this multiple correlation hardly separate, as at constant speed:
+what separates them is small, ..."""
 _PAIR_SHARE = 0.5
 """... and their sigmas must be within this share of the limits."""
 

@@ -14,8 +14,8 @@ there is, for pose and offset are fitted to the same sides.
 A class whose mask bias is no variable keeps it in the answer. What the matches say of it is worked out as if
 it were one (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C (Schmidt).
 
-Along a direction that the data hardly tell, as forward against later at one speed, a common error of a pixel
-is many times what independent matches leave: there the two covariances differ most.
+Along a direction that the data hardly determine, as forward against later at one speed, a common error of a
+pixel is many times what independent matches leave: there the two covariances differ most.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ wide or narrow of where the LiDAR's beams leave them."""
 MASK_BIAS_PRIOR_PX = 3.0
 """Deviation of a mask bias beforehand where it is tested [px], as in ``calibrate``."""
 MASK_BIAS_SIGMAS = 3.0
-"""A mask bias farther from 0 than this many of its deviations is told."""
+"""A mask bias farther from 0 than this many of its deviations gives a warning."""
 TIMES_TOO_SURE = 3.0
-"""Ratio of the two sigmas along any direction that is told: factors scaled to the mean ratio leave up to
-about 2 along some directions."""
+"""Ratio of the two sigmas along any direction that gives a warning: factors scaled to the mean ratio leave up
+to about 2 along some directions."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def calibration_covariance(
         graph: all factors, those of the matches among them.
         values: its optimum.
         matches: of all terms, of one camera.
-        config: limits of what is told.
+        config: limits of the warnings.
 
     Raises:
         EstimationError: no match has a factor, or the graph does not determine extrinsic and offset.
@@ -108,7 +108,7 @@ def calibration_covariance(
     found = robust_covariance(P, sums, fit_errors(rows, config), keys)
     warnings = (
         *last_warnings(matches, values, found.covariance, config),
-        *told(P[:7, :7], found, keys.extrinsic(values), config),
+        *covariance_warnings(P[:7, :7], found, keys.extrinsic(values), config),
     )
     return CalibrationCovariance(
         found.covariance,
@@ -130,7 +130,7 @@ def marginal(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Alig
     try:
         joint = gtsam.Marginals(graph, values).jointMarginalCovariance(list(keys.lasting))
         return keys.placed(np.asarray(joint.fullMatrix()))
-    except (RuntimeError, IndexError):  # indeterminate, or nothing in the graph tells of them
+    except (RuntimeError, IndexError):  # indeterminate, or no factor in the graph touches them
         return np.full((COLUMNS, COLUMNS), np.inf)
 
 
@@ -301,7 +301,9 @@ def _ratios(P: FloatArray, C: FloatArray) -> FloatArray | None:
     return np.asarray(np.linalg.eigvalsh(whiten @ C @ whiten.T))
 
 
-def told(P: FloatArray, found: Robust, cTl: gtsam.Pose3, config: RematchConfig) -> list[TermWarning]:
+def covariance_warnings(
+    P: FloatArray, found: Robust, cTl: gtsam.Pose3, config: RematchConfig
+) -> list[TermWarning]:
     """Warnings of a covariance: weak directions, a marginal (7, 7) that is too sure, mask biases."""
     warnings, C = [], found.covariance
     if not np.isfinite(C).all():

@@ -23,12 +23,12 @@ from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.covariance import (
     Robust,
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     least_errors,
     robust_covariance,
     rows_of,
-    told,
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
@@ -149,7 +149,7 @@ class IncrementalTerms:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config.rematch)
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
-                warnings = warnings + told(P, found, cTl, self._config.rematch)
+                warnings = warnings + covariance_warnings(P, found, cTl, self._config.rematch)
         return IncrementalUpdate(
             estimate,
             covariance,

@@ -28,12 +28,12 @@ from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.covariance import (
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     marginal,
     robust_covariance,
     rows_of,
-    told,
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
@@ -120,7 +120,9 @@ def solve_with_terms(
     if not settled:
         warnings.append(TermWarning(WarningKind.NOT_SETTLED, moved, config.step_px, "px"))
     warnings += last_warnings(matches, values, C, config)
-    warnings += told(marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config)
+    warnings += covariance_warnings(
+        marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config
+    )
     return RematchSolution(values, whole, tuple(matches), C, rounds, settled, tuple(warnings))
 
 

@@ -21,11 +21,11 @@ from sst_graph.slam.covariance import (
     MASK_BIAS_PRIOR_PX,
     MASK_BIAS_PX,
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     robust_covariance,
     times_too_sure,
-    told,
     total,
 )
 from sst_graph.slam.solving import RematchSolution
@@ -105,7 +105,7 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     assert found.clustered[0, 0] < found.covariance[0, 0]
     off = joint[:7] - step
     assert off @ np.linalg.solve(found.covariance, off) < 1.0
-    (warning,) = told(P[:7, :7], found, gtsam.Pose3(), RematchConfig())[-1:]
+    (warning,) = covariance_warnings(P[:7, :7], found, gtsam.Pose3(), RematchConfig())[-1:]
     assert warning.kind is WarningKind.MASK_BIAS and "vehicle, -2.4" in warning.detail
     variable = AlignmentKeys(Trajectory(), E, D, {VEHICLE: gtsam.symbol("B", 0)})
     assert robust_covariance(P, TermSums.of(whole, 1.0), ErrorModel(0, 0, 1), variable).mask_biases_px == {}
@@ -139,9 +139,9 @@ def test_a_marginal_that_is_too_sure_is_told() -> None:
         P, total(TermSums.of(each, 1.0) for each in rows), ErrorModel(1.0, 0.0, 1.0), KEYS
     )
     times = times_too_sure(P[:7, :7], found.clustered)
-    kinds = [w.kind for w in told(P[:7, :7], found, gtsam.Pose3(), RematchConfig())]
+    kinds = [w.kind for w in covariance_warnings(P[:7, :7], found, gtsam.Pose3(), RematchConfig())]
     assert times > 3.0 and WarningKind.OVERCONFIDENT_MARGINAL in kinds
-    honest = told(found.clustered, found, gtsam.Pose3(), RematchConfig())
+    honest = covariance_warnings(found.clustered, found, gtsam.Pose3(), RematchConfig())
     assert WarningKind.OVERCONFIDENT_MARGINAL not in [w.kind for w in honest]
 
 
