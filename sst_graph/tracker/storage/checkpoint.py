@@ -35,7 +35,7 @@ from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import NO_PICTURE, CameraImage
 
 FORMAT = "sst-graph/tracker"
-VERSION = 18
+VERSION = 19
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
