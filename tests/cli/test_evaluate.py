@@ -59,9 +59,7 @@ def test_evaluate_as_json(result_file: Path, capsys: pytest.CaptureFixture[str])
     assert values["status"] == "ok"
 
 
-def test_evaluate_counts_the_truths_own_error(
-    result_file: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_counts_the_truths_own_error(result_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     truth = ["--truth", str(result_file.parent / "truth.json")]
     assert main(["evaluate", str(result_file), *truth, "--json", "--truth-sigma", "0.5,1,2"]) == 0
     values = json.loads(capsys.readouterr().out)
