@@ -23,18 +23,14 @@ from scipy.stats import t as student_t
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.batch.problem import CalibrationProblem, Estimate
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
-from sst_graph.covariance.cluster_robust import (
-    MatchTable,
-    RobustCovariance,
-    covariance_of,
-    fit_error_model,
-    match_table,
-    robust_covariance,
-)
+from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, Considered, consider
+from sst_graph.covariance.error_model import fit_error_model
+from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.errors import EstimationError
 from sst_graph.graph.building import state_from
-from sst_graph.graph.elimination import Unknowns, marginal_covariance, scaled_inverse
+from sst_graph.graph.elimination import Unknowns, marginal_covariance
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.outer_loop import JointSolution, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import ObjectId
@@ -195,9 +191,9 @@ class LinearProblem:
     def alone(self, name: str, config: AssumptionConfig) -> Finding:
         """Estimate of one parameter while the others of them are zero."""
         step, kept, bread = self._step_to(name)
-        moved = self.table.moved(step)
+        moved = self.table.after(step)
         table = _centred(replace(moved, J=moved.J[:, kept]), bread)
-        covariance = covariance_of(bread, table, fit_error_model(table))
+        covariance = covariance_of(bread, table, fit_error_model(table.residuals))
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
         sigma = float(np.sqrt(covariance[place, place]))
@@ -236,7 +232,7 @@ class LinearProblem:
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
     """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
     zero, and the jackknife over objects would take that for a disagreement among them."""
-    return table.moved(-bread @ (table.J.T @ (table.root_weights * table.r)))
+    return table.after(-bread @ (table.J.T @ (table.root_weights * table.r)))
 
 
 def _solved_alone(

@@ -1,4 +1,4 @@
-"""How far an assumption may be wrong once the data have been heard: what is considered in the covariance.
+"""How far an assumption may be wrong, given the data: what is considered in the covariance.
 
 Beforehand either all assumptions hold, or one of them is broken, which has probability ``prevalence``. The
 parameter of one that holds is normal with its prior deviation s0. That of a broken one has a deviation tau of
@@ -60,7 +60,7 @@ class Evidence:
 
 
 _MOST_LOG = 500.0
-"""Largest logarithm of a Bayes factor that is told from certainty."""
+"""Largest logarithm of a Bayes factor, so that its exponential is finite."""
 
 
 def _log_normal(value: float, variances: FloatArray) -> FloatArray:
@@ -74,12 +74,12 @@ def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:
     Never below the prior one; that stays 0 where it is 0: the assumption holds exactly.
     """
     open_ = {name: each for name, each in evidence.items() if 0.0 < each.prior < each.span}
-    told = {name: each.broken() for name, each in open_.items()}
-    odds = {name: open_[name].prevalence * factor for name, (factor, _) in told.items()}
+    broken = {name: each.broken() for name, each in open_.items()}
+    odds = {name: open_[name].prevalence * factor for name, (factor, _) in broken.items()}
     none = max(1.0 - sum(each.prevalence for each in open_.values()), 0.0)
     total = none + sum(odds.values())
     sigmas = {name: each.prior for name, each in evidence.items()}
-    for name, (_, square) in told.items():
+    for name, (_, square) in broken.items():
         share, prior = odds[name] / total, sigmas[name]
         sigmas[name] = max(prior, float(np.sqrt((1.0 - share) * prior**2 + share * square)))
     return sigmas

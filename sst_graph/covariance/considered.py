@@ -1,4 +1,4 @@
-"""How an answer follows the assumptions it rests on, and what that adds to its covariance.
+"""How an estimate follows the assumptions it rests on, and what that adds to its covariance.
 
 A parameter theta that is held at 0 but has deviation sigma moves the answer by (dx/dtheta) theta: Schmidt's
 considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
 from sst_graph.config import Settings, setting
-from sst_graph.covariance.cluster_robust import MatchTable, RobustCovariance
+from sst_graph.covariance.cluster_robust import RobustCovariance
+from sst_graph.covariance.match_table import MatchTable
 from sst_graph.graph.building import GraphConfig, PairMatches, joint_graph
 from sst_graph.graph.elimination import marginal_covariance
 from sst_graph.graph.nuisances import residual_columns
@@ -52,7 +53,7 @@ else:
 
 @dataclass(frozen=True)
 class AssumptionConfig(Settings):
-    """What is taken for granted, and how far it may be wrong.
+    """What is assumed, and how far it may be wrong.
 
     Attributes:
         sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
@@ -109,7 +110,7 @@ def columns_of(
 ) -> FloatArray:
     """(m, k) derivatives of all matches' residuals by assumptions' parameters [px per unit], unweighted.
 
-    In the order of :func:`~sst_graph.covariance.cluster_robust.match_table`.
+    In the order of :func:`~sst_graph.covariance.match_table.match_table`.
     """
     blocks = [np.zeros((0, len(names)))]
     for pair in pairs:
@@ -198,12 +199,12 @@ def budget(covariance: FloatArray, motion: FloatArray, considered: Considered) -
     return {name: [float(f"{value:.6g}") for value in np.sqrt(part)] for name, part in parts.items()}
 
 
-def remainder(total: FloatArray, told: FloatArray) -> dict[str, list[float]]:
+def remainder(total: FloatArray, explained: FloatArray) -> dict[str, list[float]]:
     """JSON-able part of a budget: what a covariance (7, 7) has beyond another (n, n), where there is any.
 
-    The motion around single scans that nothing measures, and sweeps that nothing tells.
+    The motion around single scans that nothing measures, and sweeps that nothing determines.
     """
-    left = np.clip(np.diag(total) - np.diag(told)[:7], 0.0, None)
+    left = np.clip(np.diag(total) - np.diag(explained)[:7], 0.0, None)
     if not left.any():
         return {}
     return {"unmeasured motion and sweep": [float(f"{value:.6g}") for value in np.sqrt(left)]}

@@ -1,4 +1,4 @@
-"""Which combinations of the seven unknowns the data do not tell, in words."""
+"""Which combinations of the seven unknowns the data do not determine, in words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,12 @@ from sst_graph.result import DIRECTION_SCALES, WeakDirection
 FloatArray = NDArray[np.float64]
 
 _TAKES_PART = 0.1
-"""Least part of a weak direction's unit vector that is worth a word."""
+"""Least part of a weak direction's unit vector that is named."""
+_PAIR_CORRELATION = 0.98
+"""Translation and time offset of at least this multiple correlation hardly separate, as at constant speed:
+what separates them is small, ..."""
+_PAIR_SHARE = 0.5
+"""... and their sigmas must be within this share of the limits."""
 
 
 _PAIR_CORRELATION = 0.98
@@ -26,7 +31,7 @@ _PAIR_SHARE = 0.5
 
 @dataclass(frozen=True)
 class Advice:
-    """What to record so that a direction is told, by what is weak in it.
+    """What to record so that a direction is determined, by what is weak in it.
 
     Attributes:
         together: translation against time offset.
@@ -96,11 +101,12 @@ def open_directions(
     config: ObservabilityConfig,
     advice: Advice = SILHOUETTES,
 ) -> tuple[WeakDirection, ...]:
-    """Directions that are not known: by the covariance or, where that is well, by what stands alone.
+    """Directions that are not known: by the covariance or, where that is within the limits, by static
+    objects alone.
 
     Args:
         covariance: (7, 7) of the answer.
-        by_static_objects: (7, 7) by objects that stand alone, where that is asked, too.
+        by_static_objects: (7, 7) by static objects alone, where dynamic ones are among the matches.
     """
     weak = weak_directions(covariance, cTl, config, advice)
     if weak or by_static_objects is None:
@@ -111,17 +117,17 @@ def open_directions(
 def inseparable_directions(
     covariance: FloatArray, cTl: gtsam.Pose3, config: ObservabilityConfig
 ) -> tuple[WeakDirection, ...]:
-    """Directions along which objects that stand cannot tell the time offset from the translation.
+    """Directions along which static objects do not separate the time offset from the translation.
 
     None unless the two are correlated as closely as at constant speed.
 
     Args:
-        covariance: (7, 7) by what stands alone.
+        covariance: (7, 7) by static objects alone.
     """
     if _paired(covariance) < _PAIR_CORRELATION:
         return ()
     return tuple(
-        replace(direction, sentence=f"by what stands alone, {direction.sentence}")
+        replace(direction, sentence=f"by static objects alone, {direction.sentence}")
         for direction in weak_directions(covariance, cTl, config)
         if min(abs(float(direction.vector[6])), float(np.linalg.norm(direction.vector[3:6]))) > _TAKES_PART
     )

@@ -11,6 +11,7 @@ from scipy.special import chdtrc
 
 from sst_graph.covariance.contradiction import Difference, PartAnswer, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError
+from sst_graph.graph.linear import unit_scale
 
 FloatArray = NDArray[np.float64]
 
@@ -66,9 +67,9 @@ def check_agreement(
 
 def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:
     """That each is an answer of its own, and no difference of two as a growing marginal's parts are."""
-    scale = np.sqrt(np.maximum(np.diag(np.sum(informations, axis=0)), 1e-300))
+    scale = unit_scale(np.sum(informations, axis=0))
     for k, information in enumerate(informations):
-        least = float(np.linalg.eigvalsh(information / np.outer(scale, scale))[0])
+        least = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[0])
         if least < -_ROUNDING:
             name = repr(names[k]) if names else f"number {k}"
             raise EstimationError(

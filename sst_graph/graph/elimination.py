@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.graph.building import PairMatches, tracked_objects
+from sst_graph.graph.linear import scale_of, with_ridge
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, nuisance_key, object_bias_key, time_offset_key
 
 FloatArray = NDArray[np.float64]
@@ -61,24 +62,19 @@ def marginal_covariance(
     are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
     """
     own, groups = _information(graph, values, unknowns)
-    n = unknowns.size
-    # Scaled to a unit diagonal, that of the motion too, with 1e-14 added to it.
+    # Scaled to a unit diagonal, that of the motion too.
     diagonal = np.diag(own).copy()
     for group in groups:
         diagonal[group.columns] += np.diag(group.information)[: len(group.columns)]
-    scale = _to_unit(diagonal)
-    schur = own * np.outer(scale, scale) + 1e-14 * np.eye(n)
+    scale = scale_of(diagonal)
+    schur = with_ridge(own * np.outer(scale, scale))
     for columns, information, _ in groups:
         m = len(columns)
-        scales = np.concatenate([scale[columns], _to_unit(np.diag(information)[m:])])
+        scales = np.concatenate([scale[columns], scale_of(np.diag(information)[m:])])
         H = information * np.outer(scales, scales)
-        inner = H[m:, m:] + 1e-14 * np.eye(len(H) - m)
+        inner = with_ridge(H[m:, m:])
         schur[np.ix_(columns, columns)] += H[:m, :m] - H[:m, m:] @ np.linalg.solve(inner, H[m:, :m])
     return np.asarray(np.linalg.inv(schur) * np.outer(scale, scale))
-
-
-def _to_unit(diagonal: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / np.sqrt(np.maximum(diagonal, 1e-300)))
 
 
 def twist_responses(
@@ -171,18 +167,3 @@ class _Together:
         first = self.root(keys[0])
         for key in keys[1:]:
             self._above[self.root(key)] = first
-
-
-def scaled_inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of an information matrix whose units differ by orders of magnitude.
-
-    Raises:
-        np.linalg.LinAlgError: it is singular or not finite.
-    """
-    diagonal = np.diag(matrix)
-    if not np.isfinite(matrix).all() or (diagonal <= 0.0).any():
-        raise np.linalg.LinAlgError("an information matrix that is not positive")
-    scale = 1.0 / np.sqrt(diagonal)
-    inverse = np.linalg.inv(matrix * np.outer(scale, scale) + 1e-14 * np.eye(len(matrix)))
-    inverse = inverse * np.outer(scale, scale)
-    return np.asarray(0.5 * (inverse + inverse.T))

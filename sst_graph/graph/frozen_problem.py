@@ -23,7 +23,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.factors.reprojection import evaluate, weigh
 from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.matching import DriveMatches, GraphConfig
 from sst_graph.graph.state import (
     EXTRINSIC,
@@ -86,7 +86,7 @@ class NormalEquations:
 
     def covariance(self) -> FloatArray:
         """(n, n) of all unknowns but the twists."""
-        return scaled_inverse(self._reduced(0.0)[1])
+        return information_inverse(self._reduced(0.0)[1])
 
     def _reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Inverse of the twists' blocks, and H and g with the twists eliminated."""

@@ -17,6 +17,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.graph.linear import unit_scale, with_ridge
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
 from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
 
@@ -118,9 +119,9 @@ def _noise_information(term: HandEyeTerm) -> FloatArray:
 
 def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
     """(7, 7) inverse of the information without what noise feigns, which stays positive."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    scale = unit_scale(hessian)
     both = np.outer(scale, scale)
-    whitener = np.linalg.inv(np.linalg.cholesky(hessian * both + 1e-14 * np.eye(7)))
+    whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * both)))
     values, vectors = np.linalg.eigh(np.eye(7) - whitener @ (noise * both) @ whitener.T)
     root = whitener.T @ vectors
     return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)

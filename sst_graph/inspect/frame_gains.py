@@ -1,38 +1,36 @@
-"""What each frame brings to the covariance: by itself, beside all the others, and one after the other.
+"""What each frame adds to the covariance: by itself, beside all the others, and one after the other.
 
 Without a frame, the covariance is made anew from all other matches as
 :mod:`sst_graph.covariance.cluster_robust` makes it: information, error model, and the objects left out in
 turn. The matches and their robust weights stay as they are; the estimate takes the Gauss-Newton step to the
-optimum of the other frames, and the residuals follow. Without that step, the left-out frame's pull would
+optimum of the other frames, and the residuals follow. Without that step, the left-out frame's gradient would
 stay in the residuals, and the spread over objects would take it for their disagreement.
 
-The covariance of the frames up to one, and of one by itself, is a sandwich under the error model of all: H
-sums the frames' information with the motion marginalised out, the surplus their scores; sides that several
+The covariance of the frames up to one, and of one by itself, is a sandwich under the error model of all: the
+information of the frames with the motion marginalised out, and the sums of their scores; sides that several
 frames see keep their shared error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import (
-    ErrorModel,
-    MatchTable,
-    RobustCovariance,
-    covariance_of,
-    fit_error_model,
-    views_of,
-)
+from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
+from sst_graph.covariance.error_model import ErrorModel, fit_error_model
+from sst_graph.covariance.match_table import MatchTable
+from sst_graph.covariance.sums import ScoreSums, total
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.building import PairMatches
 from sst_graph.graph.elimination import Unknowns
+from sst_graph.graph.linear import information_inverse
 from sst_graph.graph.state import State, time_offset_key, twist_key
 from sst_graph.inspect.frame_information import FrameInformation, positive_part
+from sst_graph.inspect.gained import bits_between
 from sst_graph.result import FrameId
 
 FloatArray = NDArray[np.float64]
@@ -41,69 +39,41 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class FrameTerm:
-    """What the factors of one frame say, its motion marginalised out.
+    """The factors of one frame, its motion marginalised out.
 
     Attributes:
-        columns: (c,) unknowns that it tells something about.
-        information: (c, c) H of its quadratic 1/2 d' H d - g' d.
-        pull: (c,) g.
+        columns: (c,) unknowns that they touch.
+        information: (c, c) H of their quadratic 1/2 d' H d - g' d.
+        vector: (c,) g.
     """
 
     columns: IntArray
     information: FloatArray
-    pull: FloatArray
+    vector: FloatArray
 
 
 @dataclass(frozen=True)
-class FramePart:
-    """One frame's part in the sums behind the covariance.
-
-    Attributes:
-        term: what its factors say.
-        surplus: (c, c) variance of its score beyond that of independent matches, without what sides share
-            over frames.
-        sides: (s,) sides it sees.
-        scores: (s, c) score of each side for a unit of the side's error.
-    """
-
-    term: FrameTerm
-    surplus: FloatArray
-    sides: IntArray
-    scores: FloatArray
-
-
-@dataclass
-class Sums:
-    """Sums over frames, priors included; all over the unknowns (n).
+class CovarianceSums:
+    """Sums over frames, priors included, over n unknowns.
 
     Attributes:
         information: (n, n).
-        surplus: (n, n).
-        scores: (sides, n).
-        side: variance that a side shares over frames.
+        scores: of the matches.
     """
 
     information: FloatArray
-    surplus: FloatArray
-    scores: FloatArray
-    side: float
+    scores: ScoreSums
 
-    def add(self, part: FramePart, sign: float = 1.0) -> None:
-        """Take a frame in, or out with ``sign`` -1."""
-        columns = part.term.columns
-        block = np.ix_(columns, columns)
-        self.information[block] += sign * part.term.information
-        self.surplus[block] += sign * part.surplus
-        self.scores[np.ix_(part.sides, columns)] += sign * part.scores
+    def plus(self, term: FrameTerm, scores: ScoreSums) -> CovarianceSums:
+        """These frames and one more; its scores are in its own columns."""
+        information, every = self.information.copy(), np.arange(len(self.information))
+        information[np.ix_(term.columns, term.columns)] += term.information
+        return CovarianceSums(information, total(len(every), (self.scores, scores), (every, term.columns)))
 
-    def covariance(self, columns: IntArray) -> FloatArray:
-        """Cluster-robust covariance of some of the unknowns."""
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.information), 1e-300))
-        scaled = self.information * np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
-        chosen = np.eye(len(scale))[:, columns]
-        rows = np.linalg.solve(scaled, chosen * scale[:, None]).T * scale
-        shared = rows @ self.scores.T
-        covariance = rows[:, columns] + rows @ self.surplus @ rows.T + self.side * (shared @ shared.T)
+    def covariance(self, model: ErrorModel) -> FloatArray:
+        """(n, n) cluster-robust covariance."""
+        bread = information_inverse(self.information)
+        covariance = bread + bread @ self.scores.excess(model) @ bread
         return np.asarray(0.5 * (covariance + covariance.T))
 
 
@@ -117,53 +87,47 @@ def frame_gains(
 ) -> tuple[FrameInformation, ...]:
     """What each pair brought, in the order of the pairs; pairs that share an image count as one."""
     unknowns, table, model = robust.unknowns, robust.table, robust.model
+    # 1. Of each frame its factors and the scores of its matches.
     prior, twisted = _frame_information(graph, values, unknowns)
     groups = _groups(pairs)
-    parts = [_part(table, rows, twisted[key], model) for key, (_, rows) in groups.items()]
-    sums = Sums(
-        prior.copy(), np.zeros_like(prior), np.zeros((int(table.sides.max()) + 1, len(prior))), model.side
-    )
-    before = []
+    terms = [twisted[key] for key in groups]
+    scores = [_scores(table, rows, term) for (_, rows), term in zip(groups.values(), terms, strict=True)]
     columns = [_own(unknowns, state, pair) for pair, _ in groups.values()]
-    for part, own in zip(parts, columns, strict=True):
-        sums.add(part)
-        before.append(sums.covariance(own))
-    found = []
-    prior_covariance = np.asarray(np.linalg.inv(prior))
-    moving = np.concatenate([np.full(len(pair), pair.moved) for pair in pairs])
-    for (pair, rows), part, own, seen in zip(groups.values(), parts, columns, before, strict=True):
-        full, without = (
-            robust.matrix[np.ix_(own, own)],
-            _left_out(robust, sums, part.term, rows, moving)[np.ix_(own, own)],
-        )
-        view = _view(part, prior_covariance, int(own[6]), model.side)
-        so_far = np.diag(seen) / np.diag(sums.covariance(own))
+    # 2. One frame after the other.
+    sums, before = CovarianceSums(prior, ScoreSums.none(len(prior))), []
+    for term, own_scores, own in zip(terms, scores, columns, strict=True):
+        sums = sums.plus(term, own_scores)
+        before.append(np.diag(sums.covariance(model))[own])
+    # 3. Each by itself, and beside all the others.
+    found, prior_covariance = [], np.asarray(np.linalg.inv(prior))
+    after = np.diag(sums.covariance(model))
+    for k, (pair, rows) in enumerate(groups.values()):
+        own = columns[k]
+        without = _left_out(robust, sums, terms[k], scores[k], rows)[np.ix_(own, own)]
+        view = _view(terms[k], scores[k], prior_covariance, int(own[6]), model)
+        full, so_far = robust.matrix[np.ix_(own, own)], before[k] / after[own]
         found.append(_entry(pair, len(rows), drives, state, view, full, without, so_far))
     return tuple(found)
 
 
 def _left_out(
-    robust: RobustCovariance, sums: Sums, term: FrameTerm, rows: IntArray, moving: NDArray[np.bool_]
+    robust: RobustCovariance, sums: CovarianceSums, term: FrameTerm, scores: ScoreSums, rows: IntArray
 ) -> FloatArray:
     """(n, n) covariance of a calibration without a frame, its matches and their weights as they are.
 
     The whole of it is made anew from the matches that are left, error model and objects left out in turn
-    included: a frame that contradicts the others widens both, and leaving it out narrows them. ``moving``:
-    (m,) whether the LiDAR moved, for each match.
+    included: a frame that contradicts the others widens both, and leaving it out narrows them.
     """
     information = sums.information.copy()
     information[np.ix_(term.columns, term.columns)] -= term.information
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    scaled = information * np.outer(scale, scale) + 1e-14 * np.eye(len(scale))
-    bread = np.asarray(np.linalg.inv(scaled)) * np.outer(scale, scale)
+    bread = information_inverse(information)
     kept = np.delete(np.arange(len(robust.table.r)), rows)
     if len(kept) == 0:
         return bread
-    # All pulls sum to nothing at the optimum: those of the others to minus this one's.
-    table = robust.table.take(kept).moved(-bread[:, term.columns] @ term.pull)
-    views = views_of(table.sides, table.side_frames, moving[kept], table.root_weights**2)
-    table = replace(table, views=views)
-    return covariance_of(0.5 * (bread + bread.T), table, fit_error_model(table))
+    # All gradients sum to nothing at the optimum: those of the others to minus this one's.
+    table = robust.table.take(kept).after(-bread[:, term.columns] @ term.vector)
+    others = sums.scores - total(len(bread), (scores,), (term.columns,))
+    return covariance_of(bread, table, fit_error_model(table.residuals), others)
 
 
 def _groups(pairs: Sequence[PairMatches]) -> dict[int, tuple[PairMatches, IntArray]]:
@@ -213,7 +177,7 @@ def _columns(key: int, unknowns: Unknowns) -> IntArray:
 
 
 def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> FrameTerm:
-    """What augmented information says of the columns below ``n``, with the twist marginalised out."""
+    """From augmented information, on the columns below ``n``, with the twist marginalised out."""
     columns = np.unique(np.concatenate([columns for columns, _ in terms]))
     H, g = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
     for touched, augmented in terms:
@@ -225,34 +189,24 @@ def _marginal(terms: Sequence[tuple[IntArray, FloatArray]], n: int) -> FrameTerm
     return FrameTerm(columns[:m], H[:m, :m] - H[:m, m:] @ response, g[:m] - response.T @ g[m:])
 
 
-def _part(table: MatchTable, rows: IntArray, term: FrameTerm, model: ErrorModel) -> FramePart:
-    J, z = table.J[rows][:, term.columns].toarray(), table.root_weights[rows]
-    sides, of_side = np.unique(table.sides[rows], return_inverse=True)
-    scores = np.stack([np.bincount(of_side, z * column, len(sides)) for column in J.T], axis=1)
-    in_frame = np.unique(table.side_frames[rows], return_inverse=True)[1]
-    sums = np.stack([np.bincount(in_frame, z * column) for column in J.T], axis=1)
-    surplus = (model.match - 1.0) * (J.T @ J) + model.side_frame * (sums.T @ sums)
-    return FramePart(
-        term,
-        np.asarray(surplus),
-        np.asarray(sides, dtype=np.intp),
-        np.asarray(scores, dtype=np.float64),
-    )
+def _scores(table: MatchTable, rows: IntArray, term: FrameTerm) -> ScoreSums:
+    """Sums of the scores of some matches, in the columns of their frame."""
+    some = table.take(rows)
+    J = some.J[:, term.columns].toarray()
+    return ScoreSums.of(J, some.root_weights, some.sides, some.frames)
 
 
-def _view(part: FramePart, prior_covariance: FloatArray, offset: int, side: float) -> FloatArray:
+def _view(
+    term: FrameTerm, scores: ScoreSums, prior_covariance: FloatArray, offset: int, model: ErrorModel
+) -> FloatArray:
     """(6, 6) information on the extrinsic of one frame alone, the offset known, mask biases estimated."""
-    keep = np.flatnonzero(part.term.columns != offset)
-    columns = part.term.columns[keep]
+    keep = np.flatnonzero(term.columns != offset)
+    columns = term.columns[keep]
     prior = np.linalg.inv(prior_covariance[np.ix_(columns, columns)])
-    alone = Sums(
-        prior + part.term.information[np.ix_(keep, keep)],
-        part.surplus[np.ix_(keep, keep)],
-        part.scores[:, keep],
-        side,
-    )
+    information = prior + term.information[np.ix_(keep, keep)]
+    covariance = CovarianceSums(information, scores.columns(keep)).covariance(model)[:6, :6]
     own = np.linalg.inv(prior_covariance[:6, :6])
-    return positive_part(np.linalg.inv(alone.covariance(np.arange(6))) - own)
+    return positive_part(np.linalg.inv(covariance) - own)
 
 
 def _entry(
@@ -272,7 +226,7 @@ def _entry(
     sigmas = np.sqrt(np.diag(full))
     return FrameInformation(
         FrameId(drive.name, drive.scans[pair.pair.scan].index),
-        0.5 * float(_log_det(without) - _log_det(full)) / float(np.log(2.0)),
+        bits_between(without, full),
         np.sqrt(np.maximum(np.diag(without), 0.0)) / sigmas,
         np.sqrt(np.maximum(so_far, 0.0)),
         view,
@@ -282,9 +236,3 @@ def _entry(
         float(np.linalg.norm(lPs, axis=1).min()),
         float((us < drive.camera.cx).mean()),
     )
-
-
-def _log_det(covariance: FloatArray) -> float:
-    sigmas = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sigmas, sigmas)
-    return float(np.linalg.slogdet(correlation)[1] + 2.0 * np.log(sigmas).sum())

@@ -1,4 +1,4 @@
-"""What each frame of a calibration brought, as it stands in ``calibration.json``.
+"""What each frame of a calibration added, as it stands in ``calibration.json``.
 
 Under ``diagnostics.frame_information``, one list a quantity, one entry a frame. Ratios are relative to
 the calibration with all its frames, so that they hold whatever scale its covariance has.
@@ -36,7 +36,7 @@ _UPPER = np.triu_indices(6)
 
 @dataclass(frozen=True)
 class FrameInformation:
-    """What one frame brings. Order of seven: the covariance's; see :mod:`factors`.
+    """What one frame adds. Order of seven: the covariance's; see :mod:`factors`.
 
     Attributes:
         frame: which frame.
@@ -106,7 +106,7 @@ def to_document(frames: Sequence[FrameInformation]) -> dict[str, Any]:
 
 
 def frames_of(result: CalibrationResult) -> tuple[FrameInformation, ...]:
-    """What each frame of a result brought; empty where the result does not tell.
+    """What each frame of a result added; empty where the result does not have it.
 
     Raises:
         DataError: the entry is there, and is not such columns.
@@ -207,11 +207,11 @@ def unit_diagonal(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     in its place is divided by.
     """
     diagonal = np.diag(A)
-    told = diagonal > 0.0
-    scale = np.sqrt(np.where(told, diagonal, 1.0))
+    known = diagonal > 0.0
+    scale = np.sqrt(np.where(known, diagonal, 1.0))
     with np.errstate(over="ignore"):
         unit = np.clip(A / scale[:, None] / scale, -1.0, 1.0)
-    return unit * np.outer(told, told), scale * told
+    return unit * np.outer(known, known), scale * known
 
 
 def _rounded(value: float) -> float:

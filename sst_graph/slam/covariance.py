@@ -14,23 +14,24 @@ there is, for pose and offset are fitted to the same sides.
 A class whose mask bias is no variable keeps it in the answer. What the matches say of it is worked out as if
 it were one (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C (Schmidt).
 
-Along a direction that the data hardly tell, as forward against later at one speed, a common error of a pixel
-is many times what independent matches leave: there the two covariances differ most.
+Along a direction that the data hardly determine, as forward against later at one speed, a common error of a
+pixel is many times what independent matches leave: there the two covariances differ most.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.edge_matching import SIDES
-from sst_graph.covariance.cluster_robust import MatchTable, fit_error_model
+from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.observability import limits_of_unknowns, weak_directions
+from sst_graph.covariance.sums import ScoreSums
 from sst_graph.errors import EstimationError
+from sst_graph.graph.linear import covariance_root
 from sst_graph.result import WeakDirection
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
 from sst_graph.slam.alignment_term import TermMatches, TermRows
@@ -47,10 +48,10 @@ wide or narrow of where the LiDAR's beams leave them."""
 MASK_BIAS_PRIOR_PX = 3.0
 """Deviation of a mask bias beforehand where it is tested [px], as in ``calibrate``."""
 MASK_BIAS_SIGMAS = 3.0
-"""A mask bias farther from 0 than this many of its deviations is told."""
+"""A mask bias farther from 0 than this many of its deviations gives a warning."""
 TIMES_TOO_SURE = 3.0
-"""Ratio of the two sigmas along any direction that is told: factors scaled to the mean ratio leave up to
-about 2 along some directions."""
+"""Ratio of the two sigmas along any direction that gives a warning: factors scaled to the mean ratio leave up
+to about 2 along some directions."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def calibration_covariance(
         graph: all factors, those of the matches among them.
         values: its optimum.
         matches: of all terms, of one camera.
-        config: limits of what is told.
+        config: limits of the warnings.
 
     Raises:
         EstimationError: no match has a factor, or the graph does not determine extrinsic and offset.
@@ -107,7 +108,7 @@ def calibration_covariance(
     found = robust_covariance(P, sums, fit_errors(rows, config), keys)
     warnings = (
         *last_warnings(matches, values, found.covariance, config),
-        *told(P[:7, :7], found, keys.extrinsic(values), config),
+        *covariance_warnings(P[:7, :7], found, keys.extrinsic(values), config),
     )
     return CalibrationCovariance(
         found.covariance,
@@ -129,7 +130,7 @@ def marginal(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Alig
     try:
         joint = gtsam.Marginals(graph, values).jointMarginalCovariance(list(keys.lasting))
         return keys.placed(np.asarray(joint.fullMatrix()))
-    except (RuntimeError, IndexError):  # indeterminate, or nothing in the graph tells of them
+    except (RuntimeError, IndexError):  # indeterminate, or no factor in the graph touches them
         return np.full((COLUMNS, COLUMNS), np.inf)
 
 
@@ -137,75 +138,37 @@ def marginal(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, keys: Alig
 
 
 @dataclass(frozen=True)
-class SideErrors:
-    """Errors of matches: variances that a side keeps in all images and in one [px^2], and the variance of a
-    match over what its factor gives it, 1 or more."""
-
-    side: float
-    side_frame: float
-    match: float
-
-
-@dataclass
 class TermSums:
     """Sums over the matches of one term or more, over :data:`COLUMNS` (n).
 
     Attributes:
         claimed: (n, n) information in the graph, sum of q w J J' / sigma^2 with q the factor's scale.
-        independent: (n, n) variance of the scores in the graph if matches err as their factors say: q twice.
-        side_frames: (n, n) sum of squared scores of each side in each image, for a side's error of 1 px.
-        sides: (n,) score of each side over all images, by its number.
-        pull: (n,) sum of q w J r / sigma^2.
+        scores: of the errors of sides [px] and, over sigma / sqrt(w), of single matches.
+        gradient: (n,) sum of q w J r / sigma^2.
     """
 
     claimed: FloatArray = field(default_factory=lambda: np.zeros((COLUMNS, COLUMNS)))
-    independent: FloatArray = field(default_factory=lambda: np.zeros((COLUMNS, COLUMNS)))
-    side_frames: FloatArray = field(default_factory=lambda: np.zeros((COLUMNS, COLUMNS)))
-    sides: dict[int, FloatArray] = field(default_factory=dict)
-    pull: FloatArray = field(default_factory=lambda: np.zeros(COLUMNS))
+    scores: ScoreSums = field(default_factory=lambda: ScoreSums.none(COLUMNS))
+    gradient: FloatArray = field(default_factory=lambda: np.zeros(COLUMNS))
 
     @classmethod
     def of(cls, rows: TermRows, information: float) -> TermSums:
         """Of one term."""
-        if not len(rows):
-            return cls()
-        scores = information * rows.J * (rows.weights / rows.sigmas_px**2)[:, None]
-        claimed = scores.T @ rows.J
-        numbers, own = np.unique(rows.sides, return_inverse=True)
-        by_side = np.zeros((len(numbers), COLUMNS))
-        np.add.at(by_side, own.reshape(-1), scores)
-        return cls(
-            claimed,
-            information * claimed,
-            by_side.T @ by_side,
-            dict(zip(numbers.tolist(), by_side, strict=True)),
-            scores.T @ rows.r,
-        )
+        roots = np.sqrt(rows.weights) / rows.sigmas_px
+        J = rows.J * roots[:, None]
+        scores = ScoreSums.of_frame(J, roots, rows.sides)
+        gradient = np.asarray(information * (J.T @ (roots * rows.r)))
+        return cls(information * scores.independent, scores.scaled(information), gradient)
 
-    def add(self, other: TermSums) -> None:
-        self.claimed = self.claimed + other.claimed
-        self.independent = self.independent + other.independent
-        self.side_frames = self.side_frames + other.side_frames
-        self.pull = self.pull + other.pull
-        for side, score in other.sides.items():
-            self.sides[side] = self.sides.get(side, np.zeros(COLUMNS)) + score
-
-    def variance(self, errors: SideErrors) -> FloatArray:
-        """(n, n) of the sum of all scores."""
-        shared = np.array([*self.sides.values()]).reshape(-1, COLUMNS)
-        return np.asarray(
-            errors.match * self.independent
-            + errors.side_frame * self.side_frames
-            + errors.side * (shared.T @ shared)
+    def __add__(self, other: TermSums) -> TermSums:
+        return TermSums(
+            self.claimed + other.claimed, self.scores + other.scores, self.gradient + other.gradient
         )
 
 
 def total(parts: Iterable[TermSums]) -> TermSums:
     """All of them in one."""
-    whole = TermSums()
-    for part in parts:
-        whole.add(part)
-    return whole
+    return sum(parts, TermSums())
 
 
 def rows_of(matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> TermRows:
@@ -213,32 +176,29 @@ def rows_of(matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> T
     return TermRows.none() if matches.term is None else matches.term.rows(matches, sides, values)
 
 
-def least_errors(config: RematchConfig) -> SideErrors:
-    """What is known of the errors before any residual."""
-    return SideErrors(config.side_sigma_px**2, 0.0, 1.0)
+def least_errors(config: RematchConfig) -> ErrorModel:
+    """What is known of the errors before any residual: variances of a side [px^2], and of a match over what
+    its factor gives it."""
+    return ErrorModel(config.side_sigma_px**2, 0.0, 1.0)
 
 
-def fit_errors(rows: Sequence[TermRows], config: RematchConfig) -> SideErrors:
-    """Errors of sides and matches by the residuals, and at least as large as is known beforehand."""
-    all_rows = TermRows.joined(rows)
-    if not len(all_rows):
-        return least_errors(config)
-    precisions = all_rows.weights / all_rows.sigmas_px**2
+def fit_errors(rows: Sequence[TermRows], config: RematchConfig) -> ErrorModel:
+    """Errors of sides [px^2] and matches (over what their factors give them) by the residuals, and at least
+    as large as is known beforehand."""
+    joined, least = TermRows.joined(rows), least_errors(config)
+    if not len(joined):
+        return least
+    precisions = joined.weights / joined.sigmas_px**2
     image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-    sides = np.unique(all_rows.sides, return_inverse=True)[1].reshape(-1)
-    side_frames = np.unique(image * (sides.max() + 1) + sides, return_inverse=True)[1].reshape(-1)
-    objects = np.unique(all_rows.sides // SIDES, return_inverse=True)[1].reshape(-1)
-    nothing = np.zeros((len(all_rows), 0))
-    table = MatchTable(
-        nothing, np.sqrt(precisions), precisions, all_rows.r, sides, side_frames, objects, np.inf
-    )
-    model = fit_error_model(table)
-    of_claimed = float((precisions / all_rows.sigmas_px**2).sum()) / max(float(precisions.sum()), 1e-300)
+    moved = np.ones(len(joined), np.bool_)
+    residuals = SideResiduals.of(joined.r, precisions, joined.sides, image, moved)
+    # The least error of a side, below, is in pixels: views do not matter to it.
+    model = fit_error_model(residuals, np.inf)
+    of_claimed = float((precisions / joined.sigmas_px**2).sum()) / max(float(precisions.sum()), 1e-300)
+    match = max(model.match * of_claimed, least.match)
     if config.side_sigma_px == 0.0:  # what sides have in common is not wanted
-        return SideErrors(0.0, 0.0, max(model.match * of_claimed, 1.0))
-    return SideErrors(
-        max(model.side, config.side_sigma_px**2), model.side_frame, max(model.match * of_claimed, 1.0)
-    )
+        return replace(least, match=match)
+    return ErrorModel(max(model.side, least.side), model.side_frame, match)
 
 
 # --- the covariance
@@ -261,7 +221,7 @@ class Robust:
     mask_biases_px: Mapping[SemanticClass, tuple[float, float]]
 
 
-def robust_covariance(P: FloatArray, sums: TermSums, errors: SideErrors, keys: AlignmentKeys) -> Robust:
+def robust_covariance(P: FloatArray, sums: TermSums, errors: ErrorModel, keys: AlignmentKeys) -> Robust:
     """P + P (Var(scores) - claimed) P, and what mask biases that are no variables add.
 
     Args:
@@ -271,7 +231,9 @@ def robust_covariance(P: FloatArray, sums: TermSums, errors: SideErrors, keys: A
         keys: which mask biases are variables.
     """
     rest = _by_the_rest(P, sums.claimed)
-    independent, clustered = rest + P @ sums.independent @ P, rest + P @ sums.variance(errors) @ P
+    independent, clustered = (
+        rest + P @ variance @ P for variance in (sums.scores.independent, sums.scores.variance(errors))
+    )
     considered = np.zeros_like(P)
     biases = _held_biases(P, sums, errors, keys)
     for c, (bias, _) in biases.items():
@@ -286,29 +248,20 @@ def _by_the_rest(P: FloatArray, claimed: FloatArray) -> FloatArray:
 
     No part of P is taken twice: an incremental solver's P is that of an earlier linearization.
     """
-    root, _ = _root(P)
+    root, _ = covariance_root(P)
     shares, axes = np.linalg.eigh(root.T @ claimed @ root)
     return np.asarray((root @ axes * np.clip(1.0 - shares, 0.0, 1.0)) @ (root @ axes).T)
 
 
-def _root(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R with R R' = P, a column for each direction that P knows, and R's pseudo-inverse."""
-    scale = np.sqrt(np.maximum(np.diag(P), 1e-300))
-    values, vectors = np.linalg.eigh(P / np.outer(scale, scale))
-    known = values > 1e-12 * max(float(values[-1]), 1e-300)
-    sizes = np.sqrt(values[known])
-    return scale[:, None] * vectors[:, known] * sizes, (vectors[:, known] / sizes).T / scale
-
-
 def _held_biases(
-    P: FloatArray, sums: TermSums, errors: SideErrors, keys: AlignmentKeys
+    P: FloatArray, sums: TermSums, errors: ErrorModel, keys: AlignmentKeys
 ) -> dict[SemanticClass, tuple[float, float]]:
     """Estimate and sigma [px] of each mask bias that is no variable, each by itself beside all variables.
 
     At the optimum the variables' pulls are balanced by the rest of the graph; a bias b would take
     b = -pull_b / S, S its information with the variables marginalised out.
     """
-    found, variance = {}, sums.variance(errors)
+    found, variance = {}, sums.scores.variance(errors)
     for c in SemanticClass:
         column = bias_column(c)
         if isinstance(keys.biases_px.get(c), int) or sums.claimed[column, column] <= 0.0:
@@ -319,7 +272,7 @@ def _held_biases(
         S = float(follows @ sums.claimed[:, column]) + MASK_BIAS_PRIOR_PX**-2
         # What the variables know beyond these matches (priors, motion) does not err with them.
         sigma = float(np.sqrt(np.maximum(follows @ variance @ follows, 0.0))) / S
-        found[c] = -float(sums.pull[column]) / S, sigma
+        found[c] = -float(sums.gradient[column]) / S, sigma
     return found
 
 
@@ -344,11 +297,13 @@ def _ratios(P: FloatArray, C: FloatArray) -> FloatArray | None:
     """Variances of C along the axes in which P is the unit matrix; None where P knows nothing."""
     if not np.isfinite(P).all() or not P.any():
         return None
-    _, whiten = _root(P)
+    _, whiten = covariance_root(P)
     return np.asarray(np.linalg.eigvalsh(whiten @ C @ whiten.T))
 
 
-def told(P: FloatArray, found: Robust, cTl: gtsam.Pose3, config: RematchConfig) -> list[TermWarning]:
+def covariance_warnings(
+    P: FloatArray, found: Robust, cTl: gtsam.Pose3, config: RematchConfig
+) -> list[TermWarning]:
     """Warnings of a covariance: weak directions, a marginal (7, 7) that is too sure, mask biases."""
     warnings, C = [], found.covariance
     if not np.isfinite(C).all():

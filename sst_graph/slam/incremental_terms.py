@@ -22,12 +22,12 @@ from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     Robust,
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     least_errors,
     robust_covariance,
     rows_of,
-    told,
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
@@ -139,7 +139,7 @@ class IncrementalTerms:
             warnings = warnings + last_warnings(matches, estimate, covariance, self._config)
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
-                warnings = warnings + told(P, found, cTl, self._config)
+                warnings = warnings + covariance_warnings(P, found, cTl, self._config)
         return IncrementalUpdate(
             estimate,
             covariance,
@@ -182,7 +182,7 @@ class IncrementalTerms:
         matches = self._matches()
         rows = [rows_of(each, self._sides, estimate) for each in matches]
         sums = total(TermSums.of(each, m.information) for each, m in zip(rows, matches, strict=True))
-        sums.add(self._gone)
+        sums = sums + self._gone
         config = self._config
         errors = fit_errors(rows, config), least_errors(config)
         found, least = (robust_covariance(P, sums, each, self._keys) for each in errors)
@@ -234,7 +234,7 @@ class IncrementalTerms:
         """
         for placed in self._terms:
             if placed.is_gone(estimate):
-                self._gone.add(placed.sums)
+                self._gone = self._gone + placed.sums
         self._terms = [placed for placed in self._terms if not placed.is_gone(estimate)]
 
     def _matches(self) -> list[TermMatches]:

@@ -27,12 +27,12 @@ from sst_graph.slam.alignment_term import AlignmentTerm, TermMatches
 from sst_graph.slam.config import CALM, RematchConfig
 from sst_graph.slam.covariance import (
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     marginal,
     robust_covariance,
     rows_of,
-    told,
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
@@ -125,7 +125,9 @@ def solve_with_terms(
     if not converged:
         warnings.append(TermWarning(WarningKind.NOT_CONVERGED, moved, _STEP_PX, "px"))
     warnings += last_warnings(matches, values, C, config)
-    warnings += told(marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config)
+    warnings += covariance_warnings(
+        marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config
+    )
     return RematchSolution(values, whole, tuple(matches), C, rounds, converged, tuple(warnings))
 
 

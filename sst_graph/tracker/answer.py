@@ -32,7 +32,7 @@ def answer(
     weak: tuple[WeakDirection, ...] = ()
     if estimate.exists:
         limits = tracker.setup.config.calibration.observability
-        weak = open_directions(covariance, estimate.uncertainty.by_static, point.cTl, limits)
+        weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
         unconfirmed = changes.start_unconfirmed or confirmation.too_old
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
         status = "contradicted" if contradictions else status

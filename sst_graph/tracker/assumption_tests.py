@@ -22,7 +22,7 @@ from sst_graph.batch.assumption_tests import Finding, few_objects
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.jackknife import bounded_ratio
 from sst_graph.errors import EstimationError
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.window.smoother import WindowSmoother
 
 _EVERY = 10
@@ -42,11 +42,11 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
         raise EstimationError(str(error)) from error
     A = np.concatenate([follows, np.eye(smoother.past.held)])
     score, information = A.T @ g, np.einsum("nk,nm,mk->k", A, H, A)
-    surplus = np.einsum("nk,nm,mk->k", A, smoother.surplus(with_held=True), A)
+    excess = np.einsum("nk,nm,mk->k", A, smoother.excess(with_held=True), A)
     before = np.array([ASSUMPTIONS[name].span ** -2.0 for name in smoother.held_names])
-    curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.flatness) + before
+    curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.weight_curvature_ratio) + before
     values = score / curvature
-    sigmas = np.sqrt(np.maximum(information + surplus, 0.0) + before) / curvature
+    sigmas = np.sqrt(np.maximum(information + excess, 0.0) + before) / curvature
     sigmas *= few_objects(smoother.objects, config.threshold)
     found = []
     for place, name in enumerate(smoother.held_names):

@@ -23,7 +23,6 @@ from sst_graph.tracker.monitor.statistic import Estimate
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
-from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.information_log import InformationLog
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -55,7 +54,7 @@ class FrameMatches:
 
     scan: int
     chosen: frozenset[int]
-    found: Mapping[int, Found]
+    found: Mapping[int, MatchedPair]
     missing: frozenset[int]
     waiting: tuple[int, ...]
 

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.window.epochs import RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -80,7 +80,7 @@ def _messages(beliefs: Sequence[Gaussian], walks: Sequence[FloatArray], first: G
 
 
 def _cluster_robust(epoch: RetiredEpoch, point: Point) -> Gaussian:
-    """The epoch's Gaussian with its cluster-robust information: H M^-1 H, M = H + surplus."""
+    """The epoch's Gaussian with its cluster-robust information: H M^-1 H, M = H + excess."""
     belief = epoch.information.at(point)
     H = belief.information
     diagonal = np.diag(H)
@@ -88,7 +88,7 @@ def _cluster_robust(epoch: RetiredEpoch, point: Point) -> Gaussian:
         return belief
     scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-12 * diagonal.max()))
     K = H * np.outer(scale, scale)
-    M = K + epoch.surplus * np.outer(scale, scale) + 1e-9 * np.eye(len(H))
+    M = K + epoch.excess * np.outer(scale, scale) + 1e-9 * np.eye(len(H))
     shrink = np.linalg.solve(M, K).T  # K M^-1
     information = shrink @ K / np.outer(scale, scale)
     vector = (shrink @ (belief.vector * scale)) / scale

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.covariance.considered import steps_by
 from sst_graph.errors import EstimationError
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.tracker.monitor.statistic import EstimateCovariance
 from sst_graph.tracker.track_update import UNKNOWN_SIGMAS
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -32,7 +32,7 @@ class Uncertainty:
 
     joint: EstimateCovariance
     inflation: float = 1.0
-    by_static: FloatArray | None = None
+    by_static_objects: FloatArray | None = None
     steps: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
@@ -54,14 +54,14 @@ class Uncertainty:
         m = smoother.past.point.core_size
         share = np.trace(np.linalg.solve(naive[:m, :m], matrix[:m, :m])) / m
         inflation = max(1.0, float(share))
-        by_static = None
+        by_static_objects = None
         static = smoother.static_information()
         if static is not None:
             wider = scaled_inverse(static)[:7, :7] - naive[:7, :7]
-            by_static = matrix[:7, :7] + inflation * wider
+            by_static_objects = matrix[:7, :7] + inflation * wider
         steps = steps_by(smoother.held_names, naive, information[: len(naive), len(naive) :], 7)
         joint = EstimateCovariance(matrix, smoother.past.point.tracks, m)
-        return cls(joint, inflation, by_static, steps)
+        return cls(joint, inflation, by_static_objects, steps)
 
     @property
     def covariance(self) -> FloatArray:

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from sst_graph.covariance.cluster_robust import (
+from sst_graph.association.edge_matching import SIDES
+from sst_graph.covariance.cluster_robust import steps_without_objects
+from sst_graph.covariance.error_model import (
     ErrorModel,
-    MatchTable,
     effective_views,
     fit_error_model,
     freedom_of_sides,
-    gram,
-    score_variance,
     spread_beyond,
-    steps_without_objects,
     with_floors,
 )
+from sst_graph.covariance.match_table import MatchTable
+from sst_graph.covariance.sums import ScoreSums, gram, total
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.state import EXTRINSIC, bias_key, time_offset_key, twist_key
 from sst_graph.types import SemanticClass
@@ -29,18 +29,18 @@ VEHICLE = SemanticClass.VEHICLE
 
 
 def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
-    """Matches on 4 sides, each seen in 3 frames."""
+    """Matches on 4 sides of two objects, each seen in 3 frames."""
     rng = np.random.default_rng(seed)
-    sides = rng.integers(0, 4, m)
-    frames = sides * 3 + rng.integers(0, 3, m)
+    sides = np.array([0, 1, 2, SIDES])[rng.integers(0, 4, m)]
+    frames = rng.integers(0, 3, m)
     roots = rng.uniform(0.1, 1.0, m)
     J = rng.normal(0.0, 1.0, (m, n)) * roots[:, None]
-    side_frames = np.unique(frames, return_inverse=True)[1]
-    return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, side_frames, sides // 3, 5.0)
+    moved = np.ones(m, np.bool_)
+    return MatchTable(csr_array(J), roots, roots**2, rng.normal(size=m), sides, frames, moved)
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
-    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model.
+    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model; 6 views.
 
     A pose and a mask bias of each object (of three sides) have been fitted to them.
     """
@@ -54,14 +54,13 @@ def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
         + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
-    return MatchTable(
-        csr_array((len(r), 8)), np.ones(len(r)), np.ones(len(r)), r, sides, frames, sides // 3, 5.0
-    )
+    names, ones, moved = sides // 3 * SIDES + sides % 3, np.ones(len(r)), np.ones(len(r), np.bool_)
+    return MatchTable(csr_array((len(r), 8)), ones, ones, r, names, frames % 6, moved)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_steps_without_objects_are_those_of_solving_again(seed: int) -> None:
-    table = replace(random_table(seed, m=60), objects=np.repeat(np.arange(5), 12))
+    table = replace(random_table(seed, m=60), sides=np.repeat(np.arange(5) * SIDES, 12))
     J, r = table.J.toarray(), table.root_weights * table.r
     # A prior that makes 0 the optimum of all: minimise |r + J x|^2 + |P^(1/2) (x - x0)|^2.
     P = np.diag(np.linspace(0.5, 2.0, J.shape[1]))
@@ -77,7 +76,8 @@ def test_steps_without_objects_are_those_of_solving_again(seed: int) -> None:
 def brute_force(table: MatchTable, model: ErrorModel) -> np.ndarray:
     """J^T Z R Z J with the residuals' covariance R (m, m) written out."""
     R = model.side * (table.sides[:, None] == table.sides)
-    R = R + model.side_frame * (table.side_frames[:, None] == table.side_frames)
+    same = (table.sides[:, None] == table.sides) & (table.frames[:, None] == table.frames)
+    R = R + model.side_frame * same
     R = R + model.match * np.eye(len(table.r))
     rows = table.root_weights[:, None] * table.J.toarray()
     return rows.T @ R @ rows
@@ -90,7 +90,7 @@ MODELS = [ErrorModel(0.7, 0.3, 1.4), ErrorModel(0.0, 0.5, 0.9), ErrorModel(0.6, 
 @pytest.mark.parametrize("model", MODELS)
 def test_score_variance_by_brute_force(seed: int, model: ErrorModel) -> None:
     table = replace(random_table(seed), root_weights=np.ones(40))
-    np.testing.assert_allclose(score_variance(table, model), brute_force(table, model), atol=1e-10)
+    np.testing.assert_allclose(table.scores.variance(model), brute_force(table, model), atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -99,19 +99,43 @@ def test_score_variance_of_weighted_matches(seed: int, model: ErrorModel) -> Non
     table = random_table(seed)
     # What the clusters share is exact; all in all the variance is never below that of the model.
     shared = replace(model, match=0.0)
-    np.testing.assert_allclose(score_variance(table, shared), brute_force(table, shared), atol=1e-10)
-    surplus = score_variance(table, model) - brute_force(table, model)
-    assert np.linalg.eigvalsh(surplus)[0] > -1e-9
+    np.testing.assert_allclose(table.scores.variance(shared), brute_force(table, shared), atol=1e-10)
+    excess = table.scores.variance(model) - brute_force(table, model)
+    assert np.linalg.eigvalsh(excess)[0] > -1e-9
 
 
 def test_independent_matches_keep_their_information() -> None:
     table = random_table(0)
-    np.testing.assert_allclose(score_variance(table, ErrorModel(0.0, 0.0, 1.0)), gram(table.J))
+    np.testing.assert_allclose(table.scores.variance(ErrorModel(0.0, 0.0, 1.0)), gram(table.J))
+    np.testing.assert_allclose(table.scores.excess(ErrorModel(0.0, 0.0, 1.0)), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_frames_add_up_and_can_be_left_out(seed: int) -> None:
+    """Frame by frame, in other columns, with sides closed: the sums of all matches at once."""
+    table, model = random_table(seed), ErrorModel(0.7, 0.3, 1.4)
+    parts = [table.take(np.flatnonzero(table.frames == frame)) for frame in range(3)]
+    one, two, three = (part.scores for part in parts)
+    expected = table.scores.variance(model)
+    np.testing.assert_allclose((one + two + three).variance(model), expected, rtol=1e-9)
+    np.testing.assert_allclose((table.scores - three).variance(model), (one + two).variance(model), rtol=1e-9)
+    dense = ScoreSums.of_frame(parts[0].J.toarray(), parts[0].root_weights, parts[0].sides)
+    np.testing.assert_allclose(dense.variance(model), one.variance(model), rtol=1e-9)
+    columns = np.array([9, 0, 3, 4, 1, 7, 2, 5])
+    apart = total(10, [one, two, three], [columns] * 3)
+    np.testing.assert_allclose(apart.columns(columns).variance(model), expected, rtol=1e-9)
+    assert not apart.independent[[6, 8]].any()
+    closed = (one + two + three).without_sides([0, 2])
+    assert closed.sides.tolist() == [1, SIDES]
+    np.testing.assert_allclose(closed.variance(model), expected, rtol=1e-9)
+    T = np.random.default_rng(seed).normal(size=(5, 8))
+    np.testing.assert_allclose(closed.transformed(T).variance(model), T @ expected @ T.T, rtol=1e-9)
+    np.testing.assert_allclose(closed.scaled(0.3).variance(model), 0.09 * expected, rtol=1e-9)
 
 
 def test_fitted_variances_are_those_drawn() -> None:
     model = ErrorModel(1.5, 0.6, 0.9)
-    fitted = [fit_error_model(drawn_table(model, seed)) for seed in range(4)]
+    fitted = [fit_error_model(drawn_table(model, seed).residuals) for seed in range(4)]
     assert np.mean([f.match for f in fitted]) == pytest.approx(model.match, rel=0.03)
     assert np.mean([f.side_frame for f in fitted]) == pytest.approx(model.side_frame, rel=0.08)
     assert np.mean([f.side for f in fitted]) == pytest.approx(model.side, rel=0.12)
@@ -123,8 +147,10 @@ def test_what_the_fit_swallows() -> None:
 
 
 def test_floors() -> None:
-    fitted = fit_error_model(drawn_table(ErrorModel(0.0, 0.0, 1.0), 0))
-    assert fitted == with_floors(0.0, 0.0, fitted.match, 5.0)
+    residuals = drawn_table(ErrorModel(0.0, 0.0, 1.0), 0).residuals
+    fitted = fit_error_model(residuals)
+    assert fitted == with_floors(0.0, 0.0, fitted.match, 6.0)
+    assert fit_error_model(residuals, np.inf) == with_floors(0.0, 0.0, fitted.match, np.inf)
     assert min(fitted.side, fitted.side_frame) > 0.1 * fitted.match
     assert fitted.match == pytest.approx(1.0, rel=0.03)
 

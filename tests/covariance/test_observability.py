@@ -59,7 +59,8 @@ def test_what_stands_alone_must_separate_offset_and_translation() -> None:
     tied = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     (weak,) = inseparable_directions(with_direction(tied), CTL, CONFIG)
     assert (
-        weak.sentence.startswith("by what stands alone, the LiDAR shifted forward") and "stop" in weak.advice
+        weak.sentence.startswith("by static objects alone, the LiDAR shifted forward")
+        and "stop" in weak.advice
     )
     assert inseparable_directions(with_direction(0.3 * tied), CTL, CONFIG) == ()
     loose = with_direction(tied) + np.diag([0.0] * 6 + [0.01**2])

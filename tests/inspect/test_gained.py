@@ -8,7 +8,6 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.tracker.window.information_log import InformationLog
 
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -18,6 +17,7 @@ from sst_graph.inspect.gained import KEY, gained_of, pair_gains, to_document
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.inspection_text import inspection_text
 from sst_graph.result import CalibrationResult, FrameId
+from sst_graph.tracker.window.information_log import InformationLog
 
 
 def _covariance(seed: int) -> np.ndarray:
@@ -64,11 +64,11 @@ def test_a_pair_is_worth_what_the_others_lack_without_it() -> None:
 
 
 def test_bits_of_arrivals_add_up() -> None:
-    arrivals = InformationLog()
+    log = InformationLog()
     covariances = [_covariance(seed) / (1.0 + seed) for seed in range(5)]
     for scan, covariance in enumerate(covariances):
-        arrivals.add(10 + scan, covariance)
-    gained = arrivals.gained("a/00")
+        log.add(10 + scan, covariance)
+    gained = log.gained("a/00")
     assert gained.gains[0].bits is None
     total = 0.5 * np.log2(np.linalg.det(1e3 * covariances[0]) / np.linalg.det(1e3 * covariances[-1]))
     assert sum(gain.bits or 0.0 for gain in gained.gains) == pytest.approx(total, rel=1e-6)
@@ -79,18 +79,18 @@ def test_bits_of_arrivals_add_up() -> None:
 
 
 def test_a_new_start_is_no_gain() -> None:
-    arrivals = InformationLog()
-    arrivals.add(0, _covariance(1))
-    arrivals.restart()
-    arrivals.add(1, 100.0 * _covariance(1))
-    assert [gain.bits for gain in arrivals.gained("a").gains] == [None, None]
+    log = InformationLog()
+    log.add(0, _covariance(1))
+    log.restart()
+    log.add(1, 100.0 * _covariance(1))
+    assert [gain.bits for gain in log.gained("a").gains] == [None, None]
 
 
 def test_the_tracker_s_scans_in_words_and_in_json() -> None:
-    arrivals = InformationLog()
+    log = InformationLog()
     for scan in range(30):
-        arrivals.add(scan, _covariance(2) / (1.0 + scan))
-    inspection = inspect_result(_result("track", to_document(arrivals.gained("a/00"))))
+        log.add(scan, _covariance(2) / (1.0 + scan))
+    inspection = inspect_result(_result("track", to_document(log.gained("a/00"))))
     text = inspection_text(inspection)
     assert "what each scan brought as it came" in text and "18 more with --all-frames" in text
     assert "half of them from" in text and "\n0              start" in text

@@ -9,16 +9,9 @@ import numpy as np
 import pytest
 from stored import simulated
 
-from sst_graph.covariance.cluster_robust import (
-    ErrorModel,
-    MatchTable,
-    covariance_of,
-    fit_error_model,
-    gram,
-    match_table,
-    robust_covariance,
-    score_variance,
-)
+from sst_graph.covariance.cluster_robust import covariance_of, robust_covariance
+from sst_graph.covariance.error_model import ErrorModel, fit_error_model
+from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import (
@@ -96,8 +89,8 @@ def values_of(motion: str, graph: gtsam.NonlinearFactorGraph) -> gtsam.Values:
 def covariance_by_model(motion: str, positions: list[int]) -> np.ndarray:
     """(7, 7) covariance of some of the frames, with the error model of all."""
     _, bread, table = frozen(motion, positions)
-    surplus = score_variance(table, gains(motion)[0]) - gram(table.J)
-    return (bread + bread @ surplus @ bread)[:7, :7]
+    excess = table.scores.excess(gains(motion)[0])
+    return np.asarray(bread + bread @ excess @ bread)[:7, :7]
 
 
 def claimed(motion: str, positions: list[int]) -> np.ndarray:
@@ -107,8 +100,8 @@ def claimed(motion: str, positions: list[int]) -> np.ndarray:
     graph, bread, table = frozen(motion, positions)
     step = graph.linearize(values_of(motion, graph)).optimize()
     unknowns = Unknowns.of(state, [pairs[k] for k in positions])
-    table = table.moved(np.concatenate([step.at(key) for key in unknowns.keys]))
-    return covariance_of(bread, table, fit_error_model(table))[:7, :7]
+    table = table.after(np.concatenate([step.at(key) for key in unknowns.keys]))
+    return covariance_of(bread, table, fit_error_model(table.residuals))[:7, :7]
 
 
 @pytest.mark.parametrize("motion", ["standing", "constant"])

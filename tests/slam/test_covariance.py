@@ -12,6 +12,7 @@ from alignment_streets import D, E, Street, simulated_street
 
 from sst_graph import AlignmentKeys, Trajectory, calibration_covariance, solve_with_terms
 from sst_graph.association.edge_matching import SIDES
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.errors import EstimationError
 from sst_graph.slam.alignment_keys import COLUMNS, bias_column
 from sst_graph.slam.alignment_term import TermRows
@@ -19,13 +20,12 @@ from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.covariance import (
     MASK_BIAS_PRIOR_PX,
     MASK_BIAS_PX,
-    SideErrors,
     TermSums,
+    covariance_warnings,
     fit_errors,
     inflation,
     robust_covariance,
     times_too_sure,
-    told,
     total,
 )
 from sst_graph.slam.solving import RematchSolution
@@ -63,7 +63,7 @@ def marginal_of(rows: list[TermRows], information: float, prior: float) -> np.nd
 def test_it_is_the_covariance_of_the_estimate_under_the_errors(information: float) -> None:
     """Against A S A' with the dense covariance S of all errors and A how the estimate follows them."""
     rows, prior = random_rows(), 5.0
-    whole, errors = TermRows.joined(rows), SideErrors(0.7, 0.3, 1.4)
+    whole, errors = TermRows.joined(rows), ErrorModel(0.7, 0.3, 1.4)
     P = marginal_of(rows, information, prior)
     image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
     same_side = whole.sides[:, None] == whole.sides
@@ -97,7 +97,7 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     whole = replace(whole, r=r + A[:, :7] @ step)
     joint = -np.linalg.solve(H, (A * weights[:, None]).T @ r)
     P = marginal_of(rows, 1.0, 0.0)
-    found = robust_covariance(P, TermSums.of(whole, 1.0), SideErrors(0.0, 0.0, 1.0), KEYS)
+    found = robust_covariance(P, TermSums.of(whole, 1.0), ErrorModel(0.0, 0.0, 1.0), KEYS)
     estimate, sigma = found.mask_biases_px[VEHICLE]
     assert estimate == pytest.approx(joint[7], rel=1e-9) == pytest.approx(-bias, abs=4.0 * sigma)
     assert sigma == pytest.approx(np.sqrt(np.linalg.inv(H)[7, 7]), rel=0.01)
@@ -105,10 +105,10 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     assert found.clustered[0, 0] < found.covariance[0, 0]
     off = joint[:7] - step
     assert off @ np.linalg.solve(found.covariance, off) < 1.0
-    (warning,) = told(P[:7, :7], found, gtsam.Pose3(), RematchConfig())[-1:]
+    (warning,) = covariance_warnings(P[:7, :7], found, gtsam.Pose3(), RematchConfig())[-1:]
     assert warning.kind is WarningKind.MASK_BIAS and "vehicle, -2.4" in warning.detail
     variable = AlignmentKeys(Trajectory(), E, D, {VEHICLE: gtsam.symbol("B", 0)})
-    assert robust_covariance(P, TermSums.of(whole, 1.0), SideErrors(0, 0, 1), variable).mask_biases_px == {}
+    assert robust_covariance(P, TermSums.of(whole, 1.0), ErrorModel(0, 0, 1), variable).mask_biases_px == {}
 
 
 def test_errors_of_sides_are_found_in_the_residuals() -> None:
@@ -136,12 +136,12 @@ def test_a_marginal_that_is_too_sure_is_told() -> None:
     rows = [replace(each, J=np.where(each.J != 0.0, seen[each.sides], 0.0)) for each in shape]
     P = marginal_of(rows, 1.0, 1.0)
     found = robust_covariance(
-        P, total(TermSums.of(each, 1.0) for each in rows), SideErrors(1.0, 0.0, 1.0), KEYS
+        P, total(TermSums.of(each, 1.0) for each in rows), ErrorModel(1.0, 0.0, 1.0), KEYS
     )
     times = times_too_sure(P[:7, :7], found.clustered)
-    kinds = [w.kind for w in told(P[:7, :7], found, gtsam.Pose3(), RematchConfig())]
+    kinds = [w.kind for w in covariance_warnings(P[:7, :7], found, gtsam.Pose3(), RematchConfig())]
     assert times > 3.0 and WarningKind.OVERCONFIDENT_MARGINAL in kinds
-    honest = told(found.clustered, found, gtsam.Pose3(), RematchConfig())
+    honest = covariance_warnings(found.clustered, found, gtsam.Pose3(), RematchConfig())
     assert WarningKind.OVERCONFIDENT_MARGINAL not in [w.kind for w in honest]
 
 

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sst_graph.tracker.sums.running_sums import ScoreSums
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
@@ -17,6 +16,7 @@ from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.covariance.considered import AssumptionConfig, consider
+from sst_graph.covariance.sums import ScoreSums
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
 from sst_graph.errors import ConfigError
@@ -27,6 +27,7 @@ from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.tracker.answer import current
+from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
 
@@ -94,7 +95,7 @@ def leaving(bent: KeptDrive) -> Tracker:
 def _state(tracker: Tracker) -> State:
     """The state at which all matches of a tracker's window were made."""
     assert tracker.estimate.smoother is not None
-    points = [entry.linear.belief.point for entry in tracker.estimate.smoother.entries.values()]
+    points = [entry.linear.information.point for entry in tracker.estimate.smoother.entries.values()]
     assert all(point.cTl.equals(points[0].cTl, 0.0) for point in points)
     state = points[0].state(tracker.matcher.classes)
     seen = [(point.tracks, point.object_biases_px.tolist()) for point in points]
@@ -180,14 +181,16 @@ def test_beliefs_that_hold_nothing_take_nothing_of_others() -> None:
 
 
 def test_new_unknowns_come_before_what_is_held() -> None:
-    sums, rng = ScoreSums.empty(4, held=2), np.random.default_rng(3)
+    sums, rng = RunningSums.empty(4, held=2), np.random.default_rng(3)
     A = rng.standard_normal((9, 6))
-    sums.JJ = sums.frames = sums.closed = A.T @ A
-    sums.live = {5: (A[0], 1)}
+    H = A.T @ A
+    sums.scores = ScoreSums(H, H, H, np.array([5]), A[:1])
     sums.grow(5)
-    there = [0, 1, 2, 3, 5, 6]
-    np.testing.assert_array_equal(sums.JJ[np.ix_(there, there)], A.T @ A)
-    assert not sums.JJ[4].any() and sums.live[5][0].tolist() == np.insert(A[0], 4, 0.0).tolist()
+    there, grown = [0, 1, 2, 3, 5, 6], sums.scores
+    for M in (grown.independent, grown.side_frames, grown.closed):
+        np.testing.assert_array_equal(M[np.ix_(there, there)], H)
+        assert not M[4].any()
+    assert grown.scores[0].tolist() == np.insert(A[0], 4, 0.0).tolist()
     assert sums.objects.closed.shape == (5, 5)
 
 

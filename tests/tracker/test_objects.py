@@ -1,15 +1,18 @@
-"""Leaving out objects one by one: in the window, after it, and after the objects are gone; milestones."""
+"""Leaving out objects one by one: in the window, after it, and after the objects are gone.
+
+And when the window is relinearized.
+"""
 
 from __future__ import annotations
 
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.tracker.window.relinearization import RelinearizationSchedule
 
 from sst_graph.covariance.jackknife import ObjectSpread, composed
 from sst_graph.tracker.sums.object_sums import ObjectInformation, ObjectSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.relinearization import RelinearizationSchedule
 
 TRACKS = (4, 7, 9)
 N = 8 + len(TRACKS)
@@ -148,7 +151,7 @@ def test_the_number_of_objects_counts_those_gone() -> None:
     ("start", "window", "times"),
     [(12, 60, [24, 48, 60, 120, 240]), (30, 60, [60, 120, 240]), (70, 60, [140])],
 )
-def test_settling_gets_rarer(start: int, window: int, times: list[int]) -> None:
-    milestones = RelinearizationSchedule(100, 2 * start, window)
-    reached = [seen for seen in range(start, 260) if milestones.reached(99 + seen)]
+def test_relinearization_gets_rarer(start: int, window: int, times: list[int]) -> None:
+    schedule = RelinearizationSchedule(100, 2 * start, window)
+    reached = [seen for seen in range(start, 260) if schedule.reached(99 + seen)]
     assert reached == times

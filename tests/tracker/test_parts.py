@@ -9,21 +9,22 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair, SideSums
-from sst_graph.tracker.sums.running_sums import ScoreSums, fit_sides
 
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
+from sst_graph.covariance.sums import ScoreSums
 from sst_graph.tracker.config import AlarmConfig, TrackerConfig
 from sst_graph.tracker.monitor.adoption import Adoption
 from sst_graph.tracker.monitor.confirmation import Confirmation, steps
 from sst_graph.tracker.monitor.statistic import ChangeStatistic, Comparison, EstimateCovariance
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
+from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
 
 FloatArray = NDArray[np.float64]
 N = 9
 
 
-def _belief(seed: int) -> Gaussian:
+def _gaussian(seed: int) -> Gaussian:
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((20, N))
     point = Point(gtsam.Pose3.Expmap(0.3 * rng.standard_normal(6)), 0.1, rng.standard_normal(2))
@@ -31,37 +32,38 @@ def _belief(seed: int) -> Gaussian:
 
 
 def test_local_and_moved_are_inverse() -> None:
-    a, step = _belief(1).point, np.linspace(-0.2, 0.3, N)
+    a, step = _gaussian(1).point, np.linspace(-0.2, 0.3, N)
     np.testing.assert_allclose(a.local(a.moved(step)), step, atol=1e-12)
 
 
-def test_the_factor_is_the_belief() -> None:
-    belief, keys = _belief(2), [7, 3, 5, 11]
-    factor = pickle.loads(pickle.dumps(belief.factor(keys)))
+def test_the_factor_is_the_gaussian() -> None:
+    gaussian, keys = _gaussian(2), [7, 3, 5, 11]
+    factor = pickle.loads(pickle.dumps(gaussian.factor(keys)))
     graph, values, ordering = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.Ordering()
     graph.add(factor)
-    insert_point(values, keys, belief.point)
+    insert_point(values, keys, gaussian.point)
     for key in keys:
         ordering.push_back(key)
     H, g = graph.linearize(values).hessian(ordering)
-    np.testing.assert_allclose(H, belief.information, atol=1e-9)
-    np.testing.assert_allclose(g, belief.vector, atol=1e-9)
+    np.testing.assert_allclose(H, gaussian.information, atol=1e-9)
+    np.testing.assert_allclose(g, gaussian.vector, atol=1e-9)
     optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
-    assert optimum.atVector(3)[0] == pytest.approx(belief.mean().offset_s, abs=1e-6)
+    assert optimum.atVector(3)[0] == pytest.approx(gaussian.mean().offset_s, abs=1e-6)
 
 
 def test_a_random_walk_adds_its_variance() -> None:
-    belief, variances = _belief(3), np.linspace(0.0, 0.4, N)
-    after = belief.drifted(variances)
-    expected = np.linalg.inv(belief.information) + np.diag(variances)
+    gaussian, variances = _gaussian(3), np.linspace(0.0, 0.4, N)
+    after = gaussian.drifted(variances)
+    expected = np.linalg.inv(gaussian.information) + np.diag(variances)
     np.testing.assert_allclose(np.linalg.inv(after.information), expected, rtol=1e-9)
     np.testing.assert_allclose(
-        np.linalg.solve(after.information, after.vector), np.linalg.solve(belief.information, belief.vector)
+        np.linalg.solve(after.information, after.vector),
+        np.linalg.solve(gaussian.information, gaussian.vector),
     )
 
 
-def test_beliefs_add_at_one_point() -> None:
-    a, b = _belief(4), _belief(5)
+def test_gaussians_add_about_one_point() -> None:
+    a, b = _gaussian(4), _gaussian(5)
     b = Gaussian(a.point.moved(np.full(N, 1e-3)), b.information, b.vector)
     both = a.plus(b)
     H = a.information + b.information
@@ -72,14 +74,17 @@ def test_beliefs_add_at_one_point() -> None:
 def test_error_model_of_simulated_sides() -> None:
     """Known variances of side, side in a frame, and match come back, though a bias an object was fitted."""
     rng = np.random.default_rng(0)
-    rows = []
+    residuals, sides, frames = [], [], []
     shared = rng.normal(0.0, 0.6, (100, 4))
     shared = (shared - shared.mean(axis=1, keepdims=True)).ravel()
     for side in range(400):
-        for _ in range(8):
-            r = shared[side] + rng.normal(0.0, 0.4) + rng.normal(0.0, 0.9, 12)
-            rows.append([side, r.mean(), 12.0, 12.0, ((r - r.mean()) ** 2).sum(), 1.0])
-    model = fit_sides(np.array(rows))
+        for frame in range(8):
+            residuals.append(shared[side] + rng.normal(0.0, 0.4) + rng.normal(0.0, 0.9, 12))
+            sides += [side] * 12
+            frames += [frame] * 12
+    r, ones = np.concatenate(residuals), np.ones(len(sides))
+    moved = np.ones(len(sides), np.bool_)
+    model = fit_error_model(SideResiduals.of(r, ones, np.array(sides), np.array(frames), moved))
     found = np.sqrt([model.side, model.side_frame, model.match])
     np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)  # floors: 0.36, 0.32
 
@@ -89,13 +94,12 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     J = rng.standard_normal((200, N))
     which = np.repeat(np.arange(4), 50)
     r = -J @ truth + rng.standard_normal(200) + 0.5 * rng.standard_normal(4)[which]
-    scores = np.zeros((4, N))
-    np.add.at(scores, which, J)
-    ones, fifty = np.ones(4), np.full(4, 50.0)
-    sides = SideSums(side + np.arange(4), scores, 0.0 * ones, fifty, fifty, fifty)
+    ones, still = np.ones(200), np.zeros(200, np.intp)
+    residuals = SideResiduals.of(r, ones, side + which, still, np.ones(200, np.bool_))
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
-    belief = Gaussian(point, J.T @ J, -J.T @ r)
-    return LinearizedPair(belief, belief, J.T @ J, sides, scores.T @ scores, 200)
+    information = Gaussian(point, J.T @ J, -J.T @ r)
+    scores = ScoreSums.of_frame(J, ones, side + which)
+    return LinearizedPair(information, information, scores, residuals, 200)
 
 
 def _model() -> ErrorModel:
@@ -175,27 +179,28 @@ def test_a_direction_without_information_raises_nothing() -> None:
     """At standstill the score of the time offset is rounding only."""
     rng = np.random.default_rng(3)
     score = _score(rng, np.zeros(N), 0)
-    information, vector, JJ = score.belief.information.copy(), score.belief.vector.copy(), score.JJ.copy()
-    rows = score.sides.scores.copy()
-    for array in (information, JJ):
-        array[6, :] = array[:, 6] = 0.0
-    rows[:, 6], vector[6], information[6, 6] = 0.0, 1e-15, 1e-20
-    belief = Gaussian(score.belief.point, information, vector)
+    information, vector = score.information.information.copy(), score.information.vector.copy()
+    without = np.eye(N)
+    without[6, 6] = 0.0
+    information = without @ information @ without
+    vector[6], information[6, 6] = 1e-15, 1e-20
     still = dataclasses.replace(
-        score, belief=belief, JJ=JJ, sides=dataclasses.replace(score.sides, scores=rows)
+        score,
+        information=Gaussian(score.information.point, information, vector),
+        scores=score.scores.transformed(without),
     )
     assert _chi2([still], EstimateCovariance(1e-6 * np.eye(N), (), N)) < 40.0
 
 
 def test_objects_come_and_go_without_loss() -> None:
     """Marginalized out one by one, objects leave what the whole problem says, and how surely."""
-    rng, belief, sigma = np.random.default_rng(4), _belief(6), 0.5
-    whole = belief.with_objects({40: 0, 41: 1, 42: 0}, sigma)
+    rng, gaussian, sigma = np.random.default_rng(4), _gaussian(6), 0.5
+    whole = gaussian.with_objects({40: 0, 41: 1, 42: 0}, sigma)
     assert whole.point.tracks == (40, 41, 42) and whole.point.size == N + 3
-    np.testing.assert_allclose(whole.core().information, belief.information, atol=1e-9)
-    np.testing.assert_allclose(whole.core().vector, belief.vector, atol=1e-9)
+    np.testing.assert_allclose(whole.core().information, gaussian.information, atol=1e-9)
+    np.testing.assert_allclose(whole.core().vector, gaussian.vector, atol=1e-9)
     A = rng.standard_normal((30, N + 2))
-    seen = belief.point.seen({42: 0, 40: 0})
+    seen = gaussian.point.seen({42: 0, 40: 0})
     whole = whole.plus(Gaussian(seen, A.T @ A, rng.standard_normal(N + 2)))
     S = np.cov(rng.standard_normal((N + 3, 50)))
     rows = np.linalg.inv(whole.information)
@@ -212,22 +217,22 @@ def test_objects_come_and_go_without_loss() -> None:
 
 def test_score_sums_follow_the_objects() -> None:
     rng = np.random.default_rng(5)
-    score, sums, model = _score(rng, np.zeros(N), 0), ScoreSums.empty(N), ErrorModel(0.25, 0.1, 2.0)
+    score, sums, model = _score(rng, np.zeros(N), 0), RunningSums.empty(N), ErrorModel(0.25, 0.1, 2.0)
     columns = np.arange(N)
     sums.add(score, columns, 0)
-    expected = sums.surplus([], [], model)
+    expected = sums.excess([], [], model)
     sums.grow(N + 2)
-    grown = sums.surplus([], [], model)
+    grown = sums.excess([], [], model)
     np.testing.assert_allclose(grown[:N, :N], expected)
     assert not grown[N:].any()
     # A pair counts the same in the window as when it has left it.
     again = _score(rng, np.zeros(N), 2)
-    both = sums.surplus([again], [columns], model)
+    both = sums.excess([again], [columns], model)
     sums.add(again, columns, 1)
-    np.testing.assert_allclose(sums.surplus([], [], model), both, rtol=1e-9)
+    np.testing.assert_allclose(sums.excess([], [], model), both, rtol=1e-9)
     T = rng.standard_normal((N, N + 2))
     sums.transform(T)
-    np.testing.assert_allclose(sums.surplus([], [], model), T @ both @ T.T, rtol=1e-9)
+    np.testing.assert_allclose(sums.excess([], [], model), T @ both @ T.T, rtol=1e-9)
 
 
 def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
@@ -240,7 +245,7 @@ def test_a_new_object_is_as_uncertain_as_its_class_and_more() -> None:
 
 def test_a_worse_candidate_is_refused() -> None:
     """A covariance within the limits, and held-out costs that are no worse, over enough frames."""
-    good, bad = _belief(1).point, _belief(2).point
+    good, bad = _gaussian(1).point, _gaussian(2).point
     adoption = Adoption(frames=5, margin=0.02)
     for _ in range(4):
         adoption.compare(1.0, 2.0)

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sst_graph.tracker.window.relinearization import SCANS
 from streets import TRACKED_STREET, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulatedDrive, simulate
+from sst_graph.tracker.window.relinearization import SCANS
 from sst_graph.types import Frame
 
 

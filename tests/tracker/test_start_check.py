@@ -72,29 +72,29 @@ def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, fram
     assert tracker.estimate.smoother is not None
     assert (
         tracker.estimate.smoother.static_information() is None
-        and tracker.estimate.uncertainty.by_static is None
+        and tracker.estimate.uncertainty.by_static_objects is None
     )
     # 1. One object's matches count as those of a moving one.
     smoother = tracker.estimate.smoother
     for scan, entry in smoother.entries.items():
         seen = sorted(entry.linear.places)
-        part = entry.linear.belief.without(seen[:1])[0] if seen else entry.linear.belief
+        part = entry.linear.information.without(seen[:1])[0] if seen else entry.linear.information
         half = dataclasses.replace(part, information=0.5 * part.information)
-        score = dataclasses.replace(entry.linear, standing=half)
-        smoother.entries[scan] = dataclasses.replace(entry, score=score)
+        linear = dataclasses.replace(entry.linear, static=half)
+        smoother.entries[scan] = dataclasses.replace(entry, linear=linear)
     alone, whole = smoother.static_information(), Uncertainty.of(smoother)
-    assert alone is not None and whole.by_static is not None
-    assert np.linalg.eigvalsh(whole.by_static - whole.covariance[:7, :7])[0] > -1e-9
-    assert (np.diag(whole.by_static) > 1.2 * np.diag(whole.covariance)[:7]).any()
+    assert alone is not None and whole.by_static_objects is not None
+    assert np.linalg.eigvalsh(whole.by_static_objects - whole.covariance[:7, :7])[0] > -1e-9
+    assert (np.diag(whole.by_static_objects) > 1.2 * np.diag(whole.covariance)[:7]).any()
     # 2. What they cannot separate is weak, though the whole covariance is small.
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     joint = dataclasses.replace(whole.joint, matrix=whole.joint.matrix.copy())
     joint.matrix[:7, :], joint.matrix[:, :7] = 0.0, 0.0
     joint.matrix[:7, :7] = good
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
-    for by_static, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
-        tracker.estimate.uncertainty = Uncertainty(joint, 1.0, by_static)
+    for by_static_objects, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
+        tracker.estimate.uncertainty = Uncertainty(joint, 1.0, by_static_objects)
         update = current(tracker)
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)
-    assert "by what stands alone" in update.weak_directions[0].sentence
+    assert "by static objects alone" in update.weak_directions[0].sentence

@@ -84,7 +84,7 @@ def test_objects_are_judged_as_the_batch_judges_them() -> None:
         assert moving[name].unknown_mps == pytest.approx(mover.unknown_mps)
 
 
-def test_an_object_that_starts_to_move_is_judged_anew_in_past_scans() -> None:
+def test_an_object_that_starts_to_move_changes_past_scans() -> None:
     drive = _drive(30)
     window = Window(CAMERA, 40)
     noticed, later = None, set[int]()

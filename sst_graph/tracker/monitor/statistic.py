@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
+from sst_graph.covariance.sums import total
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.window.gaussian import Point
 
@@ -106,18 +107,15 @@ class Comparison:
         n = covariance.core_size
         places = {track: place for score in scores for track, place in score.places.items()}
         order = list(places)
-        H, g, M = np.zeros((n, n + len(order))), np.zeros(n), np.zeros((n, n))
-        by_side: dict[int, FloatArray] = {}
+        H, g = np.zeros((n, n + len(order))), np.zeros(n)
         for score in scores:
-            own = [*range(n), *(n + order.index(track) for track in score.belief.point.tracks)]
-            H[:, own] += score.belief.information[:n]
-            g += score.belief.vector[:n]
-            M += max(1.0, model.match) * score.JJ[:n, :n] + model.side_frame * score.sums[:n, :n]
-            for side, row in zip(score.sides.sides.tolist(), score.sides.scores[:, :n], strict=True):
-                by_side[side] = by_side[side] + row if side in by_side else row
-        if by_side:
-            rows = np.stack(list(by_side.values()))
-            M += model.side * (rows.T @ rows)
+            own = [*range(n), *(n + order.index(track) for track in score.information.point.tracks)]
+            H[:, own] += score.information.information[:n]
+            g += score.information.vector[:n]
+        core = [score.scores.columns(slice(n)) for score in scores]
+        # Without biases of the objects, for these frames may be of few: no less than independent matches.
+        least = replace(model, match=max(1.0, model.match))
+        M = total(n, core, [np.arange(n)] * len(core)).variance(least)
         return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), covariance.with_objects(places, object_sigma_px))
 
     def chi2(self) -> float:

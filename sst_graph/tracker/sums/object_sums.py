@@ -1,4 +1,4 @@
-"""What each object says, frame by frame, for the jackknife over objects of the batch's covariance.
+"""The matches of each object by themselves, frame by frame, for the jackknife over objects.
 
 Objects of the window, and those that may be seen again, are kept one by one; of those gone for good only the
 square of the step that the estimate would take without them.
@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.jackknife import ObjectSpread, growth_without
+from sst_graph.covariance.jackknife import ObjectSpread, steps_without
 from sst_graph.tracker.window.gaussian import Gaussian, Point, core_steps
 
 FloatArray = NDArray[np.float64]
@@ -21,8 +21,8 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectInformation:
-    """The matches of each object of a frame alone, on extrinsic, offset, mask biases, parameters and its own
-    bias if any.
+    """The matches of each object of a frame by themselves, on extrinsic, offset, mask biases, parameters and
+    the object's own bias if it has one.
 
     Attributes:
         point: where the frame is linearized.
@@ -59,10 +59,10 @@ class ObjectInformation:
         weights = np.add.reduceat(roots[order] ** 2, bounds[:-1])
         return cls(point, names, information, vector, biases, weights)
 
-    def one_by_one(self) -> dict[int, ObjectBelief]:
+    def by_track(self) -> dict[int, SingleObject]:
         """By track."""
         return {
-            track: ObjectBelief(
+            track: SingleObject(
                 Gaussian(_restricted(self.point, track), self.information[k], self.vector[k]),
                 float(self.weights[k]),
             )
@@ -70,28 +70,30 @@ class ObjectInformation:
         }
 
     @classmethod
-    def single(cls, track: int, own: ObjectBelief) -> ObjectInformation:
+    def single(cls, track: int, own: SingleObject) -> ObjectInformation:
         """One object."""
-        belief, biases = own.belief, own.belief.point.object_biases_px
+        gaussian, biases = own.gaussian, own.gaussian.point.object_biases_px
         weights = np.array([own.weight])
-        return cls(belief.point, (track,), belief.information[None], belief.vector[None], biases, weights)
+        return cls(
+            gaussian.point, (track,), gaussian.information[None], gaussian.vector[None], biases, weights
+        )
 
 
 @dataclass(frozen=True)
-class ObjectBelief:
+class SingleObject:
     """The matches of one object in many frames, and the sum of their robust weights."""
 
-    belief: Gaussian
+    gaussian: Gaussian
     weight: float
 
-    def plus(self, other: ObjectBelief) -> ObjectBelief:
-        """These matches and others."""
-        return ObjectBelief(self.belief.plus(other.belief), self.weight + other.weight)
+    def plus(self, other: SingleObject) -> SingleObject:
+        """These matches and others of the object."""
+        return SingleObject(self.gaussian.plus(other.gaussian), self.weight + other.weight)
 
 
 @dataclass
 class ObjectSums:
-    """Of frames that have left the window; matrices in the columns of the belief that took them in.
+    """Of frames that have left the window; matrices in the columns of the Gaussian that holds them.
 
     Attributes:
         closed: (n, n) sum of squared scores that stand for the objects gone.
@@ -104,7 +106,7 @@ class ObjectSums:
     count: int = 0
     weight: float = 0.0
     weight2: float = 0.0
-    live: dict[int, ObjectBelief] = field(default_factory=dict)
+    live: dict[int, SingleObject] = field(default_factory=dict)
 
     @classmethod
     def empty(cls, n: int) -> ObjectSums:
@@ -112,12 +114,12 @@ class ObjectSums:
         return cls(np.zeros((n, n)))
 
     def add(self, objects: ObjectInformation) -> None:
-        """Take in the objects of a frame."""
-        for track, own in objects.one_by_one().items():
+        """Add the objects of a frame."""
+        for track, own in objects.by_track().items():
             self.live[track] = self.live[track].plus(own) if track in self.live else own
 
     def transform(self, T: FloatArray) -> None:
-        """Follow the belief to other unknowns."""
+        """Follow the Gaussian to other unknowns."""
         self.closed = T @ self.closed @ T.T
 
     def close(self, seen: Container[int], information: FloatArray, naive: FloatArray, point: Point) -> None:
@@ -130,8 +132,8 @@ class ObjectSums:
         gone = {track: self.live.pop(track) for track in list(self.live) if track not in seen}
         if not gone:
             return
-        beliefs = [ObjectInformation.single(track, own) for track, own in gone.items()]
-        steps = _steps_without(*_summed(beliefs, point), naive, point)
+        parts = [ObjectInformation.single(track, own) for track, own in gone.items()]
+        steps = _steps_without(*_summed(parts, point), naive, point)
         scores = steps @ information
         self.closed = self.closed + scores.T @ scores
         self.count += len(gone)
@@ -142,18 +144,18 @@ class ObjectSums:
         """How the estimate varies with the objects.
 
         Args:
-            window: objects of the frames beside those taken in.
+            window: objects of the frames beside those added.
             naive: (n, n) inverse of all information.
             point: the estimate.
         """
-        beliefs = [*(ObjectInformation.single(track, own) for track, own in self.live.items()), *window]
+        parts = [*(ObjectInformation.single(track, own) for track, own in self.live.items()), *window]
         squares, count = naive @ self.closed @ naive, self.count
         weight, weight2 = self.weight, self.weight2
-        if beliefs:
-            tracks, informations, vectors = _summed(beliefs, point)
+        if parts:
+            tracks, informations, vectors = _summed(parts, point)
             steps = _steps_without(tracks, informations, vectors, naive, point)
             squares, count = squares + steps.T @ steps, count + len(tracks)
-            weights = _weights_by_track(beliefs)
+            weights = _weights_by_track(parts)
             weight, weight2 = weight + float(weights.sum()), weight2 + float(weights @ weights)
         return ObjectSpread.from_sums(squares, count, weight, weight2)
 
@@ -166,28 +168,28 @@ def _restricted(point: Point, track: int) -> Point:
     return point.seen({track: 0}) if track in point.tracks else point.core()
 
 
-def _weights_by_track(beliefs: Sequence[ObjectInformation]) -> FloatArray:
+def _weights_by_track(parts: Sequence[ObjectInformation]) -> FloatArray:
     """Weight of each object, summed over its frames."""
-    tracks = np.concatenate([part.tracks for part in beliefs])
-    weights = np.concatenate([part.weights for part in beliefs])
+    tracks = np.concatenate([part.tracks for part in parts])
+    weights = np.concatenate([part.weights for part in parts])
     return np.asarray(np.bincount(np.unique(tracks, return_inverse=True)[1].reshape(-1), weights))
 
 
 def _summed(
-    beliefs: Sequence[ObjectInformation], point: Point
+    parts: Sequence[ObjectInformation], point: Point
 ) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
     """(k) tracks, (k, m, m) informations and (k, m) vectors about a point, summed object by object."""
-    counts = [len(part.tracks) for part in beliefs]
-    information = np.concatenate([part.information for part in beliefs])
-    tracks = np.concatenate([part.tracks for part in beliefs])
-    steps = np.repeat(core_steps([part.point for part in beliefs], point), counts, axis=0)
+    counts = [len(part.tracks) for part in parts]
+    information = np.concatenate([part.information for part in parts])
+    tracks = np.concatenate([part.tracks for part in parts])
+    steps = np.repeat(core_steps([part.point for part in parts], point), counts, axis=0)
     if information.shape[1] > steps.shape[1]:
-        before = np.concatenate([part.biases_px for part in beliefs])
+        before = np.concatenate([part.biases_px for part in parts])
         known = dict(zip(point.tracks, point.object_biases_px.tolist(), strict=True))
         now = [known.get(track, bias) for track, bias in zip(tracks.tolist(), before.tolist(), strict=True)]
         steps = np.column_stack([steps, now - before])
     moved = (information @ steps[:, :, None])[:, :, 0]
-    vectors = np.concatenate([part.vector for part in beliefs]) - moved
+    vectors = np.concatenate([part.vector for part in parts]) - moved
     order = np.argsort(tracks, kind="stable")
     firsts = np.append(0, np.flatnonzero(np.diff(tracks[order])) + 1)
     names = tuple(tracks[order[firsts]].tolist())
@@ -197,20 +199,9 @@ def _summed(
 def _steps_without(
     tracks: Sequence[int], informations: FloatArray, vectors: FloatArray, naive: FloatArray, point: Point
 ) -> FloatArray:
-    """(k, n) how far the linearized estimate moves without each of the objects.
-
-    As :func:`~sst_graph.covariance.cluster_robust.step_without` in the few columns of an object: with p its
-    information, s its score there, and naive = C C' on them, f(p C C') = C^-T f(C' p C) C'.
-    """
-    sigmas, m = np.sqrt(np.diag(naive)), informations.shape[1]
-    core = point.core_size
-    places = np.array([[*range(core), *([core + point.tracks.index(t)] if m > core else [])] for t in tracks])
-    scaled = naive / np.outer(sigmas, sigmas)
-    scale = sigmas[places]
-    C = np.linalg.cholesky(scaled[places[:, :, None], places[:, None, :]] + 1e-14 * np.eye(m))
-    p = informations * (scale[:, :, None] * scale[:, None, :])
-    Ct = np.swapaxes(C, 1, 2)
-    shares, axes = np.linalg.eigh(Ct @ p @ C)
-    score = np.swapaxes(axes, 1, 2) @ (Ct @ (-vectors * scale)[:, :, None])
-    moved = np.linalg.solve(Ct, axes @ (growth_without(shares)[:, :, None] * score))
-    return np.asarray((np.swapaxes(moved, 1, 2) @ scaled[places])[:, 0, :] * sigmas)
+    """(k, n) how far the linearized estimate moves without each of the objects."""
+    core, m = point.core_size, informations.shape[1]
+    columns = np.array(
+        [[*range(core), *([core + point.tracks.index(t)] if m > core else [])] for t in tracks]
+    )
+    return steps_without(informations, -vectors, columns, naive)

@@ -1,19 +1,19 @@
-"""A Gaussian belief on extrinsic, time offset, mask biases and estimated parameters of assumptions, in
-information form at a point."""
+"""Gaussians on extrinsic, time offset, mask biases and estimated parameters of assumptions, in information
+form about a point."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import groupby, pairwise
+from itertools import pairwise
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors import custom_factor
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse, scattered
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.types import SemanticClass
 
@@ -138,7 +138,7 @@ class Gaussian:
     """exp(-1/2 d' information d + vector' d) of the step d from a point.
 
     Behind the unknowns there may be parameters that are held at 0, those of assumptions that are not
-    estimated: what the data say of them is carried along, and taken for what it is where all else is known.
+    estimated: the information that the data have on them is kept with that on the unknowns.
 
     Attributes:
         point: where it was linearized.
@@ -156,27 +156,27 @@ class Gaussian:
         return len(self.vector) - self.point.size
 
     def without_held(self) -> Gaussian:
-        """The belief on the unknowns alone."""
+        """On the unknowns alone, the held parameters at 0."""
         n = self.point.size
         return self if self.held == 0 else Gaussian(self.point, self.information[:n, :n], self.vector[:n])
 
     def holding(self, count: int) -> Gaussian:
-        """The belief with so many parameters held of which nothing is known yet."""
+        """With so many parameters held on which there is no information yet."""
         n = len(self.vector)
         information = np.zeros((n + count, n + count))
         information[:n, :n] = self.information
         return Gaussian(self.point, information, np.append(self.vector, np.zeros(count)))
 
     def at(self, point: Point) -> Gaussian:
-        """The same belief about another, near point; objects that are new there are left out."""
+        """The same about another, near point; objects that are new there are left out."""
         point = point if point.tracks == self.point.tracks else _like(self.point, point)
         moved = self.information[:, : self.point.size] @ self.point.local(point)
         return Gaussian(point, self.information, self.vector - moved)
 
     def plus(self, other: Gaussian) -> Gaussian:
-        """Both beliefs together, at this one's point; the objects of the other are all known here.
+        """Both together, about this one's point; the objects of the other are all known here.
 
-        What is held is what this belief holds, or nothing.
+        What is held is what this one holds, or nothing.
         """
         other = other.at(self.point) if self.held else other.without_held().at(self.point)
         columns = self.point.columns(other.point.tracks, other.held)
@@ -186,20 +186,20 @@ class Gaussian:
         return Gaussian(self.point, information, vector)
 
     def information_with(self, others: Sequence[Gaussian]) -> FloatArray:
-        """(n, n) information of this belief and others, whose objects are all known here."""
+        """(n, n) information of this and others, whose objects are all known here."""
         others = others if self.held else [other.without_held() for other in others]
         columns = [self.point.columns(other.point.tracks, other.held) for other in others]
         return self.information + scattered(len(self.vector), columns, [o.information for o in others])[0]
 
     def vector_with(self, others: Sequence[Gaussian]) -> FloatArray:
-        """(n,) vector of the same, about this belief's point."""
+        """(n,) vector of the same, about this one's point."""
         vector = self.vector.copy()
         for other in others:
             vector[self.point.columns(other.point.tracks, other.held)] += other.at(self.point).vector
         return vector
 
     def with_objects(self, places: Mapping[int, int], sigma_px: float) -> Gaussian:
-        """The belief with biases of further objects, each within ``sigma_px`` of its class's.
+        """With biases of further objects, each within ``sigma_px`` of its class's.
 
         Args:
             places: place of its class's bias by the number of the track.
@@ -225,11 +225,11 @@ class Gaussian:
         return Gaussian(point, information, vector)
 
     def without(self, tracks: Sequence[int]) -> tuple[Gaussian, FloatArray]:
-        """The belief with some objects' biases marginalized out, and how scores follow.
+        """With some objects' biases marginalized out, and how scores follow.
 
         Returns:
-            the belief; T (m, n) = [I, -H_xo H_oo^-1]: a score (n,) of the whole belief counts in the smaller
-            one as T times it.
+            the Gaussian; T (m, n) = [I, -H_xo H_oo^-1]: a score (n,) of the whole becomes T times it in the
+            smaller one.
         """
         kept = [track for track in self.point.tracks if track not in set(tracks)]
         x = self.point.columns(kept, self.held)
@@ -243,7 +243,7 @@ class Gaussian:
         return Gaussian(point, 0.5 * (information + information.T), T @ self.vector), T
 
     def core(self) -> Gaussian:
-        """The belief on [extrinsic, offset, biases] alone."""
+        """On [extrinsic, offset, biases, parameters] alone, the objects' biases marginalized out."""
         return self.without(self.point.tracks)[0] if self.point.tracks else self
 
     def transition(self, variances: FloatArray) -> FloatArray:
@@ -253,19 +253,19 @@ class Gaussian:
         return np.asarray(np.linalg.inv(np.eye(len(Q)) + self.information * Q[None, :]))
 
     def drifted(self, variances: FloatArray) -> Gaussian:
-        """The belief after a random walk."""
+        """After a random walk of the unknowns."""
         A = self.transition(variances)
         information = A @ self.information
         return Gaussian(self.point, 0.5 * (information + information.T), A @ self.vector)
 
     def mean(self) -> Point:
-        """The most likely value, of beliefs that hold nothing."""
+        """The most likely value; nothing is held."""
         return self.point.moved(scaled_inverse(self.information) @ self.vector)
 
     def factor(self, keys: Sequence[int]) -> gtsam.LinearContainerFactor:
         """As a factor on [extrinsic, offset, biases..., parameters..., object biases...]; it can be pickled.
 
-        Of beliefs that hold nothing.
+        Nothing is held.
         """
         n, starts = self.point.size, [0, 6, *range(7, self.point.size + 1)]
         scale = np.sqrt(np.maximum(np.diag(self.information), 1e-30))
@@ -287,7 +287,7 @@ class Gaussian:
 
 @lru_cache(maxsize=4096)
 def _columns(core: int, known: tuple[int, ...], chosen: tuple[int, ...], held: int) -> IntArray:
-    """Kept, for each frame asks for those of the whole window, and few of them are new."""
+    """Cached: each frame needs those of the whole window, and few of them are new."""
     objects, size = [core + known.index(track) for track in chosen], core + len(known)
     return np.array([*range(core), *objects, *range(size, size + held)], dtype=np.intp)
 
@@ -307,26 +307,6 @@ def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
     parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
     return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
-
-
-def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray]) -> list[FloatArray]:
-    """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
-    if not places:
-        return [np.zeros((n, n)) for _ in blocks]
-    # Blocks of one size together: a call for each of them would cost more than what it does.
-    order: list[int] = sorted(range(len(places)), key=lambda i: len(places[i]))
-    groups = [list(group) for _, group in groupby(order, key=lambda i: len(places[i]))]
-    columns = [np.array([places[i] for i in group]) for group in groups]
-    where = np.concatenate([(own[:, :, None] * n + own[:, None, :]).reshape(-1) for own in columns])
-    return [
-        np.asarray(np.bincount(where, _in_a_row(some, groups), n * n).reshape(n, n), np.float64)
-        for some in blocks
-    ]
-
-
-def _in_a_row(blocks: Sequence[FloatArray], groups: Sequence[Sequence[int]]) -> FloatArray:
-    """(k,) all entries of blocks, those of each group have one shape."""
-    return np.concatenate([np.array([blocks[i] for i in group]).reshape(-1) for group in groups])
 
 
 def _like(target: Point, source: Point) -> Point:

@@ -1,4 +1,4 @@
-"""Matches of the window's scans, at any point, with the window's knowledge of the objects."""
+"""Matches of the window's scans at any point, with the window's tracks and velocities of the objects."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from sst_graph.tracker.monitor.adoption import mean_cost
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair, with_share
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
-from sst_graph.tracker.window.pending_pairs import REACH_SIGMAS, Other
+from sst_graph.tracker.window.pending_pairs import REACH_SIGMAS, OtherPairing
 from sst_graph.tracker.window.window import Window
 from sst_graph.types import SemanticClass
 
@@ -33,7 +33,7 @@ _SMOOTHED = 12
 
 
 class WindowMatcher:
-    """Pairs and matches the scans of a window: moving objects left out, each object with its track."""
+    """Pairs and matches the scans of a window: dynamic objects left out, each object with its track."""
 
     def __init__(self, window: Window, config: TrackerConfig) -> None:
         self.window = window
@@ -47,22 +47,22 @@ class WindowMatcher:
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What it knows, without what it has at hand for the present frame."""
+        """All but what it keeps for the present frame."""
         return {**vars(self), "_twists": None, "_last": None}
 
     def check_lower_edges(self, point: Point) -> None:
-        """Match edges towards the ground from now on, of classes whose labels agree about them."""
+        """Match lower edges from now on, of classes whose labels agree about them."""
         if self.config.calibration.lower_edges.use != "never":
             self.set_lower_edges(self.lower_edge_support(point, None))
 
     def lower_edge_support(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
-        """What the edges towards the ground of some scans (None: all) say about their labels at a point."""
+        """How well the labels agree with the lower edges of some scans (None: all) at a point."""
         drive, numbers = self.window.drive(None if chosen is None else chosen.__contains__)
         tracks, state = self._tracks(drive, numbers), point.state(self.classes)
         return lower_edge_support([drive], tracks, state, self.config.calibration.joint)
 
     def set_lower_edges(self, support: LowerEdgeSupport) -> None:
-        """Match edges towards the ground from now on, of classes whose labels agree as this support says."""
+        """Match lower edges from now on, of classes whose labels agree by this support."""
         chosen, _ = support.agreed(self.config.calibration.lower_edges)
         self.graph = replace(self.config.calibration.joint.graph, lower_edges=chosen)
 
@@ -90,10 +90,10 @@ class WindowMatcher:
             if len(pair) >= _MIN_MATCHES:
                 pair = pair if share == 1.0 else with_share(pair, share)
                 by_object = not self.config.drift.enabled
-                score = self._score(pair, number, point, share, by_object, self.held_names)
+                linear = self._linearized(pair, number, point, share, by_object, self.held_names)
                 image = self.window.images[pair.pair.image]
                 out = self.left_out(pair, number, point.offset_s)
-                found[number] = MatchedPair(pair, score, stamps[number], image.index, left_out=out)
+                found[number] = MatchedPair(pair, linear, stamps[number], image.index, left_out=out)
         for number in self.window.leaving():
             if number in found and offset_sigma_s > 0.0:
                 other = self._other(point, found[number], number, kernel or self.kernel, offset_sigma_s)
@@ -101,9 +101,9 @@ class WindowMatcher:
         return found, set(numbers) - set(found)
 
     def _other(
-        self, point: Point, found: Found, number: int, kernel: RobustKernel, offset_sigma_s: float
-    ) -> Other | None:
-        """What a scan says with the image on its other side, if the offset may still lead there."""
+        self, point: Point, found: MatchedPair, number: int, kernel: RobustKernel, offset_sigma_s: float
+    ) -> OtherPairing | None:
+        """The scan with the image on its other side, if the offset may still move it there."""
         images = {image.index: k for k, image in enumerate(self.window.images)}
         used = images[found.image]
         stamps = [image.stamp_ns for image in self.window.images]
@@ -120,27 +120,27 @@ class WindowMatcher:
         pairs = associate([part], tracks, state, kernel, self.graph)
         if not pairs or len(pairs[0]) < _MIN_MATCHES:
             return None
-        score = self._score(pairs[0], number, point, 1.0, False, self.held_names)
-        return Other(score.bent, middle_s, early)
+        linear = self._linearized(pairs[0], number, point, 1.0, False, self.held_names)
+        return OtherPairing(linear.observed, middle_s, early)
 
-    def scores(
+    def linearized_at(
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()
     ) -> list[LinearizedPair]:
-        """What some scans say at a point, all their objects but those of the tracks ``without``."""
-        return self.scores_of(self.pairs_at(point, chosen, kernel), point, without)
+        """Some scans matched and linearized at a point, without the objects of some tracks."""
+        return self.linearized(self.pairs_at(point, chosen, kernel), point, without)
 
     def pairs_at(self, point: Point, chosen: Collection[int], kernel: RobustKernel) -> dict[int, PairMatches]:
         """Matches of some scans at a point."""
         return self._pairs(point, chosen, kernel)[0]
 
-    def scores_of(
+    def linearized(
         self, pairs: Mapping[int, PairMatches], point: Point, without: Collection[int] = ()
     ) -> list[LinearizedPair]:
-        """What matches of scans, made at a point, say there without the objects of some tracks."""
+        """Matches of scans, made at a point, linearized there without the objects of some tracks."""
         if without:
             pairs = {number: self._leaving_out(pair, number, without) for number, pair in pairs.items()}
         return [
-            self._score(pair, number, point, 1.0, by_object=False)
+            self._linearized(pair, number, point, 1.0, by_object=False)
             for number, pair in pairs.items()
             if len(pair)
         ]
@@ -176,7 +176,7 @@ class WindowMatcher:
     def left_out(
         self, pair: PairMatches, number: int, offset_s: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
-        """The objects of a scan that count for less with the image of a pair, or for nothing: they move."""
+        """The dynamic objects of a scan whose weight is lower with the image of a pair, or 0."""
         return self.window.left_out(number, offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:
@@ -214,7 +214,7 @@ class WindowMatcher:
         pairs = associate([part], self._tracks(part, numbers), state, kernel, self.graph)
         return {numbers[pair.pair.scan]: pair for pair in pairs}, numbers
 
-    def _score(
+    def _linearized(
         self,
         pair: PairMatches,
         number: int,

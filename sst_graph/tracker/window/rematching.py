@@ -1,16 +1,18 @@
-"""Which scans of the window are matched anew with a frame."""
+"""Which scans of the window are matched again with a frame."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import FloatArray
 from sst_graph.tracker.window.gaussian import core_steps
 from sst_graph.tracker.window.matcher import WindowMatcher
-from sst_graph.tracker.window.relinearization import Settling
+from sst_graph.tracker.window.relinearization import WindowRelinearization
 from sst_graph.tracker.window.smoother import WindowSmoother
+
+FloatArray = NDArray[np.float64]
 
 _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
@@ -30,7 +32,7 @@ def scans_to_match(
     smoother: WindowSmoother,
     entered: Collection[int],
     covariance: FloatArray,
-    settling: WindowRelinearization | None = None,
+    relinearization: WindowRelinearization | None = None,
 ) -> set[int]:
     """The newest, those still without a pair, those that leave next, and some in turn.
 
@@ -38,30 +40,31 @@ def scans_to_match(
         number: of the newest scan.
         entered: scans that have had a pair.
         covariance: (m, m) of the estimate, over [extrinsic, offset, biases].
-        settling: says which are matched in turn while the tracker settles.
+        relinearization: of the whole window, where one is under way; it chooses what is matched in turn.
     """
     window = matcher.window
     numbers = [n for n, _ in window.scans]
     waiting = [n for n in numbers if n not in smoother.entries and n not in entered]
-    # What cannot wait, and as many others as there is time for: those judged anew, then the stalest.
+    # What cannot wait, and as many others as there is time for: those whose dynamic objects have changed,
+    # then those matched farthest from the estimate.
     chosen = {number, *waiting[-4:], *(n for n in numbers[-2:] if n in smoother.entries)}
     staleness = _staleness(smoother, covariance)
     leaving = [n for n in window.leaving() if staleness.get(n, 1.0) > _FRESH_SIGMAS]
     # Those that wait for a first match take the place of those in turn: a frame costs no more for them.
     late = max(0, len(waiting[-4:]) - 1)
-    turn = None if settling is None else settling.advance(smoother.point, late)
-    if settling is not None:
-        # No others: all of the window come in their turn, and to look below them costs as much.
+    turn = None if relinearization is None else relinearization.advance(smoother.point, late)
+    if relinearization is not None:
+        # No others: all of the window come in their turn, and the lower edges cost as much.
         return chosen | set(leaving) | (set(turn or ()) & set(staleness))
     known = sorted(staleness, key=staleness.__getitem__, reverse=True)
     stale = sum([value > _STALE_SIGMAS for value in staleness.values()])
     some = known[: max(_IN_TURN - len(leaving), stale)]
-    wanted = [*_judged_anew(matcher, smoother), *some]
+    wanted = [*_with_changed_objects(matcher, smoother), *some]
     return chosen | set(list(dict.fromkeys([*leaving, *wanted]))[:_MOST_IN_TURN])
 
 
-def _judged_anew(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
-    """Scans with a pair in which other objects are to be left out than were; the others are forgotten."""
+def _with_changed_objects(matcher: WindowMatcher, smoother: WindowSmoother) -> list[int]:
+    """Scans with a pair in which other dynamic objects are left out now; the rest are forgotten."""
     window, found = matcher.window, []
     for number in sorted(window.dynamics.changed_scans & set(smoother.entries)):
         entry = smoother.entries[number]
@@ -76,7 +79,7 @@ def _staleness(smoother: WindowSmoother, covariance: FloatArray) -> dict[int, fl
     """How far the estimate has moved since each pair was matched, in standard deviations."""
     if not smoother.entries:
         return {}
-    points = [entry.linear.belief.point for entry in smoother.entries.values()]
+    points = [entry.linear.information.point for entry in smoother.entries.values()]
     steps = core_steps(points, smoother.point)
     squares = np.einsum("ij,ij->i", steps, np.linalg.solve(covariance, steps.T).T)
     return dict(zip(smoother.entries, np.sqrt(np.maximum(0.0, squares)).tolist(), strict=True))

@@ -1,4 +1,4 @@
-"""iSAM2 over a window of pairs whose matches are renewed; what leaves it stays as one linear factor."""
+"""iSAM2 over a window of pairs that are matched anew; what leaves it stays as one linear factor."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero, named_sigmas
-from sst_graph.covariance.cluster_robust import ErrorModel
+from sst_graph.covariance.error_model import ErrorModel
 from sst_graph.covariance.jackknife import composed
 from sst_graph.errors import EstimationError
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.graph.building import GraphConfig, motion_factor, silhouettes_factor
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.state import (
     bias_key,
     lower_edge_track,
@@ -29,11 +29,11 @@ from sst_graph.graph.state import (
     twist_key,
 )
 from sst_graph.tracker.config import DriftConfig
-from sst_graph.tracker.sums.running_sums import ScoreSums
-from sst_graph.tracker.window.epochs import Entry, Epoch, EpochSums, Found, RetiredEpoch
+from sst_graph.tracker.sums.running_sums import RunningSums
+from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
-from sst_graph.tracker.window.pending_pairs import Undecided
-from sst_graph.tracker.window.smoother_update import Change, TwistFactor, read_point
+from sst_graph.tracker.window.pending_pairs import PendingPairs
+from sst_graph.tracker.window.smoother_update import SmootherUpdate, TwistFactor, read_point
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -45,7 +45,7 @@ _RELINEARIZE = {
     "O": np.array([0.1]),
     "V": np.repeat([0.005, 0.03], 3),
 }
-"""Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below what a frame tells."""
+"""Steps beyond these [rad, m], [s], [px], [rad/s, m/s] are relinearized: far below one frame's sigmas."""
 
 
 _RELINEARIZE_SPANS = 1e-3
@@ -69,7 +69,18 @@ def _parameters(estimate: Sequence[str]) -> gtsam.ISAM2Params:
 
 
 class WindowSmoother:
-    """The graph of the window; every update happens whole or not at all."""
+    """The graph of the window; every update happens whole or not at all.
+
+    Attributes:
+        entries: matched pairs of the window, by the number of their scan.
+        past: information of the prior and of all that has left the window, matches weighted as in the graph.
+        observed: the same with the robust loss's second derivatives; one linear factor of the graph.
+        static: the same as ``past`` by static objects alone.
+        pending: pairs of the past whose image is not certain.
+        sums: of the covariance, over all that has left the window.
+        model: error model of the matches.
+        retired: epochs that have left the window, until the history takes them over.
+    """
 
     def __init__(
         self,
@@ -82,11 +93,11 @@ class WindowSmoother:
         """prior: of the first epoch."""
         self.classes, self.graph, self.drift = tuple(classes), graph, drift
         self.held_names = held_at_zero(graph.estimate)
-        self.prior = self.alone = prior
-        self.past = self.bent = prior.holding(len(self.held_names))
-        self.undecided = PendingPairs.none(len(self.bent.vector))
-        self.sums = ScoreSums.empty(prior.point.size, len(self.held_names))
-        self.entries: dict[int, Entry] = {}
+        self.prior = self.static = prior
+        self.past = self.observed = prior.holding(len(self.held_names))
+        self.pending = PendingPairs.none(len(self.observed.vector))
+        self.sums = RunningSums.empty(prior.point.size, len(self.held_names))
+        self.entries: dict[int, MatchedPair] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
         self.retired: list[RetiredEpoch] = []
         self._epochs: tuple[Epoch, ...] = (Epoch(0, start_ns),)
@@ -100,7 +111,7 @@ class WindowSmoother:
 
     @property
     def point(self) -> Point:
-        """The present estimate (of the last epoch)."""
+        """The estimate of the last epoch."""
         return self._point
 
     @property
@@ -123,16 +134,16 @@ class WindowSmoother:
 
     def update(
         self,
-        found: Mapping[int, Found],
+        found: Mapping[int, MatchedPair],
         dropped: set[int],
         first_scan: int,
         alive: Container[int] = (),
     ) -> None:
-        """Renew or add pairs, retire those before ``first_scan``.
+        """Add pairs or replace them by new matches, retire those before ``first_scan``.
 
         Args:
             found: new matches by scan.
-            dropped: scans that no longer have a match and leave without a trace.
+            dropped: scans that no longer have a match: they leave, and nothing of them stays.
             first_scan: the window's first scan.
             alive: tracks of objects that may be seen again; the biases of all others are marginalized out
                 as soon as no pair of the window sees them.
@@ -140,36 +151,37 @@ class WindowSmoother:
         Raises:
             EstimationError: the update fails or gives numbers that are not finite; nothing has changed.
         """
-        change = Change(self, found, dropped, first_scan, alive)
+        update = SmootherUpdate(self, found, dropped, first_scan, alive)
         try:
-            change.apply()
+            update.run()
         except (RuntimeError, ValueError, np.linalg.LinAlgError) as error:
             raise EstimationError(f"the update failed: {' '.join(str(error).split())[:200]}") from error
-        self._take(change)
+        self._keep(update)
 
-    def _take(self, change: Change) -> None:
-        self.isam, self.past_id, self._epochs = change.isam, change.past_id, change.epochs
-        self.ids, self.twists, self.entries = change.ids, change.twists, change.entries
-        self.past, self.bent, self.alone, self.sums = change.past, change.bent, change.alone, change.sums
-        self.undecided = change.undecided
-        self.epoch_sums, self._point = change.epoch_sums, change.point
-        self.retired += change.retired
+    def _keep(self, update: SmootherUpdate) -> None:
+        """Go on with what an update has prepared."""
+        self.isam, self.past_id, self._epochs = update.isam, update.past_id, update.epochs
+        self.ids, self.twists, self.entries = update.ids, update.twists, update.entries
+        self.past, self.observed, self.static = update.past, update.observed, update.static
+        self.pending, self.sums, self.epoch_sums = update.pending, update.sums, update.epoch_sums
+        self._point = update.point
+        self.retired += update.retired
         if self.entries or self.sums.recent:
             self.model = self.sums.error_model([entry.linear for entry in self.entries.values()])
 
-    def rest_at(self, point: Point) -> None:
-        """Answer this estimate until the next update."""
+    def set_point(self, point: Point) -> None:
+        """Another estimate, until the next update."""
         self._point = point
 
-    def pair_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
-        """What the matches of a pair say."""
+    def pair_factor(self, entry: MatchedPair) -> gtsam.NonlinearFactor:
+        """The matches of a pair."""
         (E, D), V = self.keys(entry.epoch)[:2], twist_key(0, entry.image)
-        at = entry.linear.belief.point.nuisances
+        at = entry.linear.information.point.nuisances
         return silhouettes_factor(entry.pair, E, D, V, partial(bias_key, 0), at)
 
-    def twist_factor(self, entry: Entry) -> gtsam.NonlinearFactor:
-        """What odometry says of the twist of a pair's image."""
-        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.linear.belief.point
+    def twist_factor(self, entry: MatchedPair) -> gtsam.NonlinearFactor:
+        """Odometry's measurement of the twist of a pair's image."""
+        (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.linear.information.point
         return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s)
 
     def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
@@ -179,7 +191,7 @@ class WindowSmoother:
         turn = extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m)
         return turn, time_offset_drift(a[1], b[1], seconds, drift.offset_s)
 
-    def polish(self, iterations: int = 10) -> None:
+    def optimize(self, iterations: int = 10) -> None:
         """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
 
         Raises:
@@ -198,14 +210,14 @@ class WindowSmoother:
             point = read_point(isam, self.keys(self._epochs[-1].number, tracks), tracks, names)
         except (RuntimeError, ValueError) as error:
             raise EstimationError(f"the window's optimisation failed: {error}") from error
-        self._go_on_with(isam, indices)
+        self._replace_isam(isam, indices)
         self._point = point
 
     def relinearize(self) -> None:
-        """A fresh iSAM2, linearized at the estimate, as one that was stored begins; the answer stays."""
-        self._go_on_with(*self._linearized(self.isam.calculateEstimate(), self._held()))
+        """A fresh iSAM2, linearized at the estimate as after loading; the estimate stays."""
+        self._replace_isam(*self._linearized(self.isam.calculateEstimate(), self._present_factors()))
 
-    def _held(self) -> gtsam.NonlinearFactorGraph:
+    def _present_factors(self) -> gtsam.NonlinearFactorGraph:
         """As :meth:`_whole`, the very factors that iSAM2 holds."""
         links = [link for epoch in self._epochs for link in epoch.links or ()]
         twists = [twist.index for twist in self.twists.values()]
@@ -218,7 +230,7 @@ class WindowSmoother:
         """Every factor of the window: the past, the walks, the pairs, the twists."""
         graph = gtsam.NonlinearFactorGraph()
         keys = self.keys(self._epochs[0].number, self.past.point.tracks)
-        graph.add(self.bent.without_held().factor(keys))
+        graph.add(self.observed.without_held().factor(keys))
         for old, new in pairwise(self._epochs):
             for factor in self.drift_factors(old, new):
                 graph.add(factor)
@@ -236,8 +248,8 @@ class WindowSmoother:
         whole = self._whole() if graph is None else graph
         return isam, list(isam.update(whole, values).getNewFactorsIndices())
 
-    def _go_on_with(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
-        """Go on with an iSAM2 of :meth:`_whole`."""
+    def _replace_isam(self, isam: gtsam.ISAM2, indices: Sequence[int]) -> None:
+        """Go on with an iSAM2 of :meth:`_whole` and its factors' indices."""
         new = iter(indices)
         self.isam, self.past_id = isam, next(new)
         first, *others = self._epochs
@@ -260,7 +272,7 @@ class WindowSmoother:
         values = gtsam.Values()
         for key, value in state["isam"]:
             values.insert(key, value)
-        self._go_on_with(*self._linearized(values))
+        self._replace_isam(*self._linearized(values))
 
     def walk(self, seconds: float) -> FloatArray:
         """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] over some seconds."""
@@ -271,40 +283,39 @@ class WindowSmoother:
     def information(self) -> FloatArray:
         """(n, n) of past and window together on the last epoch, matches taken as independent, over the
         unknowns of ``past`` and what it holds."""
-        return self._onwards(self.past, {scan: entry.linear.belief for scan, entry in self.entries.items()})
+        window = {scan: entry.linear.information for scan, entry in self.entries.items()}
+        return self._last_epoch(self.past, window)
 
     def vector(self) -> FloatArray:
         """(n,) negative gradient of the cost of past and window by the last epoch, at the estimate, over the
         unknowns of ``past`` and what it holds."""
-        belief = self.bent.at(self._point)
+        total = self.observed.at(self._point)
         for i, epoch in enumerate(self._epochs):
             if i > 0:
-                belief = belief.drifted(self.walk(self._seconds(i)))
-            seen = [entry.linear.belief for entry in self.entries.values() if entry.epoch == epoch.number]
-            belief = Gaussian(belief.point, belief.information_with(seen), belief.vector_with(seen))
-        return belief.vector
+                total = total.drifted(self.walk(self._seconds(i)))
+            seen = [
+                entry.linear.information for entry in self.entries.values() if entry.epoch == epoch.number
+            ]
+            total = Gaussian(total.point, total.information_with(seen), total.vector_with(seen))
+        return total.vector
 
     def static_information(self) -> FloatArray | None:
-        """(n, n) the same by objects that stand alone; None where no match is of one that moves."""
-        alone, beliefs = (
-            self.alone,
-            {scan: entry.linear.by_static_objects for scan, entry in self.entries.items()},
-        )
-        moves = any(entry.linear.standing is not None for entry in self.entries.values())
-        if not moves and np.array_equal(alone.information, self.past.without_held().information):
+        """(n, n) the same by static objects alone; None where no match is of a dynamic one."""
+        window = {scan: entry.linear.by_static_objects for scan, entry in self.entries.items()}
+        dynamic = any(entry.linear.static is not None for entry in self.entries.values())
+        if not dynamic and np.array_equal(self.static.information, self.past.without_held().information):
             return None
-        return self._onwards(alone, beliefs)
+        return self._last_epoch(self.static, window)
 
-    def _onwards(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
+    def _last_epoch(self, past: Gaussian, window: Mapping[int, Gaussian]) -> FloatArray:
         """(n, n) information of a past and a window, by scan, on the last epoch."""
-        belief = past
+        total = past
         for i, epoch in enumerate(self._epochs):
             if i > 0:
-                walk = self.walk(self._seconds(i))
-                belief = belief.drifted(walk)
+                total = total.drifted(self.walk(self._seconds(i)))
             seen = [window[scan] for scan, e in self.entries.items() if e.epoch == epoch.number]
-            belief = replace(belief, information=belief.information_with(seen))
-        return belief.information
+            total = replace(total, information=total.information_with(seen))
+        return total.information
 
     def _seconds(self, i: int) -> float:
         """From the start of epoch i - 1 to that of epoch i [s]."""
@@ -314,7 +325,7 @@ class WindowSmoother:
         """(n, n) cluster-robust covariance of the unknowns of ``past``, and that of independent matches.
 
         Args:
-            information: as :meth:`information` tells it; None to ask for it here.
+            information: of :meth:`information`; None to compute it here.
 
         Raises:
             EstimationError: a direction without any information.
@@ -325,35 +336,34 @@ class WindowSmoother:
             naive = scaled_inverse(information)
         except np.linalg.LinAlgError as error:
             raise EstimationError(str(error)) from error
-        robust = naive + naive @ self.surplus() @ naive
+        robust = naive + naive @ self.excess() @ naive
         spread = None
         if not self.drift.enabled:
-            found = [e.score.objects for e in self.entries.values() if e.score.objects is not None]
+            found = [e.linear.objects for e in self.entries.values() if e.linear.objects is not None]
             spread = self.sums.objects.spread(found, naive, self.past.at(self._point).point)
-        robust = composed(robust, spread, self.flatness)
+        robust = composed(robust, spread, self.weight_curvature_ratio)
         return 0.5 * (robust + robust.T), naive
 
-    def surplus(self, with_held: bool = False) -> FloatArray:
+    def excess(self, with_held: bool = False) -> FloatArray:
         """(n, n) variance of the score of past and window beyond that of independent matches.
 
         Args:
             with_held: over what ``past`` holds, too.
         """
-        scores, point = [entry.linear for entry in self.entries.values()], self.past.point
+        window, point = [entry.linear for entry in self.entries.values()], self.past.point
         held = self.past.held if with_held else 0
-        columns = [point.columns(score.belief.point.tracks, held) for score in scores]
-        return self.sums.surplus(scores, columns, self.model, with_held)
+        columns = [point.columns(pair.information.point.tracks, held) for pair in window]
+        return self.sums.excess(window, columns, self.model, with_held)
 
     @property
-    def flatness(self) -> float:
+    def weight_curvature_ratio(self) -> float:
         """Mean robust weight over mean curvature, of all matches of past and window."""
-        return self.sums.flatness([entry.linear for entry in self.entries.values()])
+        return self.sums.weight_curvature_ratio([entry.linear for entry in self.entries.values()])
 
     @property
     def objects(self) -> int:
         """How many objects past and window have seen."""
-        sides = [np.array(list(self.sums.live), np.intp)]
-        sides += [entry.linear.sides.sides for entry in self.entries.values()]
+        sides = [self.sums.scores.sides, *(entry.linear.scores.sides for entry in self.entries.values())]
         live = {*self.sums.objects.live, *(np.concatenate(sides) // SIDES).tolist()}
         return self.sums.objects.count + len(live)
 

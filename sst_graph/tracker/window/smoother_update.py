@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import gtsam
 import numpy as np
 
-from sst_graph.graph.elimination import scaled_inverse
+from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.state import object_bias_key, twist_key
-from sst_graph.tracker.window.epochs import EPOCH_S, Entry, Epoch, EpochSums, Found, RetiredEpoch
+from sst_graph.tracker.window.epochs import EPOCH_S, Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Point, with_room
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def read_point(
 
 @dataclass(frozen=True)
 class TwistFactor:
-    """What odometry says of an image's twist: once, however many scans meet the image.
+    """Odometry's measurement of an image's twist: one, however many scans meet the image.
 
     Attributes:
         index: of the factor in iSAM2.
@@ -53,13 +53,13 @@ class TwistFactor:
     scan: int
 
 
-class Change:
+class SmootherUpdate:
     """One update, prepared on copies."""
 
     def __init__(
         self,
         smoother: WindowSmoother,
-        found: Mapping[int, Found],
+        found: Mapping[int, MatchedPair],
         dropped: set[int],
         first_scan: int,
         alive: Container[int],
@@ -70,7 +70,7 @@ class Change:
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
         self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
-        self.bent, self.alone, self.undecided = smoother.bent, smoother.alone, smoother.undecided
+        self.observed, self.static, self.pending = smoother.observed, smoother.static, smoother.pending
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
         self.sums = smoother.sums.copy()
@@ -81,22 +81,22 @@ class Change:
         self._added: list[tuple[str, int]] = []
         self._tied: dict[int, int] = {}
 
-    def apply(self) -> None:
+    def run(self) -> None:
         """Prepare all changes, update the copy of iSAM2, read the estimate."""
-        # 1. What goes, what comes again, what is new.
+        # 1. Pairs and objects that leave, pairs that are matched anew, new ones.
         self._retire()
         self._insert_objects()
-        self._enter()
+        self._add_pairs()
         self._tie_twists()
         self._close_epochs()
         self._marginalize_objects()
-        self._decide()
-        if self.past is not self._smoother.past or self.bent is not self._smoother.bent:
+        self._resolve_pending()
+        if self.past is not self._smoother.past or self.observed is not self._smoother.observed:
             self._replace_past()
         # 2. Everything at once.
         result = self.isam.update(self._graph, self._values, self._remove)
         self._number(list(result.getNewFactorsIndices()))
-        # 3. The estimate, if it is one.
+        # 3. The estimate, if it is finite.
         tracks = self.past.point.tracks
         keys = self._smoother.keys(self.epochs[-1].number, tracks)
         self.point = read_point(self.isam, keys, tracks, self.past.point.names)
@@ -105,17 +105,19 @@ class Change:
         for scan in sorted(scan for scan in self.entries if scan < self._first_scan):
             entry = self.entries.pop(scan)
             self._remove.append(self.ids.pop(scan))
-            belief, drift = entry.linear.belief, self._smoother.drift
+            linear, drift = entry.linear, self._smoother.drift
             while entry.epoch > self.epochs[0].number:
                 self._next_epoch()
-            self.past, self.bent = self.past.plus(belief), self.bent.plus(entry.linear.bent)
-            self.alone = self.alone.plus(entry.linear.by_static_objects)
+            self.past = self.past.plus(linear.information)
+            self.observed = self.observed.plus(linear.observed)
+            self.static = self.static.plus(linear.by_static_objects)
             if entry.other is not None:
-                self.undecided = self.undecided.plus(entry.linear.bent, entry.other, self.past.point)
-            columns = self.past.point.columns(belief.point.tracks, belief.held)
-            self.sums.add(entry.linear, columns, scan, by_object=not drift.enabled)
+                self.pending = self.pending.plus(linear.observed, entry.other, self.past.point)
+            own = linear.information
+            columns = self.past.point.columns(own.point.tracks, own.held)
+            self.sums.add(linear, columns, scan, by_object=not drift.enabled)
             if drift.enabled:
-                self.epoch_sums.add(entry.linear, scan, self._smoother.graph.object_bias_sigma_px)
+                self.epoch_sums.add(linear, scan, self._smoother.graph.object_bias_sigma_px)
         for scan in self._dropped & set(self.entries):
             del self.entries[scan]
             self._remove.append(self.ids.pop(scan))
@@ -124,15 +126,15 @@ class Change:
         """Objects seen for the first time get a mask bias of their own, tied to their class's."""
         known, new = set(self.past.point.tracks), dict[int, int]()
         for found in self._found.values():
-            new.update({t: place for t, place in found.score.places.items() if t not in known})
+            new.update({t: place for t, place in found.linear.places.items() if t not in known})
         if not new:
             return
         sigma_px = self._smoother.graph.object_bias_sigma_px
-        beliefs = (self.past, self.bent, self.alone)
-        self.past, self.bent, self.alone = (b.with_objects(new, sigma_px) for b in beliefs)
+        gaussians = (self.past, self.observed, self.static)
+        self.past, self.observed, self.static = (g.with_objects(new, sigma_px) for g in gaussians)
         self.sums.grow(self.past.point.size)
         size = self.past.point.size
-        self.undecided = self.undecided.through(with_room(size - len(new), size, self.bent.held))
+        self.pending = self.pending.through(with_room(size - len(new), size, self.observed.held))
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
             self._values.insert(object_bias_key(0, track), np.array([bias]))
@@ -146,16 +148,16 @@ class Change:
             self._close_objects()
         if gone:
             self.past, T = self.past.without(gone)
-            self.bent, bent_T = self.bent.without(gone)
-            self.alone, _ = self.alone.without(gone)
+            self.observed, observed_T = self.observed.without(gone)
+            self.static, _ = self.static.without(gone)
             self.sums.transform(T)
-            self.undecided = self.undecided.through(bent_T)
+            self.pending = self.pending.through(observed_T)
 
-    def _decide(self) -> None:
+    def _resolve_pending(self) -> None:
         """Pairings of scans that have left, by the time offset that the new matches were made at."""
-        points = [found.score.belief.point for found in self._found.values()]
+        points = [found.linear.information.point for found in self._found.values()]
         at = points[0] if points else self._smoother.point
-        self.undecided, self.bent = self.undecided.decided(self.bent, at.offset_s)
+        self.pending, self.observed = self.pending.resolved(self.observed, at.offset_s)
 
     def _close_objects(self) -> None:
         """Objects that are gone for good are no longer kept one by one."""
@@ -168,28 +170,28 @@ class Change:
         kept |= {track for track in self.sums.objects.live if track in self._alive}
         if all(track in kept for track in self.sums.objects.live):
             return
-        seen = [entry.linear.belief for entry in self.entries.values()]
+        seen = [entry.linear.information for entry in self.entries.values()]
         n = self.past.point.size
         information = self.past.information_with(seen)[:n, :n]
         point = self.past.at(self.point).point
         self.sums.objects.close(kept, information, scaled_inverse(information), point)
 
-    def _enter(self) -> None:
+    def _add_pairs(self) -> None:
+        """New pairs, and those matched anew in the place of the old."""
         smoother = self._smoother
         for scan, new in sorted(self._found.items()):
-            pair = new.pair
             known = self.entries.get(scan)
             epoch = self._epoch_at(new.stamp_ns) if known is None else known.epoch
             if known is not None:
                 self._remove.append(self.ids[scan])
-            self.entries[scan] = Entry(pair, new.score, epoch, new.image, new.other, new.left_out)
+            self.entries[scan] = replace(new, epoch=epoch)
             self._add(smoother.pair_factor(self.entries[scan]), "pair", scan)
             key = twist_key(0, new.image)
             if not (self.isam.valueExists(key) or self._values.exists(key)):
-                self._values.insert(key, pair.motion.c_twist)
+                self._values.insert(key, new.pair.motion.c_twist)
 
     def _tie_twists(self) -> None:
-        """Odometry's word on each image's twist, by the first scan that meets the image, as in the batch."""
+        """Odometry's factor on each image's twist, by the first scan that meets it, as in the batch."""
         firsts: dict[int, int] = {}
         for scan in sorted(self.entries):
             firsts.setdefault(self.entries[scan].image, scan)
@@ -236,19 +238,19 @@ class Change:
         self.retired.append(self.epoch_sums.retired(old.start_ns, smoother.model))
         self.epoch_sums = EpochSums.empty(self.past.point)
         self.sums.transform(self.past.transition(variances))
-        beliefs = (self.past, self.bent, self.alone)
-        self.past, self.bent, self.alone = (b.drifted(variances) for b in beliefs)
+        gaussians = (self.past, self.observed, self.static)
+        self.past, self.observed, self.static = (g.drifted(variances) for g in gaussians)
         self._remove += new.links or ()
         self.epochs = (replace(new, links=None), *self.epochs[2:])
 
     def _replace_past(self) -> None:
         self._remove.append(self.past_id)
-        before = self.bent.point
-        beliefs = (self.past, self.bent, self.alone)
-        self.past, self.bent, self.alone = (b.at(self.point) for b in beliefs)
-        self.undecided = self.undecided.moved(before.local(self.bent.point))
+        before = self.observed.point
+        gaussians = (self.past, self.observed, self.static)
+        self.past, self.observed, self.static = (g.at(self.point) for g in gaussians)
+        self.pending = self.pending.moved(before.local(self.observed.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
-        self._add(self.bent.without_held().factor(keys), "past", 0)
+        self._add(self.observed.without_held().factor(keys), "past", 0)
 
     def _add(self, factor: gtsam.NonlinearFactor, kind: str, number: int) -> None:
         self._graph.add(factor)

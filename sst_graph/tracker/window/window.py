@@ -30,7 +30,7 @@ class Window:
     Attributes:
         size: most scans, but while nothing may leave.
         sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
-        held: no scan leaves; afterwards two leave with each that comes, until no more than ``size`` are left.
+        growing: no scan leaves; afterwards two leave with each that comes, until ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         dynamics: which objects are dynamic.
         next_image: number of the next image; images are numbered by ``index`` as they come, never twice.
@@ -48,7 +48,7 @@ class Window:
 
     def restart(self) -> None:
         """Forget all scans, images and motions; numbers go on."""
-        self.held = False
+        self.growing = False
         self.origin_ns: int | None = None
         self.objects.forget()
         self.scans: deque[tuple[int, ScanFeatures]] = deque()
@@ -85,8 +85,8 @@ class Window:
 
     def leaving(self) -> list[int]:
         """The scans that leave when the next one comes, oldest first."""
-        surplus = 0 if self.held else min(2, len(self.scans) + 1 - self.size)
-        return [self.scans[i][0] for i in range(surplus)]
+        count = 0 if self.growing else min(2, len(self.scans) + 1 - self.size)
+        return [self.scans[i][0] for i in range(count)]
 
     def add_scan(self, features: ScanFeatures, motion: RelativeMotion | None) -> int:
         """Keep a scan and the motion that led to it; its number."""
@@ -126,7 +126,7 @@ class Window:
     def left_out(
         self, number: int, tau_s: float, reach_m: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
-        """The objects of a scan that move in an interval, with the tenths of their weight that they lose."""
+        """The dynamic objects of a scan, with the tenths of their weight that they lose in an interval."""
         found = self.dynamics.dynamic_objects(number)
         speeds = np.array([one.unknown_mps for one in found.values()])
         weights = dynamic_object_weights(speeds, np.array([tau_s]), reach_m).tolist()
@@ -134,7 +134,7 @@ class Window:
         return frozenset(entry for entry in lost if entry[2] > 0)
 
     def objects_of(self, numbers: Sequence[int]) -> tuple[dict[ObjectId, int], dict[ObjectId, DynamicObject]]:
-        """Tracks of the objects of some scans, and the moving ones, by the scan's position."""
+        """Tracks of the objects of some scans, and the dynamic ones, by the scan's position."""
         tracks: dict[ObjectId, int] = {}
         dynamic: dict[ObjectId, DynamicObject] = {}
         for position, number in enumerate(numbers):

@@ -1,17 +1,18 @@
-"""What one scan's matches say: a belief, and the sums that the cluster-robust covariance needs of them."""
+"""The matches of one scan, linearized: their information, and the sums that the covariance needs of them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import SIDES
-from sst_graph.covariance.cluster_robust import curvatures_of, unweighted
+from sst_graph.covariance.error_model import SideResiduals
+from sst_graph.covariance.match_table import curvatures_of, unweighted
 from sst_graph.covariance.static_objects import dynamic_matches
+from sst_graph.covariance.sums import ScoreSums
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
@@ -26,74 +27,44 @@ from sst_graph.types import SemanticClass
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
-_LEAST_BEND = 0.2
-"""Least curvature, over the weight, with which the gradient of a pair is taken to follow."""
-
-
-@dataclass(frozen=True)
-class SideSums:
-    """The matches of one side of an object in one frame, one row a side.
-
-    Attributes:
-        sides: (k,) number of the side, the same in all frames.
-        scores: (k, n) sum of root weight times row of J, in the columns of the belief.
-        means: (k,) weighted mean of the whitened residuals.
-        weights, weights2: (k,) sums of the weights and of their squares.
-        within: (k,) weighted sum of squares around the mean.
-        moved: whether the LiDAR moved: sides seen while it stands are one view.
-    """
-
-    sides: IntArray
-    scores: FloatArray
-    means: FloatArray
-    weights: FloatArray
-    weights2: FloatArray
-    within: FloatArray
-    moved: bool = True
-
-    @cached_property
-    def rows(self) -> FloatArray:
-        """(k, 6) [side, mean, weights, weights2, within, moved]."""
-        moved = np.full(len(self.sides), float(self.moved))
-        return np.column_stack([self.sides, self.means, self.weights, self.weights2, self.within, moved])
+_LEAST_CURVATURE = 0.2
+"""Least mean curvature, over the mean weight, in the observed information: it stays positive where most
+matches lie beyond the inflection of the robust loss."""
 
 
 @dataclass(frozen=True)
 class LinearizedPair:
-    """What one pair says: its belief, motion marginalised out, and the sums of its matches.
+    """The matches of one pair of scan and image about a point, motion marginalised out.
 
     Attributes:
-        belief: on [extrinsic, offset, biases, parameters, and the biases of the objects it sees]; it may hold
-            parameters of assumptions.
-        bent: the same with the robust loss's second derivatives in place of the weights: how the gradient of
-            matches that cannot be made anew follows an estimate that moves on.
-        JJ: (n, n) sum of J'J of its matches, motion marginalised out, times their common share; in the
-            columns of the belief, what it holds included, as are ``sides`` and ``sums``.
-        sides: by side.
-        sums: (n, n) sum of squared scores by side.
+        information: Gaussian on [extrinsic, offset, biases, parameters, and the biases of the objects it
+            sees]; behind these it may hold parameters of assumptions.
+        observed: the same with the robust loss's second derivatives in place of the weights (observed
+            information): how the gradient of matches that are kept follows an estimate that moves on.
+        scores: sums of the matches' scores, in the columns of the Gaussian, what it holds included.
+        residuals: of the matches, by side.
         matches: number of matches.
         places: place of its class's bias for each object with a bias, by its track.
-        objects: the matches of each object alone.
+        objects: the matches object by object.
         weight, curvature: sums of the matches' weights, and of the robust loss's second derivatives.
-        standing: the belief by objects that stand alone, where some move with a known velocity.
+        static: the information by static objects alone, where some are dynamic with a known velocity.
     """
 
-    belief: Gaussian
-    bent: Gaussian
-    JJ: FloatArray
-    sides: SideSums
-    sums: FloatArray
+    information: Gaussian
+    observed: Gaussian
+    scores: ScoreSums
+    residuals: SideResiduals
     matches: int
     places: Mapping[int, int] = field(default_factory=dict)
     objects: ObjectInformation | None = None
     weight: float = 1.0
     curvature: float = 1.0
-    standing: Gaussian | None = None
+    static: Gaussian | None = None
 
     @property
     def by_static_objects(self) -> Gaussian:
-        """The belief by objects that stand alone."""
-        return self.belief if self.standing is None else self.standing
+        """The information by static objects alone."""
+        return self.information if self.static is None else self.static
 
 
 def object_places(
@@ -126,64 +97,68 @@ def linearize_pair(
     by_object: bool = True,
     held: Sequence[str] = (),
 ) -> LinearizedPair:
-    """Linearize a pair at the point its matches were made at: its silhouettes and its motion.
+    """A pair at the point its matches were made at: its silhouettes and its motion.
 
     Args:
         tracks: number of the track of each (class, object) of the scan.
         share: factor that the weights of all matches carry beside their own.
-        by_object: tell what each object alone says, too.
-        held: assumptions whose parameters the belief holds.
+        by_object: keep the matches object by object, too.
+        held: assumptions whose parameters are held behind the unknowns.
     """
     places = object_places(pair, classes, tracks)
     point = point.seen(places)
     J, JV, r, roots = _rows(pair, point, classes, held)
-    # [unknowns, held parameters, twist]: silhouettes, then the twist that odometry tells.
+    # [unknowns, held parameters, twist]: silhouettes, then the odometry's information on the twist.
     A, n, m = np.concatenate([J, JV], axis=1), point.size, J.shape[1]
     H, g = A.T @ A, -A.T @ r
-    curvature = _curvatures(pair, r, roots)
-    weight, bend = float(roots @ roots), float(curvature.sum())
+    weight, curvature = float(roots @ roots), float(_curvatures(pair, r, roots).sum())
     motion = np.zeros_like(H)
     columns = [*range(7), *range(m, m + 6)]
     motion[np.ix_(columns, columns)] = _motion_information(pair, point)
-    belief, gain = _without_twist(point, H + motion, g)
-    bent, _ = _without_twist(point, min(max(bend / weight, _LEAST_BEND), 1.0) * H + motion, g)
+    information, gain = _without_twist(point, H + motion, g)
+    curved = min(max(curvature / weight, _LEAST_CURVATURE), 1.0)
+    observed, _ = _without_twist(point, curved * H + motion, g)
     known = np.array([*range(n), *range(m, m + 6)])
-    J = J - JV @ gain  # as the answer follows a residual, the twist following the answer
+    J = J - JV @ gain  # as the estimate follows a residual, the twist following the estimate
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    sides = replace(_side_sums(J, r, roots, side, share), moved=pair.moved)
+    own, frame, moved = roots / np.sqrt(share), np.zeros(len(r), np.intp), np.full(len(r), pair.moved)
     return LinearizedPair(
-        belief,
-        bent,
-        share * (J.T @ J),
-        sides,
-        sides.scores.T @ sides.scores,
+        information,
+        observed,
+        _with_share(ScoreSums.of_frame(J, roots, side), share),
+        SideResiduals.of(unweighted(r, roots), own**2, side, frame, moved),
         len(pair),
         places,
         ObjectInformation.of(J[:, :n], r, roots, track, point) if by_object else None,
         weight,
-        bend,
+        curvature,
         _by_static_objects(pair, point, A[:, known], motion[np.ix_(known, known)]),
     )
 
 
+def _with_share(scores: ScoreSums, share: float) -> ScoreSums:
+    """Scores of matches whose weights carry a common share: errors are those of their own weights."""
+    return replace(scores, independent=share * scores.independent)
+
+
 def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: FloatArray) -> Gaussian | None:
-    """The information of matches of objects that stand; the vector is not of interest."""
-    moves = dynamic_matches(pair)
-    if not moves.any():
+    """The information of matches of static objects, its vector 0; None where all are static."""
+    dynamic = dynamic_matches(pair)
+    if not dynamic.any():
         return None
-    stands = A[~moves]
-    return _without_twist(point, stands.T @ stands + motion, np.zeros(A.shape[1]))[0]
+    static = A[~dynamic]
+    return _without_twist(point, static.T @ static + motion, np.zeros(A.shape[1]))[0]
 
 
 def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian, FloatArray]:
-    """The belief on the unknowns and what is held, from information and vector over these and the twist;
-    (6, n) what each of them takes off the twist."""
+    """The Gaussian on the unknowns and what is held, from information and vector over these and the twist;
+    (6, n) how the twist's optimum follows them, with the sign changed."""
     n = len(H) - 6
     gain = np.asarray(np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]])), np.float64)
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
-    belief = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
-    return belief, gain[:, :n]
+    gaussian = Gaussian(point, 0.5 * (information + information.T), g[:n] - H[:n, n:] @ gain[:, n])
+    return gaussian, gain[:, :n]
 
 
 def _tracks_of(
@@ -250,29 +225,3 @@ def _motion_information(pair: PairMatches, point: Point) -> FloatArray:
     A[:, :6], A[:, 7:] = Ad @ twist_ad(pair.l_twist.twist), np.eye(6)
     A[:, 6] = -Ad @ pair.l_twist.acceleration
     return np.asarray(A.T @ np.linalg.solve(camera_twist(pair.l_twist, point.cTl).covariance, A))
-
-
-def _side_sums(
-    J: FloatArray, weighted: FloatArray, root: FloatArray, side: IntArray, share: float
-) -> SideSums:
-    """Sums by side of weighted rows J (m, n), weighted residuals and root weights; side (m,)."""
-    names, which = np.unique(side, return_inverse=True)
-    which = which.reshape(-1)
-    r = unweighted(weighted, root)
-    w = root**2 / share
-    weights, weights2, within = (
-        np.asarray(np.bincount(which, values), np.float64) for values in (w, w * w, w * r**2)
-    )
-    means = np.bincount(which, w * r) / np.maximum(weights, 1e-12)
-    scores = summed_rows(J * root[:, None], side)
-    within = np.maximum(within - weights * means**2, 0.0)
-    return SideSums(names, scores, means, weights, weights2, within)
-
-
-def summed_rows(rows: FloatArray, names: IntArray) -> FloatArray:
-    """(k, n) sums of rows (m, n) of the same name (m,)."""
-    if len(names) == 0:
-        return rows
-    order = np.argsort(names, kind="stable")
-    firsts = np.append(0, np.flatnonzero(np.diff(names[order])) + 1)
-    return np.asarray(np.add.reduceat(rows[order], firsts))

@@ -1,8 +1,8 @@
 """Scans that left the window when it was not certain which image they belong to.
 
 A scan half way between two images is paired with the one or the other as the time offset moves by its own
-sigma. The batch pairs by its answer. So of a scan that leaves, what it says with the other image is kept too,
-and the past changes from the one to the other when the offset passes the middle.
+sigma. The batch pairs by its estimate. So of a scan that leaves, its information with the other image is kept
+too, and the past changes from the one to the other when the offset passes the middle.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ MOST = 100
 
 
 @dataclass(frozen=True)
-class Other:
-    """What a scan says with the other image.
+class OtherPairing:
+    """A scan linearized with the other image.
 
     Attributes:
-        belief: on the unknowns of the scan.
+        information: on the unknowns of the scan.
         middle_s: time offset at which the scan lies half way between its two images [s].
         early: whether the pairing in use is with the earlier image, as it is from ``middle_s`` on.
     """
 
-    belief: Gaussian
+    information: Gaussian
     middle_s: float
     early: bool
 
 
 @dataclass(frozen=True)
-class Undecided:
+class PendingPairs:
     """Other pairings less those in use, one row a scan, about a point, in the columns of the past and of what
     it holds.
 
@@ -54,37 +54,36 @@ class Undecided:
     vector: FloatArray
 
     @classmethod
-    def none(cls, n: int) -> Undecided:
+    def none(cls, n: int) -> PendingPairs:
         return cls(np.zeros(0), np.zeros(0, np.bool_), np.zeros((0, n, n)), np.zeros((0, n)))
 
-    def plus(self, used: Gaussian, other: Other, point: Point) -> Undecided:
+    def plus(self, used: Gaussian, other: OtherPairing, point: Point) -> PendingPairs:
         """One more scan; objects of the other pairing that are not known at the point are left out."""
         n = point.size + used.held
         difference = np.zeros((n, n)), np.zeros(n)
-        for belief, sign in ((other.belief, 1.0), (used, -1.0)):
-            unknown = [track for track in belief.point.tracks if track not in point.tracks]
-            belief = belief.without(unknown)[0] if unknown else belief
-            belief = belief.at(point)
-            columns = point.columns(belief.point.tracks, belief.held)
-            difference[0][np.ix_(columns, columns)] += sign * belief.information
-            difference[1][columns] += sign * belief.vector
-        return Undecided(
+        for gaussian, sign in ((other.information, 1.0), (used, -1.0)):
+            unknown = [track for track in gaussian.point.tracks if track not in point.tracks]
+            gaussian = (gaussian.without(unknown)[0] if unknown else gaussian).at(point)
+            columns = point.columns(gaussian.point.tracks, gaussian.held)
+            difference[0][np.ix_(columns, columns)] += sign * gaussian.information
+            difference[1][columns] += sign * gaussian.vector
+        return PendingPairs(
             np.append(self.middles_s, other.middle_s)[-MOST:],
             np.append(self.early, other.early)[-MOST:],
             np.concatenate([self.information, difference[0].reshape(1, n, n)])[-MOST:],
             np.concatenate([self.vector, difference[1].reshape(1, n)])[-MOST:],
         )
 
-    def moved(self, step: FloatArray) -> Undecided:
+    def moved(self, step: FloatArray) -> PendingPairs:
         """About a point that lies a step away; (m,) of the unknowns, without what is held."""
         moved = self.information[:, :, : len(step)] @ step
-        return Undecided(self.middles_s, self.early, self.information, self.vector - moved)
+        return PendingPairs(self.middles_s, self.early, self.information, self.vector - moved)
 
-    def through(self, T: FloatArray) -> Undecided:
-        """In other unknowns: scores follow T (m, n), as :meth:`Gaussian.without` tells it."""
-        return Undecided(self.middles_s, self.early, T @ self.information @ T.T, self.vector @ T.T)
+    def through(self, T: FloatArray) -> PendingPairs:
+        """In other unknowns: scores follow T (m, n), as of :meth:`Gaussian.without`."""
+        return PendingPairs(self.middles_s, self.early, T @ self.information @ T.T, self.vector @ T.T)
 
-    def decided(self, past: Gaussian, offset_s: float) -> tuple[Undecided, Gaussian]:
+    def resolved(self, past: Gaussian, offset_s: float) -> tuple[PendingPairs, Gaussian]:
         """Pairings as they are under a time offset, and the past with them; both about the past's point."""
         changed = (offset_s >= self.middles_s) != self.early
         if not changed.any():
@@ -94,7 +93,7 @@ class Undecided:
             return self, past
         past = Gaussian(past.point, information, past.vector + self.vector[changed].sum(axis=0))
         sign = np.where(changed, -1.0, 1.0)
-        flipped = Undecided(
+        flipped = PendingPairs(
             self.middles_s,
             self.early ^ changed,
             sign[:, None, None] * self.information,

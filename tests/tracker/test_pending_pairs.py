@@ -7,25 +7,25 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
-from sst_graph.tracker.sums.linearized_pair import linearize_pair
-from sst_graph.tracker.window.pending_pairs import MOST, OtherPairing, PendingPairs
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.tracker.sums.linearized_pair import linearize_pair
 from sst_graph.tracker.window.gaussian import Gaussian, Point
+from sst_graph.tracker.window.pending_pairs import MOST, OtherPairing, PendingPairs
 
 POINT = Point(gtsam.Pose3(), 0.05, np.array([0.3]), (4, 7), np.array([0.1, -0.2]))
 N = POINT.size
 
 
-def _belief(seed: int, point: Point) -> Gaussian:
+def _gaussian(seed: int, point: Point) -> Gaussian:
     rng = np.random.default_rng(seed)
     J = rng.normal(size=(40, point.size))
     return Gaussian(point, J.T @ J, J.T @ rng.normal(size=40))
 
 
 def _tied(seed: int, point: Point) -> Gaussian:
-    belief = _belief(seed, point)
+    belief = _gaussian(seed, point)
     return Gaussian(point, belief.information + 100.0 * np.eye(point.size), belief.vector)
 
 
@@ -36,38 +36,38 @@ def _same(a: Gaussian, b: Gaussian) -> None:
 
 
 def test_the_past_pairs_anew_when_the_offset_passes_the_middle() -> None:
-    prior, rest = _tied(0, POINT), _belief(1, POINT)
-    used, other = _belief(2, POINT.seen({4: 0})), _belief(3, POINT.seen({7: 0}))
+    prior, rest = _tied(0, POINT), _gaussian(1, POINT)
+    used, other = _gaussian(2, POINT.seen({4: 0})), _gaussian(3, POINT.seen({7: 0}))
     past = prior.plus(rest).plus(used)
-    undecided = PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT)
-    stays, same = undecided.decided(past, 0.0599)
-    assert stays is undecided and same is past
-    flipped, changed = undecided.decided(past, 0.0601)
+    pending = PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT)
+    stays, same = pending.resolved(past, 0.0599)
+    assert stays is pending and same is past
+    flipped, changed = pending.resolved(past, 0.0601)
     _same(changed, prior.plus(rest).plus(other))
     assert flipped.early.tolist() == [True]
-    back, again = flipped.decided(changed, 0.05)
+    back, again = flipped.resolved(changed, 0.05)
     _same(again, past)
-    np.testing.assert_allclose(back.vector, undecided.vector)
+    np.testing.assert_allclose(back.vector, pending.vector)
 
 
 def test_other_pairings_follow_the_point_and_the_objects() -> None:
-    """Elsewhere, with one object more and another marginalized out: as if decided before."""
-    used, other = _belief(4, POINT.seen({4: 0})), _belief(5, POINT.seen({4: 0}))
+    """Elsewhere, with one object more and another marginalized out: as if resolved before."""
+    used, other = _gaussian(4, POINT.seen({4: 0})), _gaussian(5, POINT.seen({4: 0}))
     past = _tied(6, POINT).plus(used)
-    undecided = PendingPairs.none(N).plus(used, OtherPairing(other, 0.04, early=True), POINT)
-    expected = undecided.decided(past, 0.0)[1]
+    pending = PendingPairs.none(N).plus(used, OtherPairing(other, 0.04, early=True), POINT)
+    expected = pending.resolved(past, 0.0)[1]
     step = np.full(N, 1e-3)
     step[:3] = 0.0  # translations add exactly
     there = POINT.moved(step)
-    # A new object, then another point, then one that is gone (7, of which the pairings say nothing).
-    grown = undecided.through(np.eye(N + 1, N)).moved(np.append(step, 0.0))
+    # A new object, then another point, then one that is gone (7, which the pairings do not see).
+    grown = pending.through(np.eye(N + 1, N)).moved(np.append(step, 0.0))
     past, expected = (b.with_objects({9: 0}, 0.5) for b in (past, expected))
     at = dataclasses.replace(
         there, tracks=past.point.tracks, object_biases_px=np.append(there.object_biases_px, 0.3)
     )
     past, expected = past.at(at), expected.at(at)
     (past, T), (expected, _) = past.without([7]), expected.without([7])
-    found = grown.through(T).decided(past, 0.0)[1]
+    found = grown.through(T).resolved(past, 0.0)[1]
     # 7 is tied to the rest through the past alone, which the pairing changes by little.
     np.testing.assert_allclose(
         found.vector, expected.vector, rtol=0.05, atol=0.05 * np.abs(expected.vector).max()
@@ -77,23 +77,23 @@ def test_other_pairings_follow_the_point_and_the_objects() -> None:
 
 
 def test_objects_that_only_the_other_pairing_sees_are_left_out() -> None:
-    used, other = _belief(7, POINT.seen({4: 0})), _belief(8, POINT.seen({4: 0, 9: 0}))
+    used, other = _gaussian(7, POINT.seen({4: 0})), _gaussian(8, POINT.seen({4: 0, 9: 0}))
     past = _tied(9, POINT).plus(used)
     found = (
-        PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT).decided(past, 1.0)[1]
+        PendingPairs.none(N).plus(used, OtherPairing(other, 0.06, early=False), POINT).resolved(past, 1.0)[1]
     )
     _same(found, _tied(9, POINT).plus(other.without([9])[0]))
 
 
 def test_few_are_kept_and_none_that_would_break_the_past() -> None:
-    used, other = _belief(10, POINT), Gaussian(POINT, np.zeros((N, N)), np.zeros(N))
-    undecided = PendingPairs.none(N)
+    used, other = _gaussian(10, POINT), Gaussian(POINT, np.zeros((N, N)), np.zeros(N))
+    pending = PendingPairs.none(N)
     for k in range(MOST + 5):
-        undecided = undecided.plus(used, OtherPairing(other, float(k), early=False), POINT)
-    assert len(undecided.middles_s) == len(undecided.vector) == MOST
-    assert undecided.middles_s[0] == 5.0
+        pending = pending.plus(used, OtherPairing(other, float(k), early=False), POINT)
+    assert len(pending.middles_s) == len(pending.vector) == MOST
+    assert pending.middles_s[0] == 5.0
     past = _tied(11, POINT)
-    assert undecided.decided(past, 1e3) == (undecided, past)
+    assert pending.resolved(past, 1e3) == (pending, past)
 
 
 @pytest.fixture(scope="module")
@@ -126,26 +126,26 @@ def tracker() -> Tracker:
 
 def test_scans_between_two_images_are_kept_open(tracker: Tracker) -> None:
     assert tracker.estimate.smoother is not None
-    undecided, offset_s = tracker.estimate.smoother.undecided, tracker.estimate.point.offset_s
-    assert len(undecided.middles_s) > 5
-    assert np.array_equal(offset_s >= undecided.middles_s, undecided.early)
-    assert undecided.information.shape[1:] == tracker.estimate.smoother.bent.information.shape
+    pending, offset_s = tracker.estimate.smoother.pending, tracker.estimate.point.offset_s
+    assert len(pending.middles_s) > 5
+    assert np.array_equal(offset_s >= pending.middles_s, pending.early)
+    assert pending.information.shape[1:] == tracker.estimate.smoother.observed.information.shape
 
 
-def test_the_bent_belief_tells_the_gradient_elsewhere(tracker: Tracker) -> None:
-    """The same matches, biases moved by 0.4 px: the gradient is nearer to what the curvatures say."""
+def test_the_observed_information_predicts_the_gradient_elsewhere(tracker: Tracker) -> None:
+    """The same matches, biases moved by 0.4 px: the gradient is nearer to the one by the curvatures."""
     assert tracker.estimate.smoother is not None
     by_weight, by_curvature = [], []
     for number, entry in tracker.estimate.smoother.entries.items():
-        score = entry.linear
-        step = np.zeros(score.belief.point.size)
+        linear = entry.linear
+        step = np.zeros(linear.information.point.size)
         step[7:] = 0.4
-        there = score.belief.point.moved(step)
+        there = linear.information.point.moved(step)
         tracks = tracker.inputs.window.tracks[number]
         fresh = linearize_pair(
             entry.pair, there, tracker.matcher.classes, tracks, tracker.matcher.graph
-        ).belief.vector
-        own = slice(score.belief.point.core_size, score.belief.point.size)
-        by_weight.append((score.belief.without_held().at(there).vector - fresh)[own].sum())
-        by_curvature.append((score.bent.without_held().at(there).vector - fresh)[own].sum())
+        ).information.vector
+        own = slice(linear.information.point.core_size, linear.information.point.size)
+        by_weight.append((linear.information.without_held().at(there).vector - fresh)[own].sum())
+        by_curvature.append((linear.observed.without_held().at(there).vector - fresh)[own].sum())
     assert abs(sum(by_curvature)) < 0.5 * abs(sum(by_weight))

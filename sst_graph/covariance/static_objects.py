@@ -1,8 +1,8 @@
-"""What is known by objects that stand alone.
+"""The covariance by static objects alone.
 
-An oncoming vehicle whose velocity is known may tell the time offset from the translation where nothing that
-stands does: on a straight road at one speed. Its velocity was estimated along the way, and what that alone
-tells is not called known.
+An oncoming vehicle whose velocity is known may separate the time offset from the translation where static
+objects do not: on a straight road at one speed. Its velocity was estimated along the way, so what only such
+matches determine does not count as known.
 """
 
 from __future__ import annotations
@@ -12,36 +12,37 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, gram
+from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of
+from sst_graph.covariance.sums import gram
 from sst_graph.graph.building import PairMatches
 
 FloatArray = NDArray[np.float64]
 
 _ALL = 1.0 - 1e-6
-"""Largest share of what is known of a direction that is taken away."""
+"""Largest share of the information on a direction that is taken away."""
 
 
 def static_covariance(robust: RobustCovariance, pairs: Sequence[PairMatches]) -> FloatArray:
-    """(n, n) covariance of the unknowns without the matches of objects that move with a known velocity.
+    """(n, n) covariance of the unknowns without the matches of dynamic objects with a known velocity.
 
     Args:
         robust: with all of them.
         pairs: its matches.
     """
-    moves = np.concatenate([dynamic_matches(pair) for pair in pairs])
-    if not moves.any():
+    dynamic = np.concatenate([dynamic_matches(pair) for pair in pairs])
+    if not dynamic.any():
         return robust.matrix
-    if moves.all():
+    if dynamic.all():
         return np.asarray(robust.matrix / (1.0 - _ALL))
-    J = robust.table.J[np.flatnonzero(moves)]
+    J = robust.table.J[np.flatnonzero(dynamic)]
     root = np.asarray(np.linalg.cholesky(robust.bread), np.float64)
     shares, axes = np.linalg.eigh(root.T @ gram(J) @ root)
     wider = root @ (axes / np.sqrt(1.0 - np.minimum(shares, _ALL)))
-    return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~moves)), robust.model)
+    return covariance_of(wider @ wider.T, robust.table.take(np.flatnonzero(~dynamic)), robust.model)
 
 
 def dynamic_matches(pair: PairMatches) -> NDArray[np.bool_]:
-    """(m,) whether the object of each match moves with a known velocity, class by class."""
+    """(m,) whether the object of each match is dynamic with a known velocity, class by class."""
     found = []
     for matches in pair.matches.values():
         velocities = matches.alignment.l_velocities

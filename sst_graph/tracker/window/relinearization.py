@@ -1,7 +1,7 @@
-"""The whole window solved again as the batch does, from a wide kernel to the narrowest.
+"""The whole window matched and solved again as the batch does, from a wide kernel to the narrowest.
 
 At the end of a drive at once (:func:`relinearize_window`); while frames come, a little with each
-(:class:`Settling`).
+(:class:`WindowRelinearization`).
 """
 
 from __future__ import annotations
@@ -17,21 +17,22 @@ from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
 
-_RESTS_SIGMAS = 0.02
-"""A whole step shorter than this is rest."""
+_CONVERGED_SIGMAS = 0.02
+"""A step of matching and solving that is shorter, in standard deviations, has converged."""
 _INNER = 2
 """Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
 SCANS = 5
 """Scans matched with each frame while the window is matched anew: more make these frames slower."""
 _PASSES = 2
-"""How often a running tracker matches the whole window anew when it settles."""
+"""How often a running tracker matches the whole window when it relinearizes."""
 
 
 @dataclass
 class RelinearizationSchedule:
-    """When a running tracker settles: each time it has seen twice as much, and before scans first leave.
+    """When a running tracker relinearizes its window: each time it has seen twice as many scans, and before
+    scans first leave.
 
-    A young estimate wanders, and what was matched on the way no longer lies where it would now.
+    An estimate by few scans moves on, and their matches were made where it no longer is.
 
     Attributes:
         first: number of the first scan.
@@ -62,7 +63,7 @@ def relinearize_window(
     alive: Container[int],
     share: float = 1.0,
 ) -> bool:
-    """Match all scans, solve, and again under the next kernel; then under the last until it rests.
+    """Match all scans, solve, and again under the next kernel; then under the last until it converges.
 
     Matches made frame by frame hold the estimate within a standard deviation or two of where the batch
     would end. Where matches come and go in turn, so that the estimate goes round in a circle, the steps
@@ -76,7 +77,7 @@ def relinearize_window(
         share: factor on the weights of all matches.
 
     Returns:
-        Whether it rests.
+        Whether it converged.
 
     Raises:
         EstimationError: an update fails; what the steps before it reached stays.
@@ -86,30 +87,33 @@ def relinearize_window(
         kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         smoother.update(found, missing, 0, alive)
-        smoother.polish(_INNER)
-        rested = i + 1 - len(kernel_px)
+        smoother.optimize(_INNER)
+        last = i + 1 - len(kernel_px)
         left = smoother.point.core().local(at.core())
         n = len(left)
-        if rested >= 0 and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _RESTS_SIGMAS**2:
+        if (
+            last >= 0
+            and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _CONVERGED_SIGMAS**2
+        ):
             return True
-        shorter = 1.0 / (1.0 + max(0, rested - whole_steps))
+        shorter = 1.0 / (1.0 + max(0, last - whole_steps))
         back = np.zeros(smoother.point.size)
         back[:n] = (1.0 - shorter) * left
         at = smoother.point.moved(back)
-    smoother.rest_at(at)
+    smoother.set_point(at)
     return False
 
 
-class Settling:
-    """One settling of a running tracker: the whole window is matched anew, some scans with each frame.
+class WindowRelinearization:
+    """The whole window of a running tracker matched again, some scans with each frame.
 
-    First the edges towards the ground are looked at; then each scan is matched, the oldest first, at the
+    First the support of the lower edges is counted; then each scan is matched, the oldest first, at the
     estimate as it is by then, and all once more.
 
     Attributes:
-        below: support of the edges towards the ground so far; None when it is known.
+        below: support of the lower edges so far; None when it is known.
         passes: how often all are still to be matched.
-        done: scans that were asked, or matched, in this pass.
+        done: scans that were counted, or matched, in this pass.
     """
 
     def __init__(self, matcher: WindowMatcher) -> None:
@@ -125,7 +129,7 @@ class Settling:
         return self.passes == 0
 
     def advance(self, point: Point, fewer: int = 0) -> list[int] | None:
-        """The scans to match with this frame; None while the edges towards the ground are looked at.
+        """The scans to match with this frame; None while the support of the lower edges is counted.
 
         Args:
             fewer: how many fewer than usual, for others are matched in their place; one at least.
@@ -134,16 +138,16 @@ class Settling:
         # The newest is matched as it comes.
         self.done.update(numbers[-1:])
         waiting = [number for number in numbers if number not in self.done]
-        looking, below = self.below is not None, self.below
-        # To look below is to match twice.
+        counting, below = self.below is not None, self.below
+        # To count the support is to match twice.
         most = max(1, SCANS - fewer)
-        some = waiting[: (most + 1) // 2 if looking else most]
+        some = waiting[: (most + 1) // 2 if counting else most]
         if below is not None:
             self.below = below.plus(self._matcher.lower_edge_support(point, some))
         self.done.update(some)
         if len(some) == len(waiting):
             self._next()
-        return None if looking else some
+        return None if counting else some
 
     def _next(self) -> None:
         """All scans have been matched."""

@@ -1,4 +1,4 @@
-"""What each scan brought to the tracker as it came."""
+"""Information that the tracker gained with each scan."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST = 2000
 
 
 class InformationLog:
-    """Covariance after each scan that was taken in.
+    """Covariance after each scan that was used.
 
     Attributes:
         rows: (9,) each: number of the scan, bits gained (NaN for the first after a start), sigmas after it.
@@ -28,17 +28,17 @@ class InformationLog:
         self._last: FloatArray | None = None
 
     def restart(self) -> None:
-        """A new calibration begins."""
+        """A new calibration begins: its first scan has gained no known number of bits."""
         self._last = None
 
-    def take(self, scan: int, covariance: FloatArray) -> None:
-        """A scan was taken in and left this covariance (7, 7)."""
+    def add(self, scan: int, covariance: FloatArray) -> None:
+        """A scan was used; the covariance after it (7, 7)."""
         bits = np.nan if self._last is None else bits_between(self._last, covariance)
         self.rows.append(np.array([scan, bits, *np.sqrt(np.diag(covariance))]))
         self._last = covariance.copy()
 
     def gained(self, drive: str) -> Gained:
-        """As it stands in a result."""
+        """As a result keeps it."""
         gains = (
             Gain(FrameId(drive, int(row[0])), None if np.isnan(row[1]) else float(row[1]), row[2:])
             for row in self.rows

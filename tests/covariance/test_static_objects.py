@@ -1,4 +1,4 @@
-"""What objects that stand tell alone."""
+"""The covariance by static objects alone."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import dataclasses
 
 import gtsam
 import numpy as np
-from sst_graph.covariance.static_objects import static_covariance
 from streets import prepared_street, standing_street
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.batch.answer import Answer, Guess, result_of
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
+from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate, joint_graph
 from sst_graph.graph.state import State
@@ -84,4 +84,4 @@ def test_what_only_moving_objects_tell_is_not_called_known() -> None:
         answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_static_objects=by_static_objects)
         result = result_of(answer, [prepared_street()], Guess(gtsam.Pose3()), CalibrationConfig())
         assert result.status == status
-    assert "by what stands alone" in result.reasons[0] and len(result.weak_directions) == 1
+    assert "by static objects alone" in result.reasons[0] and len(result.weak_directions) == 1

@@ -1,0 +1,179 @@
+"""All matches of a frozen graph as rows of one linear problem, with the clusters that they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse import csr_array
+
+from sst_graph.association.edge_matching import SIDES
+from sst_graph.covariance.error_model import SideResiduals
+from sst_graph.covariance.jackknife import curvature_ratio
+from sst_graph.covariance.sums import ScoreSums
+from sst_graph.factors.alignment import weighted_residuals
+from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.building import PairMatches, bias_groups, state_from
+from sst_graph.graph.elimination import Unknowns, twist_responses
+from sst_graph.graph.state import State, nuisance_key, time_offset_key, twist_key
+from sst_graph.objects.tracks import ObjectId
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class MatchTable:
+    """All weighted matches over the unknowns [extrinsic 6, offsets, biases].
+
+    Attributes:
+        J: (m, n) rows multiplied by sqrt(robust weight) / sigma, motion marginalised out: the covariance of
+            independent matches times a row is how the estimate follows the residual. Sparse: a frame sees few
+            of a long drive's objects.
+        root_weights: (m,) sqrt(robust weight).
+        curvatures: (m,) second derivative of the robust loss (its slope over the residual is the weight).
+        r: (m,) whitened residuals, unweighted.
+        sides: (m,) number of the object's side, the same in all frames; ``sides // SIDES`` is its object.
+        frames: (m,) number of the frame.
+        moved: (m,) whether the LiDAR moved.
+    """
+
+    J: csr_array
+    root_weights: FloatArray
+    curvatures: FloatArray
+    r: FloatArray
+    sides: IntArray
+    frames: IntArray
+    moved: NDArray[np.bool_]
+
+    @cached_property
+    def objects(self) -> IntArray:
+        """(m,) number of the object over all frames, from 0 on."""
+        return np.unique(self.sides // SIDES, return_inverse=True)[1].reshape(-1)
+
+    def take(self, index: IntArray) -> MatchTable:
+        """Some of the matches, by position."""
+        names = ("J", "root_weights", "curvatures", "r", "sides", "frames", "moved")
+        return MatchTable(*(getattr(self, name)[index] for name in names))
+
+    def after(self, step: FloatArray) -> MatchTable:
+        """The matches after a step (n,) of the unknowns, their robust weights as they are."""
+        roots = np.maximum(self.root_weights, 1e-6)
+        return replace(self, r=np.where(self.root_weights > 1e-6, self.r + self.J @ step / roots, self.r))
+
+    @cached_property
+    def scores(self) -> ScoreSums:
+        """The sums of their scores."""
+        return ScoreSums.of(self.J, self.root_weights, self.sides, self.frames)
+
+    @property
+    def residuals(self) -> SideResiduals:
+        """Their residuals by side and frame."""
+        return SideResiduals.of(self.r, self.root_weights**2, self.sides, self.frames, self.moved)
+
+    @property
+    def weight_curvature_ratio(self) -> float:
+        """Mean robust weight over mean curvature."""
+        return curvature_ratio(float(self.root_weights @ self.root_weights), float(self.curvatures.sum()))
+
+
+def match_table(
+    graph: gtsam.NonlinearFactorGraph,
+    values: gtsam.Values,
+    pairs: Sequence[PairMatches],
+    state: State,
+    tracks: Sequence[dict[ObjectId, int]],
+    unknowns: Unknowns,
+) -> MatchTable:
+    """All matches of the frozen graph at its optimum, with the clusters they belong to.
+
+    Args:
+        state: that the matches were made at.
+        tracks: of each drive's objects.
+    """
+    made_at = state.nuisances
+    state = state_from(values, state, pairs)
+    steps = {name: value - made_at.get(name, 0.0) for name, value in state.nuisances.items()}
+    motion = _Motion(values, twist_responses(graph, values, unknowns), steps)
+    blocks, roots, residuals, curvatures, sides = [], [], [], [], []
+    for pair in pairs:
+        for c, matches in pair.matches.items():
+            block, root, r = _rows(pair, c, state, unknowns, motion)
+            blocks.append(csr_array(block))
+            roots.append(root)
+            residuals.append(r)
+            curvatures.append(curvatures_of(matches.alignment.kernel, root, r))
+            track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
+            sides.append((track * _MOST_DRIVES + pair.drive) * SIDES + matches.sides)
+    counts = [len(pair) for pair in pairs]
+    return MatchTable(
+        sparse.vstack(blocks, format="csr"),
+        np.concatenate(roots),
+        np.concatenate(curvatures),
+        np.concatenate(residuals),
+        np.concatenate(sides),
+        np.repeat(np.arange(len(pairs)), counts),
+        np.repeat(np.array([pair.moved for pair in pairs]), counts),
+    )
+
+
+_MOST_DRIVES = 64
+"""Tracks of different drives have different numbers: those of a drive are this far apart."""
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """What the optimum differs in from where the matches were made, beside the state.
+
+    Attributes:
+        values: with the twists at the optimum.
+        responses: (6, n) how each twist follows the other unknowns, by its key.
+        nuisances: steps of the assumptions' parameters since the matches were made, by name.
+    """
+
+    values: gtsam.Values
+    responses: Mapping[int, FloatArray]
+    nuisances: Mapping[str, float]
+
+
+def _rows(
+    pair: PairMatches, c: SemanticClass, state: State, unknowns: Unknowns, motion: _Motion
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weighted Jacobian rows, roots of the weights, and whitened residuals of one class in one pair."""
+    V_key = twist_key(pair.drive, pair.pair.image)
+    c_twist, response = motion.values.atVector(V_key), motion.responses[V_key]
+    alignment = pair.matches[c].alignment
+    groups = bias_groups(pair, c)
+    of_class = state.biases_px.get((pair.drive, c), 0.0)
+    biases_px, columns = np.full(len(alignment), of_class), np.zeros(len(alignment), np.intp)
+    for key, some in groups:
+        own: slice | IntArray = slice(None) if some is None else some
+        columns[own] = unknowns.column(key)
+        if some is not None:
+            biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
+    r, J, _ = weighted_residuals(alignment, state.cTl, state.offset_s(pair.drive), c_twist, biases_px)
+    roots = np.abs(J[:, 13]) * alignment.sigmas_px
+    block = J[:, 7:13] @ response
+    block[:, :6] += J[:, :6]
+    block[:, unknowns.column(time_offset_key(state.clock(pair.drive)))] += J[:, 6]
+    block[np.arange(len(alignment)), columns] += J[:, 13]
+    for name, column in pair.terms.get(c, {}).items():
+        block[:, unknowns.column(nuisance_key(name))] += column * J[:, 13]
+        r = r + column * J[:, 13] * motion.nuisances.get(name, 0.0)
+    return block, roots, unweighted(r, roots)
+
+
+def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
+    """(m,) whitened residuals from those multiplied by the roots of their weights; 0 where nothing weighs."""
+    return np.where(roots > 1e-6, r / np.maximum(roots, 1e-6), 0.0)
+
+
+def curvatures_of(kernel: RobustKernel, roots: FloatArray, r: FloatArray) -> FloatArray:
+    """(m,) second derivatives of the robust loss, weighted as matches are beside the kernel."""
+    return np.asarray(roots**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))

@@ -1,0 +1,168 @@
+"""The sums over matches that the cluster-robust covariance is made of: they grow, whoever fills them.
+
+With a match's whitened Jacobian row J, robust weight w and a = sqrt(w) J, an error e of its residual changes
+the gradient by its score, sqrt(w) a e. Under the error model (:mod:`sst_graph.covariance.error_model`) the
+gradient of all matches varies by
+
+    M = match * sum a a' + side_frame * sum s_kf s_kf' + side * sum s_k s_k',
+
+s_kf the sum of sqrt(w) a over the matches of side k in frame f, and s_k that over all frames. With H the
+information of the whole problem and A = sum a a' the part of it that the matches claim, the covariance is
+
+    H^-1 + H^-1 (M - A) H^-1.
+
+A batch fills the sums with all its matches at once, a tracker adds the frames that leave its window, a graph
+of the user's own adds term by term.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from sst_graph.covariance.error_model import ErrorModel, by_side_and_frame
+from sst_graph.graph.linear import scattered
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class ScoreSums:
+    """Sums over the matches of some frames, in n unknowns.
+
+    Attributes:
+        independent: (n, n) variance of the score if every match errs by itself, A above.
+        side_frames: (n, n) the same by a unit error of each side in each frame.
+        closed: (n, n) the same by a unit error that a side keeps over all frames, of sides that are closed:
+            no frame will see them again.
+        sides: (k,) numbers of the other sides, rising.
+        scores: (k, n) sum of sqrt(w) a of each of them.
+    """
+
+    independent: FloatArray
+    side_frames: FloatArray
+    closed: FloatArray
+    sides: IntArray
+    scores: FloatArray
+
+    @classmethod
+    def none(cls, n: int) -> ScoreSums:
+        """Of no match."""
+        nothing = np.zeros((n, n))
+        return cls(nothing, nothing, nothing, np.zeros(0, np.intp), np.zeros((0, n)))
+
+    @classmethod
+    def of(cls, J: FloatArray | csr_array, roots: FloatArray, sides: IntArray, frames: IntArray) -> ScoreSums:
+        """Of matches, from rows a (m, n), roots of the weights, sides and numbers of the frames (m,)."""
+        first, which = by_side_and_frame(sides, frames)
+        by_frame = _members(which, len(first), roots) @ J
+        names, side = np.unique(sides[first], return_inverse=True)
+        by_side = _members(side.reshape(-1), len(names), np.ones(len(first))) @ by_frame
+        scores = by_side if isinstance(by_side, np.ndarray) else by_side.toarray()
+        return cls(gram(J), gram(by_frame), np.zeros((J.shape[1],) * 2), names, np.asarray(scores))
+
+    @classmethod
+    def of_frame(cls, J: FloatArray, roots: FloatArray, sides: IntArray) -> ScoreSums:
+        """Of the matches of one frame, from dense rows."""
+        names, scores = summed_rows(J * roots[:, None], sides)
+        return cls(J.T @ J, scores.T @ scores, np.zeros((J.shape[1],) * 2), names, scores)
+
+    def __add__(self, other: ScoreSums) -> ScoreSums:
+        """These matches and others, of other frames."""
+        every = np.arange(len(self.independent))
+        return total(len(every), (self, other), (every, every))
+
+    def __sub__(self, other: ScoreSums) -> ScoreSums:
+        """These matches without those of some of the frames, none of whose sides is closed."""
+        scores = self.scores.copy()
+        scores[np.searchsorted(self.sides, other.sides)] -= other.scores
+        independent, side_frames = self.independent - other.independent, self.side_frames - other.side_frames
+        return ScoreSums(independent, side_frames, self.closed, self.sides, scores)
+
+    def columns(self, some: IntArray | slice) -> ScoreSums:
+        """In some of the unknowns, the others known."""
+        blocks = (M[some][:, some] for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(*blocks, self.sides, self.scores[:, some])
+
+    def transformed(self, T: FloatArray) -> ScoreSums:
+        """In other unknowns, whose score is T (m, n) times that of these."""
+        blocks = (T @ M @ T.T for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(*blocks, self.sides, self.scores @ T.T)
+
+    def scaled(self, weight: float) -> ScoreSums:
+        """With the weights of all matches multiplied: the scores by as much, their variance by its square."""
+        blocks = (weight**2 * M for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(*blocks, self.sides, weight * self.scores)
+
+    def without_sides(self, gone: Collection[int]) -> ScoreSums:
+        """With some sides closed: no frame will see them again."""
+        if not gone:
+            return self
+        leaving = np.isin(self.sides, list(gone))
+        rows, kept = self.scores[leaving], ~leaving
+        closed = self.closed + rows.T @ rows
+        return ScoreSums(self.independent, self.side_frames, closed, self.sides[kept], self.scores[kept])
+
+    def variance(self, model: ErrorModel) -> FloatArray:
+        """(n, n) of the score of all matches, M above."""
+        by_side = self.closed + self.scores.T @ self.scores
+        whole = model.match * self.independent + model.side_frame * self.side_frames + model.side * by_side
+        return np.asarray(whole)
+
+    def excess(self, model: ErrorModel) -> FloatArray:
+        """(n, n) variance of the score beyond that of independent matches, M - A."""
+        return self.variance(model) - self.independent
+
+
+def total(n: int, parts: Sequence[ScoreSums], columns: Sequence[IntArray]) -> ScoreSums:
+    """Sums over frames, each in its own columns (m,) of n unknowns."""
+    independent, side_frames = scattered(
+        n, columns, [part.independent for part in parts], [part.side_frames for part in parts]
+    )
+    closed = np.zeros((n, n))
+    for part, own in zip(parts, columns, strict=True):
+        if part.closed.any():
+            closed[np.ix_(own, own)] += part.closed
+    sides = [np.zeros(0, np.intp), *(part.sides for part in parts)]
+    rows = np.zeros((sum(len(own) for own in sides), n))
+    start = 0
+    for part, own in zip(parts, columns, strict=True):
+        rows[start : start + len(part.sides), own] = part.scores
+        start += len(part.sides)
+    return ScoreSums(independent, side_frames, closed, *summed_rows(rows, np.concatenate(sides)))
+
+
+def _members(groups: IntArray, count: int, weights: FloatArray) -> csr_array:
+    """(count, m) weights of the members (m,) of each group."""
+    return csr_array((weights, groups, np.arange(len(groups) + 1)), shape=(len(groups), count)).T.tocsr()
+
+
+def summed_rows(rows: FloatArray, names: IntArray) -> tuple[IntArray, FloatArray]:
+    """(k,) different names, rising, and (k, n) sums of the rows (m, n) of each; names (m,)."""
+    if len(names) == 0:
+        return names, rows
+    order = np.argsort(names, kind="stable")
+    firsts = np.append(0, np.flatnonzero(np.diff(names[order])) + 1)
+    return names[order[firsts]], np.asarray(np.add.reduceat(rows[order], firsts))
+
+
+def gram(J: FloatArray | csr_array) -> FloatArray:
+    """(n, n) J^T J of rows (m, n)."""
+    if isinstance(J, np.ndarray):
+        return np.asarray(J.T @ J)
+    m, n = J.shape
+    some, whole = max(1, _DENSE // max(n, 1)), np.zeros((n, n))
+    # Rows are multiplied much faster when they are dense, and some at a time take little memory.
+    for start in range(0, m, some):
+        rows = J[start : start + some].toarray()
+        whole += rows.T @ rows
+    return whole
+
+
+_DENSE = 500_000
+"""Numbers of a dense part of the rows."""

@@ -1,0 +1,120 @@
+"""The sums of the cluster-robust covariance, frame by frame: they stay small however long the drive.
+
+A frame that leaves the window is added to them and forgotten; sides that were not seen lately are closed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
+from sst_graph.covariance.jackknife import curvature_ratio
+from sst_graph.covariance.sums import ScoreSums, total
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair
+from sst_graph.tracker.sums.object_sums import ObjectSums
+from sst_graph.tracker.window.gaussian import with_room
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_MEMORY = 50
+"""A side that was not seen in so many scans is closed: objects are forgotten after as many."""
+_RECENT = 150
+"""The error model is fitted to so many of the latest frames and to those of the window."""
+
+
+@dataclass
+class RunningSums:
+    """The sums over all frames that have left the window, in the columns of the Gaussian that holds them.
+
+    Attributes:
+        scores: over the unknowns and, behind them, the held parameters.
+        last_seen: by the number of each side that is not closed, the scan that saw it last.
+        recent: residuals of the latest frames.
+        objects: the matches object by object.
+        weight, curvature: sums over all matches, see :class:`LinearizedPair`.
+        held: number of held parameters.
+    """
+
+    scores: ScoreSums
+    last_seen: dict[int, int] = field(default_factory=dict)
+    recent: deque[SideResiduals] = field(default_factory=lambda: deque(maxlen=_RECENT))
+    objects: ObjectSums = field(default_factory=lambda: ObjectSums.empty(0))
+    weight: float = 0.0
+    curvature: float = 0.0
+    held: int = 0
+
+    @classmethod
+    def empty(cls, n: int, held: int = 0) -> RunningSums:
+        """n: unknowns; held: further parameters."""
+        return cls(ScoreSums.none(n + held), objects=ObjectSums.empty(n), held=held)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return len(self.scores.independent) - self.held
+
+    def add(self, pair: LinearizedPair, columns: IntArray, scan: int, by_object: bool = True) -> None:
+        """Add a pair that leaves the window; sides that were not seen lately are closed.
+
+        Args:
+            columns: of the pair's unknowns, and of what it holds if the sums do, among those of these.
+            by_object: keep its matches object by object, too.
+        """
+        n = self.size + self.held
+        both = self.scores, pair.scores.columns(slice(len(columns)))
+        self.last_seen.update(dict.fromkeys(pair.scores.sides.tolist(), scan))
+        closed = [side for side, last in self.last_seen.items() if last < scan - _MEMORY]
+        for side in closed:
+            del self.last_seen[side]
+        self.scores = total(n, both, (np.arange(n), columns)).without_sides(closed)
+        self.recent.append(pair.residuals)
+        if by_object and pair.objects is not None:
+            self.objects.add(pair.objects)
+        self.weight, self.curvature = self.weight + pair.weight, self.curvature + pair.curvature
+
+    def weight_curvature_ratio(self, window: Sequence[LinearizedPair] = ()) -> float:
+        """Mean robust weight over mean curvature, of all matches."""
+        curvature = self.curvature + sum(pair.curvature for pair in window)
+        return curvature_ratio(self.weight + sum(pair.weight for pair in window), curvature)
+
+    def grow(self, n: int) -> None:
+        """Make room for further unknowns, n in all."""
+        self.transform(with_room(self.size, n, self.held))
+
+    def transform(self, T: FloatArray) -> None:
+        """Follow the Gaussian: through a random walk (:meth:`Gaussian.transition`), or to other unknowns."""
+        self.scores = self.scores.transformed(T)
+        self.objects.transform(T[: len(T) - self.held, : T.shape[1] - self.held])
+
+    def copy(self) -> RunningSums:
+        recent = deque(self.recent, self.recent.maxlen)
+        return replace(self, last_seen=dict(self.last_seen), recent=recent, objects=self.objects.copy())
+
+    def error_model(self, window: Iterable[LinearizedPair]) -> ErrorModel:
+        """The error model by the latest frames and those of the window."""
+        return fit_error_model(SideResiduals.joined([*self.recent, *(pair.residuals for pair in window)]))
+
+    def excess(
+        self,
+        window: Sequence[LinearizedPair],
+        columns: Sequence[IntArray],
+        model: ErrorModel,
+        with_held: bool = False,
+    ) -> FloatArray:
+        """(n, n) variance of the score beyond that of independent matches.
+
+        Args:
+            window: pairs beside those added.
+            columns: of their unknowns, and of what they hold where that is asked for.
+            with_held: over what is held, too.
+        """
+        n = self.size + self.held if with_held else self.size
+        past = self.scores.columns(slice(n))
+        seen = [pair.scores.columns(slice(len(own))) for pair, own in zip(window, columns, strict=True)]
+        return total(n, [past, *seen], [np.arange(n), *columns]).excess(model)

@@ -1,0 +1,109 @@
+"""The sums that a tracker fills frame by frame, against the batch's from the same matches."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sst_graph.covariance.cluster_robust import (
+    RobustCovariance,
+    robust_covariance,
+    steps_without_objects,
+)
+from sst_graph.covariance.jackknife import ObjectSpread, composed
+from sst_graph.drive.preparation import PrepareConfig, prepare_drive
+from sst_graph.factors import RobustKernel
+from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
+from sst_graph.graph.linear import unit_scale
+from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
+from sst_graph.objects.tracks import object_tracks
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair
+from sst_graph.tracker.sums.running_sums import RunningSums
+from sst_graph.tracker.window.gaussian import Point
+from sst_graph.types import SemanticClass
+
+VEHICLE, CONFIG, OFFSET_S = SemanticClass.VEHICLE, GraphConfig(), 0.03
+
+
+@pytest.fixture(scope="module")
+def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
+    """The batch's covariance of six frames at the truth, and the same frames as a tracker linearizes them."""
+    street = simulate(
+        SimulationConfig(
+            seed=4,
+            frames=6,
+            width=621,
+            height=188,
+            motion="no_stop",
+            time_offset_s=OFFSET_S,
+            azimuth_step_deg=0.35,
+        )
+    )
+    drive = prepare_drive(street, [VEHICLE], PrepareConfig(use_visual_odometry=False))
+    tracks, state = object_tracks(drive), State(street.truth.cTl, (OFFSET_S,))
+    kernel = RobustKernel("geman_mcclure", 3.0)
+    pairs = associate([drive], Tracks([drive], [tracks]), state, kernel, CONFIG)
+    graph, values = joint_graph(pairs, state, CONFIG)
+    robust = robust_covariance(graph, values, pairs, state, [tracks])
+    seen = {t: 0 for pair in pairs for t in pair.tracks[VEHICLE].tolist()}
+    point = Point.unbiased(state.cTl, OFFSET_S, [VEHICLE]).seen(seen)
+    named = [{(c, n): track for (k, c, n), track in tracks.items() if k == pair.pair.scan} for pair in pairs]
+    linear = [
+        linearize_pair(pair, point, [VEHICLE], own, CONFIG) for pair, own in zip(pairs, named, strict=True)
+    ]
+    return robust, point, linear
+
+
+def _columns(robust: RobustCovariance, point: Point) -> NDArray[np.intp]:
+    """Of the batch's unknowns, among those of the tracker."""
+    keys = [bias_key(0, VEHICLE), *(object_bias_key(0, track) for track in point.tracks)]
+    places = [7, *range(point.core_size, point.size)]
+    found = dict(
+        zip([EXTRINSIC, time_offset_key(), *keys], [[*range(6)], [6], *([p] for p in places)], strict=True)
+    )
+    return np.array([column for key in robust.unknowns.keys for column in found[key]])
+
+
+@pytest.mark.parametrize("left", [0, 3, 6])
+def test_the_sums_are_the_batch_s(
+    matched: tuple[RobustCovariance, Point, list[LinearizedPair]], left: int
+) -> None:
+    """Wherever the frames are: in the window, or gone from it."""
+    robust, point, linear = matched
+    columns, sums = _columns(robust, point), RunningSums.empty(point.size)
+    of_pairs = [point.columns(pair.information.point.tracks) for pair in linear]
+    for scan in range(left):
+        sums.add(linear[scan], of_pairs[scan], scan)
+    window, own = linear[left:], of_pairs[left:]
+    model = sums.error_model(window)
+    np.testing.assert_allclose(
+        [model.side, model.side_frame, model.match],
+        [robust.model.side, robust.model.side_frame, robust.model.match],
+        rtol=1e-9,
+    )
+    excess = sums.excess(window, own, model)[np.ix_(columns, columns)]
+    expected = robust.table.scores.excess(robust.model)
+    scale = unit_scale(expected) * (np.diag(expected) > 0.0)
+    np.testing.assert_allclose(excess * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-9)
+    ratio = sums.weight_curvature_ratio(window)
+    assert ratio == pytest.approx(robust.table.weight_curvature_ratio, rel=1e-9)
+    # The whole covariance, given that of independent matches: with the batch's jackknife the same, with the
+    # tracker's nearly. There an object's matches have no columns of other objects' biases, which the twist of
+    # their image ties to them.
+    naive = np.eye(point.size)
+    naive[np.ix_(columns, columns)] = robust.bread
+    objects = [pair.objects for pair in window if pair.objects is not None]
+    spread = sums.objects.spread(objects, naive, point)
+    steps = steps_without_objects(robust.table, robust.bread)
+    weights = np.asarray(np.bincount(robust.table.objects, robust.table.root_weights**2), np.float64)
+    of_batch = ObjectSpread.of(steps, weights)
+    assert spread.number == pytest.approx(of_batch.number, rel=1e-9)
+    by_model = naive + naive @ sums.excess(window, own, model) @ naive
+    exact = composed(by_model[np.ix_(columns, columns)], of_batch, ratio)[:7, :7]
+    found = composed(by_model, spread, ratio)[:7, :7]
+    sigmas = np.sqrt(np.diag(robust.matrix)[:7])
+    batch, both = robust.matrix[:7, :7], np.outer(sigmas, sigmas)
+    np.testing.assert_allclose(exact / both, batch / both, atol=1e-8)
+    np.testing.assert_allclose(found / both, batch / both, atol=0.02)
