@@ -86,18 +86,18 @@ class ScoreSums:
 
     def columns(self, some: IntArray | slice) -> ScoreSums:
         """In some of the unknowns, the others known."""
-        blocks = (M[some][:, some] for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(*blocks, self.sides, self.scores[:, some])
+        A, B, C = (M[some][:, some] for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(A, B, C, self.sides, self.scores[:, some])
 
     def transformed(self, T: FloatArray) -> ScoreSums:
         """In other unknowns, whose score is T (m, n) times that of these."""
-        blocks = (T @ M @ T.T for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(*blocks, self.sides, self.scores @ T.T)
+        A, B, C = (T @ M @ T.T for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(A, B, C, self.sides, self.scores @ T.T)
 
     def scaled(self, weight: float) -> ScoreSums:
         """With the weights of all matches multiplied: the scores by as much, their variance by its square."""
-        blocks = (weight**2 * M for M in (self.independent, self.side_frames, self.closed))
-        return ScoreSums(*blocks, self.sides, weight * self.scores)
+        A, B, C = (weight**2 * M for M in (self.independent, self.side_frames, self.closed))
+        return ScoreSums(A, B, C, self.sides, weight * self.scores)
 
     def without_sides(self, gone: Collection[int]) -> ScoreSums:
         """With some sides closed: no frame will see them again."""

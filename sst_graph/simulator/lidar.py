@@ -89,7 +89,7 @@ class Lidar:
         config = self.config
         order = np.argsort(np.mod(columns.azimuths, 2 * np.pi))
         # Rings from the top, columns counter-clockwise from forward.
-        faces, reach = (values[::-1][:, order] for values in hits)
+        faces, reach = hits[0][::-1][:, order], hits[1][::-1][:, order]
         slopes = self.slopes[::-1]
         azimuth = columns.azimuths[order]
         shown = (faces >= 0) & (np.abs(azimuth) <= np.deg2rad(config.azimuth_limit_deg))

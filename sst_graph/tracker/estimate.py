@@ -23,6 +23,7 @@ from sst_graph.tracker.monitor.statistic import Estimate
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
+from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.information_log import InformationLog
 from sst_graph.tracker.window.matcher import WindowMatcher
@@ -102,7 +103,7 @@ class OnlineEstimate:
         self.schedule = RelinearizationSchedule(window.first_scan, soon, self.config.window)
         self.entered.extend(smoother.entries)
         self.information_log.restart()
-        self.information_log.take(window.next_scan - 1, self.reported_covariance())
+        self.information_log.add(window.next_scan - 1, self.reported_covariance())
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: Guess) -> None:
@@ -209,7 +210,7 @@ class OnlineEstimate:
         # 3. Covariance, and what the scan contributed to it.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
-            self.information_log.take(matches.scan, self.reported_covariance())
+            self.information_log.add(matches.scan, self.reported_covariance())
         # 4. Do the data contradict what is assumed?
         self.tests.update(matches.scan, smoother)
         self.past_epochs.take(smoother)

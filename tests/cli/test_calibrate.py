@@ -58,7 +58,7 @@ def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest
     truth = street / "sequences" / "00" / "groundtruth.json"
     assert main(["evaluate", str(out), "--truth", str(truth), "--json"]) == 0
     errors = json.loads(capsys.readouterr().out)
-    assert errors["qad_deg"] < 0.3 and errors["atd_m"] < 0.03 and abs(errors["time_offset_s"]) < 0.02
+    assert errors["qad_deg"] < 0.1 and errors["atd_m"] < 0.006 and abs(errors["time_offset_s"]) < 0.001
 
     assert main(["inspect", str(out), "--json"]) == 0
     inspection = json.loads(capsys.readouterr().out)

@@ -290,3 +290,12 @@ def test_offset_and_twist_are_zero_where_they_are_not_given(make_scene):
     for make, alignment in ((point_to_pixel_factor, points), (silhouette_factor, contour)):
         expected = alignment_cost(alignment, values.atPose3(E), 0.0, np.zeros(6))
         assert make(alignment, E).error(values) == pytest.approx(expected, rel=1e-12)
+
+
+def test_one_bias_belongs_to_the_silhouettes_alone(make_scene):
+    (points, cTl, offset_s, twist), (contour, *_) = make_scene(3), make_scene(3, normals=True)
+    values = nearby(cTl, offset_s, twist, 0.7)
+    alone = frame_factor([points, contour], E, D, V, [None, B])
+    both = frame_factor([points, contour], E, D, V, B)
+    assert both.error(values) == alone.error(values)
+    np.testing.assert_array_equal(*(f.linearize(values).augmentedInformation() for f in (alone, both)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import errno
 import fcntl
 import os
@@ -283,19 +282,16 @@ def test_notes_saved_while_the_folder_is_replaced_survive(
     out = tmp_path / "out"
     write(out, {"a": "old"})
     (out / "notes.txt").write_text("first")
-    system = ctypes.CDLL(None, use_errno=True)
+    exchange = __import__("sst_graph.files.output", fromlist=["_exchange"])._exchange
 
-    class LateWriter:
-        """The C library, and somebody who writes into the old folder just before it is exchanged."""
+    def late(new: Path, target: Path) -> bool:
+        (target / "late.txt").write_text("late")
+        (target / "saved").write_text("second")
+        os.replace(target / "saved", target / "notes.txt")
+        os.utime(target / "notes.txt", ns=(1 << 62, 1 << 62))
+        return bool(exchange(new, target))
 
-        def renameat2(self, *arguments: object) -> int:
-            (out / "late.txt").write_text("late")
-            (out / "saved").write_text("second")
-            os.replace(out / "saved", out / "notes.txt")
-            os.utime(out / "notes.txt", ns=(1 << 62, 1 << 62))
-            return int(system.renameat2(*arguments))
-
-    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: LateWriter())
+    monkeypatch.setattr("sst_graph.files.output._exchange", late)
     write(out, {"a": "new"}, overwrite=True)
     assert tree(out) == {"a": "new", "late.txt": "late", "notes.txt": "second"}
 

@@ -144,6 +144,8 @@ def test_a_limit_for_each_factor_and_known_inliers():
     np.testing.assert_array_equal(narrow.weights, [1.0, 1.0, 1.0, 0.0])
     known = gnc(graph, at(0.0), GncParams(4.5), known_inliers=[3])
     assert known.weights[3] == 1.0
+    trusted = gnc(graph, at(0.0), GncParams(4.5), known_inliers=range(4))
+    assert trusted.converged and trusted.iterations == 1 and (trusted.weights == 1.0).all()
 
 
 def test_scaling_multiplies_the_cost_and_leaves_the_unweighted_error():
