@@ -162,7 +162,7 @@ def test_the_bounds_themselves_are_taken(command: str) -> None:
                 beside.append(name)
     # Only where another setting beside it says more.
     assert {name.rpartition(".")[2] for name in beside} <= {
-        *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "delay_s"),
+        *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "time_offset_s"),
         *("patience", "window", "confirmations", "start_scans", "restart_scans", "lost", "kept"),
         *("box_deg", "box_step_deg", "max_offset_s", "step_s", "search_m", "search_step_m"),
         *("rival_ratio", "finalist_ratio", "first_px", "last_px"),
