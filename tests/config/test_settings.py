@@ -162,7 +162,7 @@ def test_the_bounds_themselves_are_taken(command: str) -> None:
                 beside.append(name)
     # Only where another setting beside it says more.
     assert {name.rpartition(".")[2] for name in beside} <= {
-        *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "delay_s"),
+        *("frames", "width", "height", "speed_mps", "frame_rate_hz", "streets", "time_offset_s"),
         *("window", "start_scans", "kept"),
         *("search_m", "search_step_m"),
         *("first_px", "last_px"),
