@@ -90,8 +90,8 @@ def numeric(hint: Any) -> bool:
 
 
 def test_there_are_settings_to_look_at() -> None:
-    assert len(CLASSES) > 40
-    assert sum(1 for root in ROOTS.values() for _ in walk_settings(type(root))) > 1000
+    assert len(CLASSES) > 10
+    assert sum(1 for root in ROOTS.values() for _ in walk_settings(type(root))) > 60
 
 
 @pytest.mark.parametrize("cls", CLASSES, ids=lambda cls: cls.__name__)
