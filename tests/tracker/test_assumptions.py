@@ -241,9 +241,9 @@ def test_what_is_estimated_agrees_with_the_batch(
     assert update.contradictions == (), update
     value, sigma = update.estimated["k1"]
     assert abs(value - K1) < 3.0 * sigma and sigma < 0.05
-    assert held_at_zero(("k1",)) == tuple(estimating.considered().sigmas)
+    assert held_at_zero(("k1",)) == tuple(estimating.estimate.considered().sigmas)
     # The batch, with the same variable, from the same start.
-    config = estimating.config.calibration
+    config = estimating.setup.config.estimating.calibration
     drive = prepare_drive(bent, config.classes, config.prepare)
     assert bent.truth is not None
     tracks = object_tracks(drive)
@@ -259,7 +259,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     step = np.array([*turn, state.offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
     sigmas = np.sqrt(np.diag(robust.matrix)[[*range(7), column]])
     assert np.abs(step / sigmas).max() < 1.0, np.round(step / sigmas, 2)
-    own = np.sqrt(np.diag(estimating.covariance)[:7])
+    own = np.sqrt(np.diag(estimating.estimate.covariance)[:7])
     np.testing.assert_allclose([*own, sigma], sigmas, rtol=0.3)
     # Without distortion.
     clean = current(settled)

@@ -78,4 +78,4 @@ def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, li
         once.add(frame)
         again.add(frame)
     assert once.estimate.relinearization is None and again.estimate.relinearization is None
-    assert sigmas_apart(once, again.point.cTl, again.point.offset_s) < 0.5
+    assert sigmas_apart(once, again.estimate.point.cTl, again.estimate.point.offset_s) < 0.5
