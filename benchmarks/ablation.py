@@ -378,9 +378,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     writer = commands.add_parser("table")
     writer.add_argument("runs", nargs="+")
     writer.add_argument("--kind", default="local")
+    writer.add_argument("--full", action="store_true", help="of the full method only")
+    writer.add_argument(
+        "--into", help="Markdown file in which it stands between <!-- KIND --> and <!-- end -->"
+    )
     args = parser.parse_args(arguments)
     if args.command == "table":
-        print(write_table([Path(path) for path in args.runs], args.kind))
+        text = write_table([Path(path) for path in args.runs], args.kind, args.full)
+        if args.into is None:
+            print(text)
+        else:
+            page, mark = Path(args.into), f"<!-- {args.kind} -->\n"
+            before, _, rest = page.read_text().partition(mark)
+            page.write_text(f"{before}{mark}\n{text}\n<!-- end -->{rest.partition('<!-- end -->')[2]}")
         return
     cv2.setNumThreads(1)
     raise SystemExit(0 if run(args) else 3)

@@ -187,7 +187,7 @@ def cost_table(runs: Mapping[str, Mapping[str, Outcome]]) -> str:
     """A row for each case, the longest code first: errors without it over those with it, paired."""
     drives, groups = _drives(runs), _streets(runs)
     head = ["left out", "lines", *(f"error, {name}" for name in groups), *(f"error, {n}" for n in drives)]
-    head += ["NEES / dimension, streets", "surprise, streets", "NEES, drives", "silent", "CPU"]
+    head += ["NEES / dimension, streets", "surprise, streets", "NEES, drives", "ok", "silent", "CPU"]
     rows = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for case in _ordered(runs):
         every = Pairs.of(runs, case.name, lambda data: True)
@@ -199,7 +199,14 @@ def cost_table(runs: Mapping[str, Mapping[str, Outcome]]) -> str:
             one = Pairs.of(runs, case.name, drive.__eq__)
             cells.append(one.paired)
         silent = [sum(o.silent for o in side) for side in (every.full, every.without)]
-        cells += [streets.nees, streets.surprise, reals.nees, f"{silent[0]} → {silent[1]} of {len(every)}"]
+        ok = [sum(o.row["status"] == "ok" for o in side) for side in (every.full, every.without)]
+        cells += [
+            streets.nees,
+            streets.surprise,
+            reals.nees,
+            f"{ok[0]} → {ok[1]}",
+            f"{silent[0]} → {silent[1]} of {len(every)}",
+        ]
         cells.append(f"{every.time:.2f}" if len(every) else "–")
         rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
@@ -224,7 +231,9 @@ def detail_table(runs: Mapping[str, Mapping[str, Outcome]]) -> str:
     return "\n".join(rows)
 
 
-def write_table(paths: Sequence[Path], kind: str) -> str:
+def write_table(paths: Sequence[Path], kind: str, full_only: bool = False) -> str:
     """All tables of one kind of run."""
     runs = read(paths, kind)
-    return "\n\n".join((full_table(runs), cost_table(runs), detail_table(runs))) + "\n"
+    if full_only:
+        return full_table(runs)
+    return "\n\n".join((full_table(runs), cost_table(runs), detail_table(runs)))
