@@ -324,7 +324,7 @@ def runs(args: argparse.Namespace) -> Iterator[tuple[Case, str, Data]]:
             frames = 60 if TRACKER_KINDS & set(kinds) else 24
             data = Data(name, path, Path(args.cache), frames)
             for case in CASES:
-                if chosen is None and case.tier != int(tier):
+                if chosen is None and case.tier != int(tier) and case.name != "none":
                     continue
                 if (chosen is not None and case.name not in chosen) or case.covariance:
                     continue
