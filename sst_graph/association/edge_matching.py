@@ -45,20 +45,33 @@ BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 
 @dataclass(frozen=True)
 class MatchConfig(Settings):
-    """How boundary points are matched to contours.
+    """How boundary points are matched to contours."""
 
-    Attributes:
-        mask_sigma_px: deviation of a mask's contour from the object's [px].
-        side_sigma_px: error that all matches on one side of one object in one image share [px]; it
-            bounds what a side may claim, however many points it has.
-        lower_edge_sigma_px: the same of an object's edge towards the ground [px].
-        top_edges: use boundaries towards the ring above.
-    """
-
-    mask_sigma_px: float = setting(1.0, at_least=0.01, at_most=100.0)
-    side_sigma_px: float = setting(0.7, at_least=0.0, at_most=100.0)
-    lower_edge_sigma_px: float = setting(1.2, at_least=0.0, at_most=100.0)
-    top_edges: bool = True
+    mask_sigma_px: float = setting(
+        1.0,
+        at_least=0.01,
+        at_most=100.0,
+        doc="Deviation of a mask's contour from the object's. Raise it for coarse masks.",
+    )
+    side_sigma_px: float = setting(
+        0.7,
+        at_least=0.0,
+        at_most=100.0,
+        doc="Error that all matches on one side of an object in one image share. Raise it where "
+        "outlines are drawn carelessly.",
+    )
+    lower_edge_sigma_px: float = setting(
+        1.2,
+        at_least=0.0,
+        at_most=100.0,
+        doc="Error that all matches on an object's lower edge share. Raise it where the lower edges "
+        "of masks are poor.",
+    )
+    top_edges: bool = setting(
+        True,
+        doc="Match edges towards the ring above. Set to false where rings are far apart (16 lasers) "
+        "and tops look wrong in the overlay.",
+    )
 
 
 GATE = 3.0

@@ -35,15 +35,20 @@ _CHUNK = 100
 
 @dataclass(frozen=True)
 class SemAlignConfig(Settings):
-    """Sampled starts.
+    """Sampled starts."""
 
-    Attributes:
-        starts: poses sampled around the guess, the guess itself among them.
-        seed: of the samples.
-    """
-
-    starts: int = setting(5000, at_least=1, at_most=100_000)
-    seed: int = setting(0, at_least=0, at_most=10**15)
+    starts: int = setting(
+        5000,
+        at_least=1,
+        at_most=100_000,
+        doc="Poses that SemAlign samples around the guess. Raise it for a poorer guess.",
+    )
+    seed: int = setting(
+        0,
+        at_least=0,
+        at_most=10**15,
+        doc="Seed of SemAlign's samples. Change it to see whether the answer depends on it.",
+    )
 
 
 def solve_semalign(problem: PaperProblem, guess: Calibration, config: SemAlignConfig) -> NearestSolution:

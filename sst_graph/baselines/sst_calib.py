@@ -48,19 +48,40 @@ _VELOCITY_EVERY = 5
 
 @dataclass(frozen=True)
 class PaperConfig(Settings):
-    """What the paper leaves open, and the weights of its regularizer.
+    """What the paper leaves open, and the weights of its regularizer."""
 
-    Attributes:
-        lambda_t, lambda_r: weights of the regularizer beta [1/m^2], [1/rad^2]; the defaults are the paper's.
-        static_frames, joint_frames: most frames of each stage.
-        seed: of the sample of pixels.
-    """
-
-    lambda_t: float = setting(1e6, at_least=1e-6, at_most=1e15)
-    lambda_r: float = setting(1e9, at_least=1e-6, at_most=1e15)
-    static_frames: int = setting(5, at_least=1, at_most=1000)
-    joint_frames: int = setting(20, at_least=1, at_most=1000)
-    seed: int = setting(0, at_least=0, at_most=10**15)
+    lambda_t: float = setting(
+        1e6,
+        at_least=1e-6,
+        at_most=1e15,
+        unit="1/m^2",
+        doc="Weight of the translation in SST-Calib's regularizer. Change to compare with the paper.",
+    )
+    lambda_r: float = setting(
+        1e9,
+        at_least=1e-6,
+        at_most=1e15,
+        unit="1/rad^2",
+        doc="Weight of the rotation in SST-Calib's regularizer. Change to compare with the paper.",
+    )
+    static_frames: int = setting(
+        5,
+        at_least=1,
+        at_most=1000,
+        doc="Most frames of SST-Calib's static stage. Raise it for more data, at a cost in time.",
+    )
+    joint_frames: int = setting(
+        20,
+        at_least=1,
+        at_most=1000,
+        doc="Most frames of SST-Calib's joint stage. Raise it for more data, at a cost in time.",
+    )
+    seed: int = setting(
+        0,
+        at_least=0,
+        at_most=10**15,
+        doc="Seed of the pixels that SST-Calib samples. Change it to see whether the answer depends on it.",
+    )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Literal
 
 from sst_graph.baselines.semalign import SemAlignConfig
 from sst_graph.baselines.sst_calib import PaperConfig
-from sst_graph.config import Settings
+from sst_graph.config import Settings, setting
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.covariance.unknown_motion import UnknownMotionConfig
@@ -24,25 +24,23 @@ UseMotion = Literal["auto", "always", "never"]
 
 @dataclass(frozen=True)
 class LowerEdgesConfig(Settings):
-    """When edges towards the ground are matched.
+    """When edges towards the ground are matched."""
 
-    Attributes:
-        use: ``auto`` where the labels agree about them, class by class.
-    """
-
-    use: Literal["auto", "always", "never"] = "auto"
+    use: Literal["auto", "always", "never"] = setting(
+        "auto",
+        doc="Match edges towards the ground: auto where the labels of both sides agree on them, class"
+        " by class; never for hand-drawn outlines that cover the gap below vehicles.",
+    )
 
 
 @dataclass(frozen=True)
 class ContradictionConfig(Settings):
-    """Whether parts of the data are compared with one another.
+    """Whether parts of the data are compared with one another."""
 
-    Attributes:
-        check: solve drives, and stretches of each, by themselves and compare the answers; costs about as
-            much time as the calibration.
-    """
-
-    check: bool = True
+    check: bool = setting(
+        True,
+        doc="Test whether drives, and parts of a drive, contradict one another. Set to false to save time.",
+    )
 
 
 @dataclass(frozen=True)
@@ -50,15 +48,6 @@ class CalibrationConfig(Settings):
     """What to do and how; one part a stage, written beside every result.
 
     Attributes:
-        method: ``joint`` (default), ``paper`` (SST-Calib to the letter), ``static`` (its static stage),
-            ``semalign`` (sampled starts, points to pixels), ``motion`` (LiDAR odometry
-            against visual odometry).
-        classes: semantic classes to align.
-        time_offset_per_drive: each drive has a time offset of its own, instead of one for all.
-        use_motion: whether method joint also uses camera and LiDAR motion (hand-eye), as a factor and as a
-            check. ``auto``: where the labels alone determine all seven unknowns (a direction that only the
-            motion determines stays reported as unobservable), and the points of a scan share one time (a
-            rolling sweep is compensated by the very motion, which then lags a few milliseconds behind).
         sweep: how the times of the points are decided where the data bring none.
         prepare: what is taken from every frame.
         start: the search for a start.
@@ -72,16 +61,30 @@ class CalibrationConfig(Settings):
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
         contradictions: when method joint finds that drives, or parts of one, contradict each other.
-        check_stamps: call an answer not converged where a sensor's stamps jump against their own frame
-            interval, for then there is no one time offset; not for sensors whose rate goes up and down.
-        find_causes: where a result of method joint may be wrong or is missing, try changes of the data that
-            would make the labels agree (mirrored, inverted, ...) and name what helps; takes up to a minute.
     """
 
-    method: Method = "joint"
-    classes: tuple[SemanticClass, ...] = (SemanticClass.VEHICLE,)
-    time_offset_per_drive: bool = False
-    use_motion: UseMotion = "auto"
+    method: Method = setting(
+        "joint",
+        doc="What estimates: joint (extrinsic and time offset), motion (LiDAR against visual "
+        "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign. "
+        "Change to compare, or where there are no labels.",
+    )
+    classes: tuple[SemanticClass, ...] = setting(
+        (SemanticClass.VEHICLE,),
+        doc="Semantic classes whose edges are aligned. Add pole, person, ... where both sides label "
+        "them well; leave out classes that are labelled on one side only.",
+    )
+    time_offset_per_drive: bool = setting(
+        False,
+        doc="One time offset for each drive instead of one for all. Set where the clocks were started"
+        " anew between drives.",
+    )
+    use_motion: UseMotion = setting(
+        "auto",
+        doc="Whether method joint adds hand-eye constraints from LiDAR and visual odometry. auto: "
+        "where the labels alone determine all unknowns and the scans are not rolling. always: "
+        "where constant speed leaves the offset open; never: where visual odometry is poor.",
+    )
     sweep: SweepConfig = field(default_factory=SweepConfig)
     prepare: PrepareConfig = field(default_factory=PrepareConfig)
     start: StartConfig = field(default_factory=StartConfig)
@@ -94,8 +97,16 @@ class CalibrationConfig(Settings):
     unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
     observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
     contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
-    check_stamps: bool = True
-    find_causes: bool = True
+    check_stamps: bool = setting(
+        True,
+        doc="Report a result as not converged where a sensor's stamps jump. Set to false for sensors "
+        "without a steady rate.",
+    )
+    find_causes: bool = setting(
+        True,
+        doc="Where a result is not ok, try changes of the data (mirrored, inverted, ...) that would "
+        "make the labels agree. Set to false to save up to a minute.",
+    )
 
     @property
     def estimating(self) -> CalibrationConfig:

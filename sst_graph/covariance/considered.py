@@ -36,7 +36,18 @@ BUDGET = "sigma_budget"
 _Sigmas = make_dataclass(
     "AssumptionSigmas",
     [
-        (name, float, setting(each.sigma, at_least=0.0, at_most=100.0 * each.span))
+        (
+            name,
+            float,
+            setting(
+                each.sigma,
+                at_least=0.0,
+                at_most=100.0 * each.span,
+                unit=each.unit,
+                doc=f"{each.name}: deviation considered in the covariance ({each.source}). "
+                "Raise it for a poorer set-up; 0: exact.",
+            ),
+        )
         for name, each in ASSUMPTIONS.items()
     ],
     bases=(Settings,),
@@ -58,17 +69,23 @@ class AssumptionConfig(Settings):
     Attributes:
         sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
             what a careful set-up leaves (``sst_graph.assumptions`` names their sources).
-        estimate: assumptions whose parameters are variables of the answer: ``name``, or ``name=sigma`` with
-            the deviation from 0 beforehand, in its unit.
-        test: test the assumptions against the data.
-        threshold: an estimate of a parameter farther from 0 than this many of its deviations contradicts
-            the assumption; with ten tests, 3.3 gives one false alarm in a hundred drives.
     """
 
     sigmas: AssumptionSigmas = field(default_factory=AssumptionSigmas)
-    estimate: tuple[str, ...] = ()
-    test: bool = True
-    threshold: float = setting(3.3, at_least=1.0, at_most=100.0)
+    estimate: tuple[str, ...] = setting(
+        (),
+        doc="Assumptions whose parameters are estimated with the calibration: NAME, or NAME=SIGMA "
+        "with the deviation from 0. Use where a test says that one is violated.",
+    )
+    test: bool = setting(True, doc="Test the assumptions against the data. Set to false to save time.")
+    threshold: float = setting(
+        3.3,
+        at_least=1.0,
+        at_most=100.0,
+        unit="sigma",
+        doc="Standard deviations from 0 beyond which a parameter contradicts its assumption. Raise it"
+        " for fewer false alarms (3.3: one in a hundred drives).",
+    )
 
     def __post_init__(self) -> None:
         named_sigmas(self.estimate)

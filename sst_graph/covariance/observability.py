@@ -16,13 +16,6 @@ FloatArray = NDArray[np.float64]
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
 _PAIR_CORRELATION = 0.98
-"""Translation and time offset of at least this multiple correlation hardly separate, as at constant speed:
-what separates them is small, ..."""
-_PAIR_SHARE = 0.5
-"""... and their sigmas must be within this share of the limits."""
-
-
-_PAIR_CORRELATION = 0.98
 """A translation and the time offset that are correlated as closely as this hardly separate, as at constant
 speed: what does separate them is small ..."""
 _PAIR_SHARE = 0.5
@@ -62,17 +55,29 @@ MOTION = Advice(
 
 @dataclass(frozen=True)
 class ObservabilityConfig(Settings):
-    """Largest standard deviations of an answer that may be called ok.
+    """Largest standard deviations of an answer that may be called ok."""
 
-    Attributes:
-        rotation_deg: of any rotation [deg].
-        translation_m: of any translation [m].
-        offset_s: of the time offset [s].
-    """
-
-    rotation_deg: float = setting(0.5, at_least=1e-30, at_most=180.0)
-    translation_m: float = setting(0.05, at_least=1e-30, at_most=1000.0)
-    offset_s: float = setting(0.01, at_least=1e-30, at_most=1000.0)
+    rotation_deg: float = setting(
+        0.5,
+        at_least=1e-30,
+        at_most=180.0,
+        doc="Largest standard deviation of any rotation of a result that is ok. Lower it where the "
+        "use needs more.",
+    )
+    translation_m: float = setting(
+        0.05,
+        at_least=1e-30,
+        at_most=1000.0,
+        doc="Largest standard deviation of any translation of a result that is ok. Lower it where the"
+        " use needs more.",
+    )
+    offset_s: float = setting(
+        0.01,
+        at_least=1e-30,
+        at_most=1000.0,
+        doc="Largest standard deviation of the time offset of a result that is ok. Lower it where the"
+        " use needs more.",
+    )
 
 
 def weak_directions(

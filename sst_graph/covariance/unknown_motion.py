@@ -22,15 +22,22 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UnknownMotionConfig(Settings):
-    """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood.
+    """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood."""
 
-    Attributes:
-        speed_mps: deviation of its speed along each axis [m/s].
-        turn_deg_per_s: of its rate of turning about each axis [deg/s].
-    """
-
-    speed_mps: float = setting(10.0, at_least=0.0, at_most=200.0)
-    turn_deg_per_s: float = setting(6.0, at_least=0.0, at_most=360.0)
+    speed_mps: float = setting(
+        10.0,
+        at_least=0.0,
+        at_most=200.0,
+        doc="Deviation of the speed along each axis where a single scan leaves it unknown. 0 where "
+        "the vehicle stood.",
+    )
+    turn_deg_per_s: float = setting(
+        6.0,
+        at_least=0.0,
+        at_most=360.0,
+        doc="Deviation of the turn rate about each axis where a single scan leaves it unknown. 0 "
+        "where the vehicle stood.",
+    )
 
 
 def unknown_motion_covariance(

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings
+from sst_graph.config import Settings, setting
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError
@@ -45,13 +45,13 @@ _DEPTH_POINTS = 30_000
 
 @dataclass(frozen=True)
 class PictureConfig(Settings):
-    """Contours of masks.
+    """Contours of masks."""
 
-    Attributes:
-        use: contours follow the picture; False uses them as the masks have them.
-    """
-
-    use: bool = True
+    use: bool = setting(
+        True,
+        doc="Move the contours of the masks to the edges in the picture. Set to false for pictures at"
+        " night or without texture, or for exact masks.",
+    )
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,16 @@ class PrepareConfig(Settings):
         boundary: boundary points.
         picture: contours of masks.
         lidar_odometry: motion between scans.
-        use_visual_odometry: track image features.
     """
 
     boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
     picture: PictureConfig = field(default_factory=PictureConfig)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
-    use_visual_odometry: bool = True
+    use_visual_odometry: bool = setting(
+        True,
+        doc="Track image features for the motion of the camera. Set to false to save time where the "
+        "motion is not used.",
+    )
 
 
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")

@@ -54,15 +54,21 @@ class Edge(IntEnum):
 
 @dataclass(frozen=True)
 class BoundaryConfig(Settings):
-    """Objects whose boundaries are used.
+    """Objects whose boundaries are used."""
 
-    Attributes:
-        max_range_m: farthest object [m].
-        min_points: objects with fewer points are left out.
-    """
-
-    max_range_m: float = setting(60.0, at_least=1.0, at_most=1000.0)
-    min_points: int = setting(15, at_least=1, at_most=1_000_000)
+    max_range_m: float = setting(
+        60.0,
+        at_least=1.0,
+        at_most=1000.0,
+        doc="Range beyond which objects are not used. Lower it where labels of far objects are poor, "
+        "raise it for long-range LiDARs.",
+    )
+    min_points: int = setting(
+        15,
+        at_least=1,
+        at_most=1_000_000,
+        doc="Objects with fewer returns are not used. Lower it for LiDARs with few rings.",
+    )
 
 
 @dataclass(frozen=True)

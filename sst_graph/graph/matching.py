@@ -60,10 +60,6 @@ class GraphConfig(Settings):
         match: how boundary points meet contours.
         lower_edges: classes whose edges towards the ground are matched too. They sharpen roll and height
             where both sides label them alike; hand-drawn outlines often cover the gap above the ground.
-        bias_sigma_px: prior deviation of a class's mask bias from 0 [px].
-        object_bias_sigma_px: deviation of an object's mask bias from its class's [px]; 0 gives every object
-            of a class the same bias.
-        time_offset_sigma_s: prior deviation of the time offset from the guess [s].
         lower_edges: classes whose edges towards the ground are matched too; chosen by
             :mod:`sst_graph.batch.lower_edges`.
         estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
@@ -71,9 +67,26 @@ class GraphConfig(Settings):
     """
 
     match: MatchConfig = field(default_factory=MatchConfig)
-    bias_sigma_px: float = setting(3.0, at_least=0.001, at_most=1000.0)
-    object_bias_sigma_px: float = setting(0.5, at_least=0.0, at_most=1000.0)
-    time_offset_sigma_s: float = setting(0.3, at_least=1e-6, at_most=100.0)
+    bias_sigma_px: float = setting(
+        3.0,
+        at_least=0.001,
+        at_most=1000.0,
+        doc="Prior deviation of a class's mask bias (masks drawn too large or too small) from 0. "
+        "Raise it for networks whose masks are far too large.",
+    )
+    object_bias_sigma_px: float = setting(
+        0.5,
+        at_least=0.0,
+        at_most=1000.0,
+        doc="Prior deviation of an object's mask bias from its class's. 0: one bias for all objects "
+        "of a class.",
+    )
+    time_offset_sigma_s: float = setting(
+        0.3,
+        at_least=1e-6,
+        at_most=100.0,
+        doc="Prior deviation of the time offset from the guess. Lower it where the offset is known.",
+    )
     lower_edges: tuple[SemanticClass, ...] = internal(())
     estimate: tuple[str, ...] = internal(())
 

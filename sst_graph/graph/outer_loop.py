@@ -57,13 +57,21 @@ class JointConfig(Settings):
 
     Attributes:
         graph: matches, priors.
-        max_outer: most outer iterations.
-        min_matches: fewest matches in all for an answer.
     """
 
     graph: GraphConfig = field(default_factory=GraphConfig)
-    max_outer: int = setting(40, at_least=1, at_most=1000)
-    min_matches: int = setting(30, at_least=1, at_most=1_000_000)
+    max_outer: int = setting(
+        40,
+        at_least=1,
+        at_most=1000,
+        doc="Most outer iterations (matching anew). Raise it where a result says that it has not converged.",
+    )
+    min_matches: int = setting(
+        30,
+        at_least=1,
+        at_most=1_000_000,
+        doc="Fewest matches for a result. Lower it for single frames with few objects.",
+    )
 
 
 @dataclass(frozen=True)

@@ -35,13 +35,15 @@ _ROUNDS = 6
 
 @dataclass(frozen=True)
 class MotionStartConfig(Settings):
-    """The time offsets that are tried.
+    """The time offsets that are tried."""
 
-    Attributes:
-        max_offset_s: farthest time offset tried, either side [s]; each step of 0.02 s takes some 10 ms.
-    """
-
-    max_offset_s: float = setting(0.5, at_least=0.0, at_most=4.0)
+    max_offset_s: float = setting(
+        0.5,
+        at_least=0.0,
+        at_most=4.0,
+        doc="Half width of the time offsets tried by method motion. Raise it where the clocks may "
+        "differ by more.",
+    )
 
 
 @dataclass(frozen=True)

@@ -61,11 +61,16 @@ class MotionConfig(Settings):
 
     Attributes:
         start: time offsets that are tried first.
-        min_pairs: fewest pairs for an answer.
     """
 
     start: MotionStartConfig = field(default_factory=MotionStartConfig)
-    min_pairs: int = setting(5, at_least=2, at_most=1_000_000)
+    min_pairs: int = setting(
+        5,
+        at_least=2,
+        at_most=1_000_000,
+        doc="Fewest pairs of camera and LiDAR motions for a result of method motion. Lower it for "
+        "short drives.",
+    )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.config import Settings
+from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
@@ -45,11 +45,14 @@ class StartConfig(Settings):
 
     Attributes:
         search: where.
-        enabled: False takes the guess as it is.
     """
 
     search: SearchConfig = field(default_factory=SearchConfig)
-    enabled: bool = True
+    enabled: bool = setting(
+        True,
+        doc="Search globally for an initial extrinsic and time offset. Set to false where the guess "
+        "is within a degree and ten centimetres, to save time.",
+    )
 
 
 @dataclass(frozen=True)

@@ -53,25 +53,53 @@ drives with bad labels or few objects, votes alone lose one more start without a
 
 @dataclass(frozen=True)
 class SearchConfig(Settings):
-    """Where a start is searched.
+    """Where a start is searched."""
 
-    Attributes:
-        frames: most frames that are looked at.
-        points_per_class: most points of a class in one frame.
-        box_deg: half width of the box of rotation vectors around a guess [deg].
-        translation_m: half width of the translations around a guess [m].
-        free_translation_m: half width of the translations without a guess [m].
-        time_offset_s: half width of the time offsets [s].
-        seed: of the sampler.
-    """
-
-    frames: int = setting(6, at_least=1, at_most=50)
-    points_per_class: int = setting(250, at_least=1, at_most=5000)
-    box_deg: float = setting(30.0, at_least=0.0, at_most=180.0)
-    translation_m: float = setting(0.6, at_least=0.001, at_most=20.0)
-    free_translation_m: float = setting(2.0, at_least=0.001, at_most=20.0)
-    time_offset_s: float = setting(0.5, at_least=0.0, at_most=5.0)
-    seed: int = setting(0, at_least=0, at_most=10**15)
+    frames: int = setting(
+        6,
+        at_least=1,
+        at_most=50,
+        doc="Frames that take part in the search. Raise it where few objects are in view.",
+    )
+    points_per_class: int = setting(
+        250,
+        at_least=1,
+        at_most=5000,
+        doc="Points of each class and frame that take part in the search. Raise it where the search "
+        "misses, at a cost in time.",
+    )
+    box_deg: float = setting(
+        30.0,
+        at_least=0.0,
+        at_most=180.0,
+        doc="Half width of the rotations searched around a guess. Raise it for a poorer guess, or give none.",
+    )
+    translation_m: float = setting(
+        0.6,
+        at_least=0.001,
+        at_most=20.0,
+        doc="Half width of the translations searched around a guess. Raise it where the guess may be "
+        "off by more.",
+    )
+    free_translation_m: float = setting(
+        2.0,
+        at_least=0.001,
+        at_most=20.0,
+        doc="Half width of the translations searched without a guess. Raise it for sensors mounted "
+        "farther apart.",
+    )
+    time_offset_s: float = setting(
+        0.5,
+        at_least=0.0,
+        at_most=5.0,
+        doc="Half width of the time offsets searched. Raise it where the clocks may differ by more.",
+    )
+    seed: int = setting(
+        0,
+        at_least=0,
+        at_most=10**15,
+        doc="Seed of the global search's sampler. Change it to see whether the answer depends on it.",
+    )
 
 
 @dataclass(frozen=True)

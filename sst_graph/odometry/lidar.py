@@ -73,16 +73,29 @@ FAILED_RAD, FAILED_M = 0.1, 2.0
 
 @dataclass(frozen=True)
 class LidarOdometryConfig(Settings):
-    """Which points are registered.
+    """Which points are registered."""
 
-    Attributes:
-        voxel_m: edge of the voxels of which one point is registered, for the first scan [m].
-        near_m, far_m: ranges between which points are used [m].
-    """
-
-    voxel_m: float = setting(0.2, at_least=0.02, at_most=10.0)
-    near_m: float = setting(1.0, at_least=0.0, at_most=100.0)
-    far_m: float = setting(100.0, at_least=1.0, at_most=300.0)
+    voxel_m: float = setting(
+        0.2,
+        at_least=0.02,
+        at_most=10.0,
+        doc="Voxel size of the first scan in LiDAR odometry; later ones adapt. Larger for open "
+        "country, smaller indoors.",
+    )
+    near_m: float = setting(
+        1.0,
+        at_least=0.0,
+        at_most=100.0,
+        doc="Nearest range of the points that LiDAR odometry uses. Raise it above the size of the own"
+        " vehicle.",
+    )
+    far_m: float = setting(
+        100.0,
+        at_least=1.0,
+        at_most=300.0,
+        doc="Farthest range of the points that LiDAR odometry uses. Lower it for short-range LiDARs "
+        "with noisy far returns.",
+    )
 
     def __post_init__(self) -> None:
         self.expect_at_most("near_m", self.far_m, "far_m")

@@ -10,35 +10,59 @@ from sst_graph.config import Settings, setting
 
 @dataclass(frozen=True)
 class DriftConfig(Settings):
-    """Extrinsic and time offset as random walks.
+    """Extrinsic and time offset as random walks."""
 
-    Attributes:
-        enabled: False: one calibration for all time (until an alarm).
-        rotation_deg: of the walk, each axis [deg / sqrt(s)].
-        translation_m: of the walk, each axis [m / sqrt(s)].
-        offset_s: of the walk [s / sqrt(s)].
-    """
-
-    enabled: bool = False
-    rotation_deg: float = setting(0.005, at_least=1e-6, at_most=10.0)
-    translation_m: float = setting(0.0005, at_least=1e-7, at_most=10.0)
-    offset_s: float = setting(0.0001, at_least=1e-8, at_most=10.0)
+    enabled: bool = setting(
+        False,
+        doc="Estimate extrinsic and time offset as random walks, one value an epoch. Set where they "
+        "drift (warming mounts, free clocks).",
+    )
+    rotation_deg: float = setting(
+        0.005,
+        at_least=1e-6,
+        at_most=10.0,
+        unit="deg/sqrt(s)",
+        doc="Random walk of the rotation, each axis, with drift.enabled. Raise it for mounts that "
+        "move faster.",
+    )
+    translation_m: float = setting(
+        0.0005,
+        at_least=1e-7,
+        at_most=10.0,
+        unit="m/sqrt(s)",
+        doc="Random walk of the translation, each axis, with drift.enabled. Raise it for mounts that "
+        "move faster.",
+    )
+    offset_s: float = setting(
+        0.0001,
+        at_least=1e-8,
+        at_most=10.0,
+        unit="s/sqrt(s)",
+        doc="Random walk of the time offset, with drift.enabled. Raise it for clocks that drift faster.",
+    )
 
 
 @dataclass(frozen=True)
 class AlarmConfig(Settings):
-    """When the calibration counts as changed.
+    """When the calibration counts as changed."""
 
-    Attributes:
-        enabled: compare new frames with the estimate at all.
-        chi2: threshold of the statistic, which follows chi-squared over the unknowns where nothing changes.
-        stamps: a jump of either sensor's stamps against its frame interval is an alarm, too; not for sensors
-            whose rate goes up and down, as of a camera whose exposure sets it.
-    """
-
-    enabled: bool = True
-    chi2: float = setting(25.0, at_least=0.1, at_most=1e9)
-    stamps: bool = True
+    enabled: bool = setting(
+        True,
+        doc="Test each frame for a change of the calibration. Set to false to keep one estimate "
+        "whatever comes.",
+    )
+    chi2: float = setting(
+        25.0,
+        at_least=0.1,
+        at_most=1e9,
+        doc="Threshold of the test for a change. Raise it for fewer false alarms, lower it to see "
+        "smaller changes.",
+    )
+    stamps: bool = setting(
+        True,
+        doc="Report a jump in a sensor's stamps as a change, too. Set to false for sensors without a "
+        "steady rate.",
+    )
 
 
 @dataclass(frozen=True)
@@ -47,17 +71,33 @@ class TrackerConfig(Settings):
 
     Attributes:
         calibration: classes, preparation, start, matches and limits, as for ``calibrate``.
-        window: scans that can be matched again; more cost memory and, at the end, time.
-        start_scans: scans before the first batch solution is tried; half as many between attempts.
-        late_s: images that come later than this behind the newest scan, in true time, are refused [s].
         drift: random walks.
         alarm: changes of the calibration.
     """
 
     calibration: CalibrationConfig = field(default_factory=CalibrationConfig)
-    window: int = setting(60, at_least=8, at_most=1000)
-    start_scans: int = setting(12, at_least=1, at_most=1000)
-    late_s: float = setting(1.5, at_least=0.001, at_most=60.0)
+    window: int = setting(
+        60,
+        at_least=8,
+        at_most=1000,
+        unit="scans",
+        doc="Scans that are matched again as the estimate moves. Larger: surer, slower, and slower to"
+        " follow a change.",
+    )
+    start_scans: int = setting(
+        12,
+        at_least=1,
+        at_most=1000,
+        unit="scans",
+        doc="Scans before the first solution is tried. Raise it where few objects are in view.",
+    )
+    late_s: float = setting(
+        1.5,
+        at_least=0.001,
+        at_most=60.0,
+        doc="Images that come later than this behind the newest scan are refused. Raise it for slow "
+        "segmentation.",
+    )
     drift: DriftConfig = field(default_factory=DriftConfig)
     alarm: AlarmConfig = field(default_factory=AlarmConfig)
 

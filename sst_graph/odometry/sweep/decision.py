@@ -9,7 +9,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from sst_graph.config import Settings
+from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.sweep.estimate import Estimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
@@ -59,13 +59,13 @@ _MIN_EXPECTED = 0.5
 
 @dataclass(frozen=True)
 class SweepConfig(Settings):
-    """Scans without times of their points.
+    """Scans without times of their points."""
 
-    Attributes:
-        decide: whether the sweep is decided from the scans; False uses such points as compensated.
-    """
-
-    decide: bool = True
+    decide: bool = setting(
+        True,
+        doc="Decide from the scans whether points without times are compensated for the sweep. Set to"
+        " false where they are known to be.",
+    )
 
 
 @dataclass(frozen=True)
