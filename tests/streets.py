@@ -84,8 +84,8 @@ EARLY_START = TrackerConfig(start_scans=8)
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
     """A tracker that starts from the truth without a search, and at once when it has enough scans."""
     calibration = config.calibration
-    start = dataclasses.replace(calibration.start, enabled=False)
-    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    search = dataclasses.replace(calibration.search, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, search=search))
     tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
     tracker.initializer.work_per_frame = None
     return tracker

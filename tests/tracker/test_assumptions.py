@@ -37,7 +37,7 @@ K1 = -0.3
 
 def _config(*settings: str) -> TrackerConfig:
     """Settings of a tracker that trusts its guess and does not wait for frames that confirm it."""
-    own = ["calibration.start.enabled=false", "start_scans=10", "alarm.enabled=false"]
+    own = ["calibration.search.enabled=false", "start_scans=10", "alarm.enabled=false"]
     return with_overrides(TrackerConfig(), [*own, *settings])
 
 
@@ -249,7 +249,7 @@ def test_what_is_estimated_agrees_with_the_batch(
     tracks = object_tracks(drive)
     joint = dataclasses.replace(
         config.joint,
-        graph=dataclasses.replace(config.joint.graph, lower_edges=estimating.matcher.graph.lower_edges),
+        graph=dataclasses.replace(config.noise, lower_edges=estimating.matcher.graph.lower_edges),
     )
     start = State(bent.truth.cTl, (0.04,))
     solution = solve_joint(JointProblem([drive], Tracks([drive], [tracks]), joint), start)
@@ -291,7 +291,7 @@ def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None
 
 
 def shifted(sigma: float) -> AssumptionConfig:
-    return with_overrides(AssumptionConfig(), [f"sigmas.cx={sigma}", f"sigmas.cy={sigma}"])
+    return with_overrides(AssumptionConfig(), [f"cx={sigma}", f"cy={sigma}"])
 
 
 def test_the_principal_point_turns_the_camera(settled: Tracker) -> None:
@@ -305,5 +305,5 @@ def test_the_principal_point_turns_the_camera(settled: Tracker) -> None:
 
 @pytest.mark.parametrize("sigma", [-0.1, float("nan"), float("inf")])
 def test_a_sigma_out_of_range_is_refused(sigma: float) -> None:
-    with pytest.raises(ConfigError, match=r"sigmas\.cx"):
+    with pytest.raises(ConfigError, match="cx: found"):
         shifted(sigma)

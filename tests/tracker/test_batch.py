@@ -39,11 +39,10 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
         )
     )
     default = TrackerConfig(start_scans=10)
-    search = dataclasses.replace(default.calibration.start, enabled=False)
-    joint = default.calibration.joint
-    graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
-    joint = dataclasses.replace(joint, graph=graph)
-    calibration = dataclasses.replace(default.calibration, start=search, joint=joint)
+    search = dataclasses.replace(default.calibration.search, enabled=False)
+    noise = default.calibration.noise
+    noise = noise if by_object else dataclasses.replace(noise, object_bias_sigma_px=0.0)
+    calibration = dataclasses.replace(default.calibration, search=search, noise=noise)
     config = dataclasses.replace(default, calibration=calibration)
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
     tracker.initializer.work_per_frame = None
