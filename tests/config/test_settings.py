@@ -225,7 +225,7 @@ def test_rules_between_settings(settings: str, message: str) -> None:
     [
         ("joint.max_outer=0", "joint.max_outer: found 0, expected at least 1 and at most 1000"),
         ("joint.graph.lower_edges=[vehicle]", "unknown setting 'joint.graph.lower_edges'"),
-        ("joint.graph.estimate=[focal]", "unknown setting 'joint.graph.estimate'"),
+        ("joint.graph.focal=1", "unknown setting 'joint.graph.focal'"),
         ("start.search.frames=0", "start.search.frames: found 0, expected at least 1"),
         ("prepare.lidar_odometry.voxel_m=0", "voxel_m: found 0, expected at least 0.02 and at most 10 m"),
         ("motion.min_pairs=0", "motion.min_pairs: found 0, expected at least 2"),
