@@ -210,7 +210,7 @@ def test_the_offset_of_every_drive_counts() -> None:
 def test_parts_carry_the_tracks_of_their_scans() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     parts, scans = parts_of(drives, STREET.time_offset_s), (3, 4, 5, 6, 10, 11)
-    tracks = parts.tracks.part(0, scans)
+    tracks = parts.problem.tracks.part(0, scans)
     assert tracks.objects is not None
     own = tracks.objects[0]
     for (scan, c, n), track in own.items():

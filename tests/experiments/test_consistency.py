@@ -50,7 +50,7 @@ def test_what_did_not_converge_or_is_wrong_is_counted_and_left_out() -> None:
 def test_the_offset_of_a_drive_that_stands_is_not_judged() -> None:
     moving = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
     error = np.append(np.full(6, 0.01), 0.0)
-    standing = Run(error, np.eye(7) * 1e-4, False, tells_offset=False)
+    standing = Run(error, np.eye(7) * 1e-4, False, offset_observable=False)
     cells = consistency.row("standing", [standing], 2.0).split("|")
     assert cells[5].strip() == "–" and cells[7].count("%") == 2
     assert float(cells[6]) == pytest.approx(1.0)

@@ -225,9 +225,8 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
         assert frame.image is not None
         image = frame.image
         if frame.index == STEP:
-            monkeypatch.setattr(
-                tracker.inputs.window, "recently_moving", lambda: set(tracker.inputs.window.objects.live)
-            )
+            dynamics, live = tracker.inputs.window.dynamics, tracker.inputs.window.objects.live
+            monkeypatch.setattr(dynamics, "recently_moving", lambda live=live: set(live))
         if frame.index >= STEP:
             image = knocked(image, street, 1.5)
         update = tracker.add(dataclasses.replace(frame, image=image))

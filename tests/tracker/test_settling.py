@@ -77,5 +77,7 @@ def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, li
     for frame in coming[1:]:
         once.add(frame)
         again.add(frame)
+        if once.estimate.relinearization is None and again.estimate.relinearization is None:
+            break
     assert once.estimate.relinearization is None and again.estimate.relinearization is None
     assert sigmas_apart(once, again.estimate.point.cTl, again.estimate.point.offset_s) < 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import gtsam
@@ -39,7 +40,9 @@ def test_a_better_pose_that_has_not_converged_prevents_a_start(
         yield 1
         return [State(gtsam.Pose3(), (delay_s,))]
 
-    def solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[tracker_start._Solved]:
+    def solution(
+        drive: Drive, start: State, kernels_px: Sequence[float], config: TrackerConfig
+    ) -> Stepwise[tracker_start._Solved]:
         yield 1
         if start.offset_s(0) > 0.0:
             raise tracker_start._NotConverged("still moved", _solved(turn_deg, cost))

@@ -32,7 +32,7 @@ from sst_graph.graph.outer_loop import (
 )
 from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
-from sst_graph.initialization.selection import SELECTION_SCANS, select_start_steps
+from sst_graph.initialization.selection import select_start_steps
 from sst_graph.stepwise import Stepwise
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import held_out_cost
@@ -196,12 +196,9 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
     calibration = config.calibration
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
-    # Scans of one second show much the same: candidates are compared on every other one, and the best are
-    # solved on all.
-    scans = min(SELECTION_SCANS, (len(drive.scans) + 1) // 2)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
     problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s)
-    selection = yield from select_start_steps(problem, joint.graph, search, scans)
+    selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (offset_s,)) for cTl, offset_s in selection.starts]
 
 
