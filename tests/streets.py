@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from functools import cache
+from pathlib import Path
 
 import cv2
 import gtsam
@@ -89,6 +91,27 @@ def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_STA
     tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
     tracker.initializer.work_per_frame = None
     return tracker
+
+
+def saved_tracker(frames: int) -> bytes:
+    """Checkpoint of a tracker of :data:`TRACKED_STREET` after some frames, made once a session."""
+
+    def make() -> bytes:
+        street = simulated(TRACKED_STREET)
+        tracker = tracker_from_truth(street)
+        for position in range(frames):
+            tracker.add(street[position])
+        return checkpoint_of(tracker)
+
+    return stored((TRACKED_STREET, EARLY_START, frames), make)
+
+
+def checkpoint_of(tracker: Tracker) -> bytes:
+    """The file that it saves."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "tracker.npz")
+        tracker.save(path)
+        return path.read_bytes()
 
 
 def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stored import simulated
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
@@ -25,7 +26,7 @@ from sst_graph.graph.building import Tracks, joint_graph
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.answer import current
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
@@ -55,7 +56,7 @@ def street() -> KeptDrive:
         time_offset_s=0.04,
         speed_mps=6.0,
     )
-    return KeptDrive.of(simulate(config))
+    return KeptDrive.of(simulated(config))
 
 
 @pytest.fixture(scope="module")
