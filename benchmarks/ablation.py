@@ -156,7 +156,7 @@ def calibrated(case: Case, data: Data, kind: str) -> Iterator[dict[str, Any]]:
     """One calibration; of the full method also what its covariance is without parts of it."""
     config = CalibrationConfig(find_causes=False)
     if kind == "local":
-        config = dataclasses.replace(config, start=dataclasses.replace(config.start, enabled=False))
+        config = dataclasses.replace(config, search=dataclasses.replace(config.search, enabled=False))
     probe = Probe()
     with case.left_out(), probe.listening():
         config = case.configured(config)
@@ -234,8 +234,8 @@ def tracked(case: Case, data: Data, kind: str) -> Iterator[dict[str, Any]]:
     """One drive through the tracker; ``knock`` turns the camera half way, ``clock`` moves its stamps."""
     config = TrackerConfig(window=WINDOW)
     calibration = config.calibration
-    start = dataclasses.replace(calibration.start, enabled=False)
-    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    search = dataclasses.replace(calibration.search, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, search=search))
     truth = data.truth
     half, step = round(0.6 * len(data.kept)), STEPS.get(kind, Step(""))
     with case.left_out():

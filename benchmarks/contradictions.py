@@ -99,10 +99,10 @@ def clock_set(frames: Sequence[Frame], first: int, milliseconds: float) -> list[
 def contradictions_of(source: Source, start: State) -> Contradictions:
     """What the default settings find in a drive, its joint solution sought from ``start``."""
     config = CalibrationConfig()
-    joint = replace(config.joint, graph=replace(config.joint.graph, lower_edges=tuple(config.classes)))
+    noise = replace(config.noise, lower_edges=tuple(config.classes))
     drives = prepare_drives([source], config)
     guess = Guess(start.cTl, start.offsets_s[0])
-    problem = CalibrationProblem.of(drives, guess, replace(config, joint=joint))
+    problem = CalibrationProblem.of(drives, guess, replace(config, noise=noise))
     solution = solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
     return find_contradictions(PartSolver(problem, solution.state))
 

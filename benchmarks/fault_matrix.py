@@ -53,7 +53,7 @@ STREET = SimulationConfig(
     speed_mps=6.0,
 )
 SMALL = ["--frames", "3", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
-TRACK = ["--set", "start_scans=4", "--set", "calibration.start.enabled=false", "--checkpoint-every", "2"]
+TRACK = ["--set", "start_scans=4", "--set", "calibration.search.enabled=false", "--checkpoint-every", "2"]
 ENDED = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 READER_GONE = 141
 TIMEOUT_S = 300.0

@@ -152,8 +152,8 @@ def _tracker(started: bool) -> Tracker:
     motion = dataclasses.replace(STREET, frames=14, motion="no_stop") if started else STREET
     street = simulate(motion)
     config = TrackerConfig(start_scans=8)
-    start = dataclasses.replace(config.calibration.start, enabled=False)
-    config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, start=start))
+    search = dataclasses.replace(config.calibration.search, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(config.calibration, search=search))
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.0)
     for k in range(len(street)):
         tracker.add(street[k])

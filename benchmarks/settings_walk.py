@@ -1,6 +1,6 @@
 """Every setting of ``calibrate`` and ``track`` at its lowest and its highest value, on a tiny street.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.settings_walk [--only joint.] [--seconds 60] [--memory-gb 4]
+    OMP_NUM_THREADS=1 python -m benchmarks.settings_walk [--only noise.] [--seconds 60] [--memory-gb 4]
     OMP_NUM_THREADS=1 python -m benchmarks.settings_walk --part 3/4
 
 Each case must end in a result or in a typed error (:class:`sst_graph.errors.SstGraphError`) within the time
@@ -37,14 +37,14 @@ from sst_graph.tracker.config import TrackerConfig
 from sst_graph.types import Frame, GroundTruth
 
 FRAMES = 6
-METHODS = {"paper": "paper", "semalign": "semalign", "motion": "motion"}
+METHODS = {"paper": "paper"}
 """Method that a table of settings belongs to; ``joint`` for the others."""
-QUICK = {"joint": ("start.enabled=false",), "semalign": ("semalign.starts=200",)}
+QUICK = {"joint": ("search.enabled=false",)}
 """What makes a method quick, for settings that have nothing to do with it."""
 TRACKING = (
     "window=8",
     "start_scans=3",
-    "calibration.start.enabled=false",
+    "calibration.search.enabled=false",
 )
 """Settings under which a few frames are enough for the tracker to start and go on."""
 

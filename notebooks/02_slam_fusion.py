@@ -31,7 +31,7 @@ import numpy as np
 import sst_graph
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.batch import calibrate_prepared
-from sst_graph.drive.preparation import PictureConfig, PrepareConfig, prepare_drive
+from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import (
     Between,
     GroupedBias,
@@ -94,7 +94,7 @@ class OnePass:
 
 
 # Contours stay where the masks have them: on small images following the picture brings nothing.
-prepared = prepare_drive(OnePass(), [VEHICLE], PrepareConfig(picture=PictureConfig(use=False)))
+prepared = prepare_drive(OnePass(), [VEHICLE], PrepareConfig(image_edges=False))
 tracks = object_tracks(prepared)
 stamps_s = drive.stamps_ns * 1e-9
 N = len(scans)

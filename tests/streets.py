@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import tempfile
 from functools import cache
+from pathlib import Path
 
 import cv2
 import gtsam
@@ -84,11 +86,32 @@ EARLY_START = TrackerConfig(start_scans=8)
 def tracker_from_truth(street: SimulatedDrive, config: TrackerConfig = EARLY_START) -> Tracker:
     """A tracker that starts from the truth without a search, and at once when it has enough scans."""
     calibration = config.calibration
-    start = dataclasses.replace(calibration.start, enabled=False)
-    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, start=start))
+    search = dataclasses.replace(calibration.search, enabled=False)
+    config = dataclasses.replace(config, calibration=dataclasses.replace(calibration, search=search))
     tracker = Tracker(street.camera, config, street.truth.cTl, street.truth.time_offset_s or 0.0)
     tracker.initializer.work_per_frame = None
     return tracker
+
+
+def saved_tracker(frames: int) -> bytes:
+    """Checkpoint of a tracker of :data:`TRACKED_STREET` after some frames, made once a session."""
+
+    def make() -> bytes:
+        street = simulated(TRACKED_STREET)
+        tracker = tracker_from_truth(street)
+        for position in range(frames):
+            tracker.add(street[position])
+        return checkpoint_of(tracker)
+
+    return stored((TRACKED_STREET, EARLY_START, frames), make)
+
+
+def checkpoint_of(tracker: Tracker) -> bytes:
+    """The file that it saves."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "tracker.npz")
+        tracker.save(path)
+        return path.read_bytes()
 
 
 def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:

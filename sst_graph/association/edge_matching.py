@@ -41,6 +41,8 @@ SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
 """Side by kind of edge and whether the way out of the object runs to the right."""
 BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 """The side towards the ground."""
+LOWER_EDGE_SIGMA_PX = 1.2
+"""Error that all matches on an object's lower edge share [px]: masks are least exact there."""
 
 
 @dataclass(frozen=True)
@@ -59,18 +61,6 @@ class MatchConfig(Settings):
         at_most=100.0,
         doc="Error that all matches on one side of an object in one image share. Raise it where "
         "outlines are drawn carelessly.",
-    )
-    lower_edge_sigma_px: float = setting(
-        1.2,
-        at_least=0.0,
-        at_most=100.0,
-        doc="Error that all matches on an object's lower edge share. Raise it where the lower edges "
-        "of masks are poor.",
-    )
-    top_edges: bool = setting(
-        True,
-        doc="Match edges towards the ring above. Set to false where rings are far apart (16 lasers) "
-        "and tops look wrong in the overlay.",
     )
 
 
@@ -337,8 +327,7 @@ def match_edges(
         ideal = paired.projected(paired.points.lPs, cTl, offset_s)
         shift = _pixel_shift(deviation, paired, ideal)
         uvs = ideal + shift
-    used = paired.camera.in_image(uvs) & (config.top_edges | (paired.points.edges != Edge.TOP))
-    index = np.flatnonzero(used)
+    index = np.flatnonzero(paired.camera.in_image(uvs))
     paired, uvs = paired.take(index), uvs[index]
     seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
     # 2. The nearest contours that are near.
@@ -439,7 +428,7 @@ def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
 def side_weights(owners: IntArray, sides: IntArray, sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
     """(n,) weights under which the mean of a side of an object counts with sigma^2 / n + shared^2 instead of
     sigma^2 / n."""
-    shared_px = np.where(sides == BOTTOM, config.lower_edge_sigma_px, config.side_sigma_px)
+    shared_px = np.where(sides == BOTTOM, LOWER_EDGE_SIGMA_PX, config.side_sigma_px)
     numbers = owners * SIDES + sides
     information = np.bincount(numbers, sigmas_px**-2.0)[numbers] if len(numbers) else np.zeros(0)
     return np.asarray(1.0 / (1.0 + information * shared_px**2))

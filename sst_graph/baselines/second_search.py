@@ -9,7 +9,14 @@ import numpy as np
 
 from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, spread
 from sst_graph.drive.preparation import Drive
-from sst_graph.initialization.global_search import FINE, SearchConfig, SearchProblem, search_steps
+from sst_graph.initialization.global_search import (
+    FINE,
+    FRAMES,
+    POINTS_PER_CLASS,
+    SearchConfig,
+    SearchProblem,
+    search_steps,
+)
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
 from sst_graph.stepwise import whole
 from sst_graph.types import SemanticClass
@@ -63,13 +70,13 @@ def search_again(
     """
     numbers = [frame.pair.drive for frame in frames]
     richest = max(set(numbers), key=numbers.count)
-    own = spread([frame for frame in frames if frame.pair.drive == richest], config.frames)
+    own = spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
     chosen = [_search_frame(frame, answer) for frame in own]
     camera = drives[richest].camera
     problem = SearchProblem(chosen, camera, classes, answer.cTl, answer.offset_s, config)
     best = whole(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
-    points = LabelledPoints.sampled(chosen, camera, classes, config.points_per_class, rng)
+    points = LabelledPoints.sampled(chosen, camera, classes, POINTS_PER_CLASS, rng)
     agreement = points.agreement_map(FINE[-1].blur_px, FINE[-1].share)
     scores = whole(agreement.score_steps(_states([start, answer])))
     cells = len(chosen) * CELLS[0] * CELLS[1]

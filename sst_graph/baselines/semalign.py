@@ -7,7 +7,6 @@ one is refined by least squares on point-to-pixel matches, found anew at every s
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -16,7 +15,6 @@ from scipy.ndimage import distance_transform_edt
 
 from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, frozen_covariance, step_once
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, still_frames
-from sst_graph.config import Settings, setting
 from sst_graph.factors import PinholeCamera
 
 FloatArray = NDArray[np.float64]
@@ -25,6 +23,8 @@ BOX_DEG, BOX_M = 10.0, 0.1
 """Half widths of the samples about the guess, by axis [deg], [m]: the starts of the paper's experiments."""
 TRUNCATION_PX = 50.0
 """Distances count no more than this [px]: of points whose object has no mask."""
+_STARTS = 5000
+"""Poses that are sampled around the guess."""
 _POINTS = 200
 """Most points of a class and frame in the scoring: more cost time."""
 _ITERATIONS = 60
@@ -33,32 +33,14 @@ _CHUNK = 100
 """Poses that are scored at once: bounds the memory."""
 
 
-@dataclass(frozen=True)
-class SemAlignConfig(Settings):
-    """Sampled starts."""
-
-    starts: int = setting(
-        5000,
-        at_least=1,
-        at_most=100_000,
-        doc="Poses that SemAlign samples around the guess. Raise it for a poorer guess.",
-    )
-    seed: int = setting(
-        0,
-        at_least=0,
-        at_most=10**15,
-        doc="Seed of SemAlign's samples. Change it to see whether the answer depends on it.",
-    )
-
-
-def solve_semalign(problem: PaperProblem, guess: Calibration, config: SemAlignConfig) -> NearestSolution:
+def solve_semalign(problem: PaperProblem, guess: Calibration) -> NearestSolution:
     """The best sampled start, refined; on the frames of the static stage, the time offset at the guess.
 
     Raises:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
     still = still_frames(problem, guess)
-    poses = sampled_poses(guess.cTl, config)
+    poses = sampled_poses(guess.cTl, problem.config.seed)
     scores, progress = np.zeros(len(poses)), problem.progress
     for done, frame in enumerate(still.frames, start=1):
         scores += truncated_distances(frame, poses)
@@ -77,11 +59,11 @@ def solve_semalign(problem: PaperProblem, guess: Calibration, config: SemAlignCo
     return NearestSolution(at, covariance, remaining, still.frames, still.reasons, numbers)
 
 
-def sampled_poses(guess: gtsam.Pose3, config: SemAlignConfig) -> list[gtsam.Pose3]:
+def sampled_poses(guess: gtsam.Pose3, seed: int) -> list[gtsam.Pose3]:
     """The guess, then poses with rotation vectors (camera side) and translations uniform in the box."""
-    rng = np.random.default_rng(config.seed)
-    turns = np.radians(rng.uniform(-BOX_DEG, BOX_DEG, (config.starts, 3)))
-    shifts = rng.uniform(-BOX_M, BOX_M, (config.starts, 3))
+    rng = np.random.default_rng(seed)
+    turns = np.radians(rng.uniform(-BOX_DEG, BOX_DEG, (_STARTS, 3)))
+    shifts = rng.uniform(-BOX_M, BOX_M, (_STARTS, 3))
     turns[0] = shifts[0] = 0.0
     R, t = guess.rotation(), np.asarray(guess.translation())
     return [gtsam.Pose3(gtsam.Rot3.Expmap(w) * R, t + d) for w, d in zip(turns, shifts, strict=True)]

@@ -24,7 +24,7 @@ from sst_graph.baselines.nearest_pixel_frames import (
     spread,
     step_once,
 )
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal, setting
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.factors import beta_regularizer
@@ -48,7 +48,11 @@ _VELOCITY_EVERY = 5
 
 @dataclass(frozen=True)
 class PaperConfig(Settings):
-    """What the paper leaves open, and the weights of its regularizer."""
+    """What the paper leaves open, and the weights of its regularizer.
+
+    Attributes:
+        seed: of the sampled pixels and poses; the calibration's.
+    """
 
     lambda_t: float = setting(
         1e6,
@@ -76,12 +80,7 @@ class PaperConfig(Settings):
         at_most=1000,
         doc="Most frames of SST-Calib's joint stage. Raise it for more data, at a cost in time.",
     )
-    seed: int = setting(
-        0,
-        at_least=0,
-        at_most=10**15,
-        doc="Seed of the pixels that SST-Calib samples. Change it to see whether the answer depends on it.",
-    )
+    seed: int = internal(0)
 
 
 @dataclass(frozen=True)

@@ -144,7 +144,7 @@ def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple
     """Test every assumption that the matches can test; the most contradicted first."""
     if not config.test:
         return ()
-    estimated = dict(named_sigmas(problem.problem.config.joint.graph.estimate))
+    estimated = dict(named_sigmas(problem.problem.config.noise.estimate))
     names = [name for name, each in ASSUMPTIONS.items() if each.by_matches and name not in estimated]
     try:
         linear = LinearProblem.of(problem, names)

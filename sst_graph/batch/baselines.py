@@ -34,11 +34,7 @@ def answer_semalign(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> Answer:
     """SemAlign."""
-
-    def solve(problem: PaperProblem, start: Calibration) -> NearestSolution:
-        return solve_semalign(problem, start, config.semalign)
-
-    return _checked(solve, _problem(drives, config, progress), guess, config)
+    return _checked(solve_semalign, _problem(drives, config, progress), guess, config)
 
 
 def _problem(drives: Sequence[Drive], config: CalibrationConfig, progress: Progress | None) -> PaperProblem:
@@ -61,7 +57,7 @@ def _checked(
     start = Calibration(guess.cTl, guess.offset_s)
     solution = solve(problem, start)
     at, step = solution.calibration, solution.remaining_step
-    second = search_again(solution.frames, problem.drives, config.classes, start, at, config.start.search)
+    second = search_again(solution.frames, problem.drives, config.classes, start, at, config.search)
     return Answer(
         at.cTl,
         at.offset_s,

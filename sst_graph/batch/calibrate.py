@@ -77,12 +77,12 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
-    with_lower_edges = config.method == "joint" and config.lower_edges.use != "never"
+    with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
         prepare_drive(source, config.classes, prepare, progress, depth, with_lower_edges)
-        for source in (with_sweep(source, config.sweep.decide) for source in sources)
+        for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
 
 
@@ -136,7 +136,7 @@ def answer_joint(
     agreement = label_agreement(problem, solutions[0])
     # 3. Lower edges of the objects, where both sensors' labels agree about them.
     lower = problem.with_lower_edges(solutions)
-    problem, solutions = problem.with_joint(lower.joint), lower.solutions
+    problem, solutions = problem.with_noise(lower.joint.graph), lower.solutions
     # 4. Consistency: drives against each other, stretches of a drive against its rest.
     contradictions = find_contradictions(PartSolver(problem, solutions[0].state))
     # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.

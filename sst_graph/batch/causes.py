@@ -75,7 +75,7 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
         search = StartProblem(few, tracks, config.classes, guess, offset_s)
         try:
-            selection = whole(select_start_steps(search, joint.graph, config.start, _SCANS, _CANDIDATES))
+            selection = whole(select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES))
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
             problem = JointProblem(few, tracks, joint, search.centre(start))

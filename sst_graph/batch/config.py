@@ -1,66 +1,41 @@
-"""Settings of a calibration, stage by stage."""
+"""Settings of a calibration."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from sst_graph.baselines.semalign import SemAlignConfig
 from sst_graph.baselines.sst_calib import PaperConfig
 from sst_graph.config import Settings, setting
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.covariance.unknown_motion import UnknownMotionConfig
 from sst_graph.drive.preparation import PrepareConfig
+from sst_graph.features.lidar_edges import MAX_RANGE_M
+from sst_graph.graph.building import GraphConfig
 from sst_graph.graph.outer_loop import JointConfig
-from sst_graph.hand_eye.solution import MotionConfig
-from sst_graph.initialization.candidates import StartConfig
-from sst_graph.odometry.sweep import SweepConfig
+from sst_graph.initialization.global_search import SearchConfig
+from sst_graph.odometry.lidar import LidarOdometryConfig
 from sst_graph.types import SemanticClass
 
 Method = Literal["joint", "paper", "static", "semalign", "motion"]
 UseMotion = Literal["auto", "always", "never"]
-
-
-@dataclass(frozen=True)
-class LowerEdgesConfig(Settings):
-    """When edges towards the ground are matched."""
-
-    use: Literal["auto", "always", "never"] = setting(
-        "auto",
-        doc="Match edges towards the ground: auto where the labels of both sides agree on them, class"
-        " by class; never for hand-drawn outlines that cover the gap below vehicles.",
-    )
-
-
-@dataclass(frozen=True)
-class ContradictionConfig(Settings):
-    """Whether parts of the data are compared with one another."""
-
-    check: bool = setting(
-        True,
-        doc="Test whether drives, and parts of a drive, contradict one another. Set to false to save time.",
-    )
+UseLowerEdges = Literal["auto", "always", "never"]
 
 
 @dataclass(frozen=True)
 class CalibrationConfig(Settings):
-    """What to do and how; one part a stage, written beside every result.
+    """What to do and how; written beside every result.
 
     Attributes:
-        sweep: how the times of the points are decided where the data bring none.
-        prepare: what is taken from every frame.
-        start: the search for a start.
-        joint: the outer and inner loop.
-        lower_edges: when method joint matches edges towards the ground.
-        paper: both stages of the paper.
-        semalign: sampled starts.
-        motion: hand-eye calibration.
+        search: the global search for a start.
+        lidar_odometry: the motion between scans.
+        noise: of matches and priors of the joint graph.
+        paper: SST-Calib.
         assumptions: what is assumed: considered in the covariance, tested, or estimated.
         unknown_motion: what the covariance has beside that of the matches where a single scan does not show
             motion; both 0 where the vehicle stood.
         observability: when a direction counts as unobservable.
-        contradictions: when method joint finds that drives, or parts of one, contradict each other.
     """
 
     method: Method = setting(
@@ -85,18 +60,32 @@ class CalibrationConfig(Settings):
         "where the labels alone determine all unknowns and the scans are not rolling. always: "
         "where constant speed leaves the offset open; never: where visual odometry is poor.",
     )
-    sweep: SweepConfig = field(default_factory=SweepConfig)
-    prepare: PrepareConfig = field(default_factory=PrepareConfig)
-    start: StartConfig = field(default_factory=StartConfig)
-    joint: JointConfig = field(default_factory=JointConfig)
-    lower_edges: LowerEdgesConfig = field(default_factory=LowerEdgesConfig)
-    paper: PaperConfig = field(default_factory=PaperConfig)
-    semalign: SemAlignConfig = field(default_factory=SemAlignConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
-    unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
-    observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
-    contradictions: ContradictionConfig = field(default_factory=ContradictionConfig)
+    max_range_m: float = setting(
+        MAX_RANGE_M,
+        at_least=1.0,
+        at_most=1000.0,
+        doc="Range beyond which objects are not used. Lower it where labels of far objects are poor, "
+        "raise it for long-range LiDARs.",
+    )
+    image_edges: bool = setting(
+        True,
+        doc="Move the contours of the masks to the edges in the picture. Set to false for pictures at"
+        " night or without texture, or for exact masks.",
+    )
+    lower_edges: UseLowerEdges = setting(
+        "auto",
+        doc="Match edges towards the ground: auto where the labels of both sides agree on them, class"
+        " by class; never for hand-drawn outlines that cover the gap below vehicles.",
+    )
+    decide_sweep: bool = setting(
+        True,
+        doc="Decide from the scans whether points without times are compensated for the sweep. Set to"
+        " false where they are known to be.",
+    )
+    check_contradictions: bool = setting(
+        True,
+        doc="Test whether drives, and parts of a drive, contradict one another. Set to false to save time.",
+    )
     check_stamps: bool = setting(
         True,
         doc="Report a result as not converged where a sensor's stamps jump. Set to false for sensors "
@@ -107,9 +96,35 @@ class CalibrationConfig(Settings):
         doc="Where a result is not ok, try changes of the data (mirrored, inverted, ...) that would "
         "make the labels agree. Set to false to save up to a minute.",
     )
+    seed: int = setting(
+        0,
+        at_least=0,
+        at_most=10**15,
+        doc="Seed of all that is sampled. Change it to see whether the answer depends on it.",
+    )
+    search: SearchConfig = field(default_factory=SearchConfig)
+    lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
+    noise: GraphConfig = field(default_factory=GraphConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    assumptions: AssumptionConfig = field(default_factory=AssumptionConfig)
+    unknown_motion: UnknownMotionConfig = field(default_factory=UnknownMotionConfig)
+    observability: ObservabilityConfig = field(default_factory=ObservabilityConfig)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "search", replace(self.search, seed=self.seed))
+        object.__setattr__(self, "paper", replace(self.paper, seed=self.seed))
+
+    @property
+    def prepare(self) -> PrepareConfig:
+        """What is kept of every frame."""
+        return PrepareConfig(self.max_range_m, self.image_edges, self.lidar_odometry)
+
+    @property
+    def joint(self) -> JointConfig:
+        """The joint method under this noise."""
+        return JointConfig(self.noise)
 
     @property
     def estimating(self) -> CalibrationConfig:
         """The same with a variable in method joint's graph for each assumption that is to be estimated."""
-        graph = replace(self.joint.graph, estimate=self.assumptions.estimate)
-        return replace(self, joint=replace(self.joint, graph=graph))
+        return replace(self, noise=replace(self.noise, estimate=self.assumptions.estimate))

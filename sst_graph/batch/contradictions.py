@@ -51,7 +51,7 @@ class Contradictions:
 
 def find_contradictions(parts: PartSolver) -> Contradictions:
     """Drives against the other drives, and within each drive the run of stretches that differs most."""
-    if not parts.problem.config.contradictions.check:
+    if not parts.problem.config.check_contradictions:
         return Contradictions()
     # 1. Every stretch of every drive by itself.
     stretches = [

@@ -47,7 +47,7 @@ def joint_reasons(
         covariance: (n, n) of extrinsic and offsets.
         labels: as :func:`label_agreement` gives them.
     """
-    searched = problem.config.start.enabled
+    searched = problem.config.search.enabled
     return (
         *_moving(solution),
         *(_little_agreement(problem, covariance, labels) if searched else ()),
@@ -103,7 +103,7 @@ def _little_agreement(
 
 
 def _outside_search(problem: CalibrationProblem, solution: JointSolution) -> Iterator[str]:
-    search, guess = problem.config.start.search, problem.guess.cTl
+    search, guess = problem.config.search, problem.guess.cTl
     around = np.zeros(3) if guess is None else guess.translation()
     far = float(np.linalg.norm(solution.state.cTl.translation() - around))
     if far > (REACH * search.free_translation_m if guess is None else 1.5 * search.translation_m):

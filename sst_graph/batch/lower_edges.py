@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sst_graph.association.edge_matching import BOTTOM
-from sst_graph.batch.config import LowerEdgesConfig
+from sst_graph.batch.config import UseLowerEdges
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import Tracks
@@ -57,7 +57,7 @@ class WithLowerEdges:
 def with_lower_edges(
     problem: JointProblem,
     finals: Sequence[tuple[JointSolution, State]],
-    config: LowerEdgesConfig,
+    use: UseLowerEdges,
     progress: Progress | None = None,
 ) -> WithLowerEdges:
     """Joint solutions with the edges towards the ground, of classes whose labels agree about them.
@@ -69,9 +69,7 @@ def with_lower_edges(
         EstimationError: too few matches at any step.
     """
     solutions, joint = [solution for solution, _ in finals], problem.config
-    chosen, concentration = agreed_lower_edges(
-        problem.drives, problem.tracks, solutions[0].state, joint, config
-    )
+    chosen, concentration = agreed_lower_edges(problem.drives, problem.tracks, solutions[0].state, joint, use)
     if not chosen:
         return WithLowerEdges(solutions, joint, concentration)
     joint = replace(joint, graph=replace(joint.graph, lower_edges=chosen))
@@ -81,12 +79,12 @@ def with_lower_edges(
 
 
 def agreed_lower_edges(
-    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, config: LowerEdgesConfig
+    drives: Sequence[Drive], tracks: Tracks, state: State, joint: JointConfig, use: UseLowerEdges
 ) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
     """Classes whose edges towards the ground are to be matched, and the concentration that says so."""
-    if config.use == "never":
+    if use == "never":
         return (), {}
-    return lower_edge_support(drives, tracks, state, joint).agreed(config)
+    return lower_edge_support(drives, tracks, state, joint).agreed(use)
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class LowerEdgeSupport:
         return LowerEdgeSupport(_summed(self.narrow, other.narrow), _summed(self.wide, other.wide))
 
     def agreed(
-        self, config: LowerEdgesConfig, min_support: float = MIN_SUPPORT
+        self, use: UseLowerEdges, min_support: float = MIN_SUPPORT
     ) -> tuple[tuple[SemanticClass, ...], dict[SemanticClass, float]]:
         """Classes whose labels agree, and the share of the wide support that remains under the last kernel.
 
@@ -114,7 +112,7 @@ class LowerEdgeSupport:
         concentration = {
             c: self.narrow[c] / self.wide[c] for c in sorted(self.narrow) if self.narrow[c] >= min_support
         }
-        least = MIN_CONCENTRATION if config.use == "auto" else 0.0
+        least = MIN_CONCENTRATION if use == "auto" else 0.0
         return tuple(c for c, share in concentration.items() if share >= least), concentration
 
 

@@ -85,9 +85,8 @@ def fuse_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequen
     # 1. The hand-eye solution from the joint one.
     config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
     try:
-        motion = solve_motion(problem.drives, state.cTl, state.offsets_s[0], config.motion, problem.progress)[
-            0
-        ]
+        reach_s = config.search.time_offset_s
+        motion = solve_motion(problem.drives, state.cTl, state.offsets_s[0], reach_s, problem.progress)[0]
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree?

@@ -121,7 +121,7 @@ class PartSolver:
         drive, tracks = self._data(part)
         kernel = RobustKernel("geman_mcclure", self.kernel_px[-1])
         found = np.zeros(len(part.scans))
-        for own in match_all(edges_of([drive], tracks, self.problem.config.joint.graph), state, kernel):
+        for own in match_all(edges_of([drive], tracks, self.problem.config.noise), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]
             found += np.bincount(scans, robust_weights(own, state), len(found))
         return found

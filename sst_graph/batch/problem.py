@@ -14,11 +14,10 @@ from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
-from sst_graph.graph.building import Tracks
+from sst_graph.graph.building import GraphConfig, Tracks
 from sst_graph.graph.outer_loop import (
     KERNELS_PX,
     NARROW_KERNELS_PX,
-    JointConfig,
     JointProblem,
     JointSolution,
     solve_all,
@@ -63,7 +62,7 @@ class CalibrationProblem:
         """The problem with objects tracked."""
         config = config.estimating
         objects = [object_tracks(drive) for drive in drives]
-        by_object = config.joint.graph.object_bias_sigma_px > 0.0
+        by_object = config.noise.object_bias_sigma_px > 0.0
         tracks = Tracks(drives, objects if by_object else None)
         return cls(drives, tracks, objects, guess, config, progress)
 
@@ -81,11 +80,11 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        return whole(select_start_steps(self._start_problem(), self.config.joint.graph, self.config.start))
+        return whole(select_start_steps(self._start_problem(), self.config.noise, self.config.search))
 
-    def with_joint(self, joint: JointConfig) -> CalibrationProblem:
-        """The problem with other settings of the joint method."""
-        return replace(self, config=replace(self.config, joint=joint))
+    def with_noise(self, noise: GraphConfig) -> CalibrationProblem:
+        """The problem with another noise of the joint graph."""
+        return replace(self, config=replace(self.config, noise=noise))
 
     def with_lower_edges(self, solutions: Sequence[JointSolution]) -> WithLowerEdges:
         """Solutions with the lower edges of classes whose labels agree about them.
@@ -103,7 +102,7 @@ class CalibrationProblem:
             EstimationError: none of them leads anywhere.
         """
         clocks = len(self.drives) if self.config.time_offset_per_drive else 1
-        kernels_px = NARROW_KERNELS_PX if self.config.start.enabled else KERNELS_PX
+        kernels_px = NARROW_KERNELS_PX if self.config.search.enabled else KERNELS_PX
         starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in selection.starts]
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)

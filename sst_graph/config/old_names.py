@@ -8,7 +8,7 @@ from typing import Any
 
 from sst_graph.config.renamed import CONSTANTS, RENAMED
 from sst_graph.config.settings import join, walk_settings
-from sst_graph.config.values import printable
+from sst_graph.config.values import printable, shown
 from sst_graph.errors import ConfigError
 
 _LOG = logging.getLogger(__name__)
@@ -34,11 +34,11 @@ def with_new_names(
         renamed, constants: as the tables of :mod:`sst_graph.config.renamed`.
 
     Raises:
-        ConfigError: a setting that is a constant, or one that is given under both names.
+        ConfigError: a setting that is a constant, or one that is given under two names.
     """
     known = {name for name, _, _ in walk_settings(cls)}
-    old = {name: value for name, value in _leaves(data, known) if name not in known}
-    moved = {}
+    old = {name: value for name, value in _leaves(data) if name not in known}
+    moved: dict[str, tuple[str, Any]] = {}
     for name, value in old.items():
         short = name.removeprefix(CALIBRATION)
         prefix = name[: len(name) - len(short)]
@@ -46,24 +46,31 @@ def with_new_names(
             raise ConfigError(f"'{printable(name)}' is not a setting any more: {constants[short]}")
         new = prefix + renamed.get(short, short)
         if new != name and new in known:
-            if _has(data, new):
-                raise ConfigError(f"'{printable(name)}' and '{new}': found both, expected the second alone")
             _LOG.warning("setting '%s' is called '%s': use that name", name, new)
             moved[name] = (new, value)
     if not moved:
         return data
     tree = _without(data, moved)
-    for new, value in moved.values():
+    given: dict[str, tuple[str, Any]] = {}
+    for name, (new, value) in moved.items():
+        if _has(tree, new) and new not in given:
+            raise ConfigError(f"'{printable(name)}' and '{new}': found both, expected the second alone")
+        other, same = given.setdefault(new, (name, value))
+        if same != value:
+            raise ConfigError(
+                f"'{printable(other)}' and '{printable(name)}', both called '{new}': found {shown(same)} and "
+                f"{shown(value)}, expected one value"
+            )
         _put(tree, new, value)
     return tree
 
 
-def _leaves(data: Mapping[str, Any], known: set[str], where: str = "") -> Iterator[tuple[str, Any]]:
+def _leaves(data: Mapping[str, Any], where: str = "") -> Iterator[tuple[str, Any]]:
     """Dotted name and value of each single setting in a nested table."""
     for key, value in data.items():
         name = join(where, str(key))
-        if isinstance(value, Mapping) and value and name not in known and name.count(".") < _MAX_DEPTH:
-            yield from _leaves(value, known, name)
+        if isinstance(value, Mapping) and value and name.count(".") < _MAX_DEPTH:
+            yield from _leaves(value, name)
         else:
             yield name, value
 

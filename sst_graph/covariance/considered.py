@@ -11,7 +11,7 @@ the solve itself claims,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, make_dataclass, replace
+from dataclasses import dataclass, make_dataclass, replace
 from typing import TYPE_CHECKING
 
 import gtsam
@@ -63,15 +63,13 @@ else:
 
 
 @dataclass(frozen=True)
-class AssumptionConfig(Settings):
+class AssumptionConfig(AssumptionSigmas):
     """What is assumed, and how far it may be wrong.
 
-    Attributes:
-        sigmas: deviation of each assumption's parameter, in its unit; 0: it holds exactly. The defaults are
-            what a careful set-up leaves (``sst_graph.assumptions`` names their sources).
+    The defaults of the deviations are what a careful set-up leaves (``sst_graph.assumptions`` names their
+    sources).
     """
 
-    sigmas: AssumptionSigmas = field(default_factory=AssumptionSigmas)
     estimate: tuple[str, ...] = setting(
         (),
         doc="Assumptions whose parameters are estimated with the calibration: NAME, or NAME=SIGMA "
@@ -92,7 +90,7 @@ class AssumptionConfig(Settings):
 
     def sigma(self, name: str) -> float:
         """Deviation of an assumption's parameter."""
-        return float(getattr(self.sigmas, name))
+        return float(getattr(self, name))
 
     @property
     def estimated(self) -> tuple[tuple[str, float], ...]:

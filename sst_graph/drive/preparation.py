@@ -11,12 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.features.lidar_edges import Boundaries, BoundaryConfig, Edge, find_boundaries
+from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.files.array_store import ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
@@ -44,34 +44,20 @@ _DEPTH_POINTS = 30_000
 
 
 @dataclass(frozen=True)
-class PictureConfig(Settings):
-    """Contours of masks."""
-
-    use: bool = setting(
-        True,
-        doc="Move the contours of the masks to the edges in the picture. Set to false for pictures at"
-        " night or without texture, or for exact masks.",
-    )
-
-
-@dataclass(frozen=True)
 class PrepareConfig(Settings):
     """What is kept of every frame.
 
     Attributes:
-        boundary: boundary points.
-        picture: contours of masks.
+        max_range_m: range beyond which objects are not used [m].
+        image_edges: move the contours of the masks to the edges in the picture.
         lidar_odometry: motion between scans.
+        use_visual_odometry: track image features for the motion of the camera.
     """
 
-    boundary: BoundaryConfig = field(default_factory=BoundaryConfig)
-    picture: PictureConfig = field(default_factory=PictureConfig)
+    max_range_m: float = internal(MAX_RANGE_M)
+    image_edges: bool = internal(True)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
-    use_visual_odometry: bool = setting(
-        True,
-        doc="Track image features for the motion of the camera. Set to false to save time where the "
-        "motion is not used.",
-    )
+    use_visual_odometry: bool = internal(True)
 
 
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
@@ -288,7 +274,7 @@ def prepare_drive(
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))
-            contours = image_features(frame.index, frame.image, classes, config.picture.use)
+            contours = image_features(frame.index, frame.image, classes, config.image_edges)
             images.append(contours.stored_in(store))
         if progress is not None:
             progress(f"reading {source.name}", position + 1, total)
@@ -333,7 +319,7 @@ def scan_features(
     if depth and config.use_visual_odometry:
         near = np.flatnonzero(np.linalg.norm(scan.points, axis=1) < _FAR_M)
         deep = near[:: max(1, len(scan.points) // _DEPTH_POINTS)]
-    boundaries, lower_edges = apart(find_boundaries(scan, classes, config.boundary, with_lower_edges))
+    boundaries, lower_edges = apart(find_boundaries(scan, classes, config.max_range_m, with_lower_edges))
     return ScanFeatures(
         index,
         scan.stamp_ns,

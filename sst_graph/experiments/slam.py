@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch import CalibrationConfig, calibrate_prepared
 from sst_graph.config import Settings, setting
-from sst_graph.drive.preparation import PictureConfig, PrepareConfig, Progress, prepare_drive
+from sst_graph.drive.preparation import Progress, prepare_drive
 from sst_graph.experiments.slam_graph import (
     EXTRINSIC,
     TIME_OFFSET,
@@ -53,7 +53,7 @@ MEASURES = {
 
 def _as_drawn() -> CalibrationConfig:
     """Contours where the masks have them: on small images following the picture brings nothing."""
-    return CalibrationConfig(prepare=PrepareConfig(picture=PictureConfig(use=False)))
+    return CalibrationConfig(image_edges=False)
 
 
 @dataclass(frozen=True)

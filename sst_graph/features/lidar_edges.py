@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.features.lidar_beams import Beams, arrange_beams
 from sst_graph.types import Scan, SemanticClass
 
@@ -42,6 +41,10 @@ _ROOF_BEAMS = 2
 """Beams to either side of a point on a roof that hit the object, too."""
 _CELL_M = 0.3
 """Grid cell for splitting a class into objects where instances are missing [m]."""
+MAX_RANGE_M = 60.0
+"""Range beyond which objects are not used [m]: their labels are poor, and few returns outline them."""
+_MIN_POINTS = 15
+"""Objects with fewer returns are not used: their edges are those of a few beams."""
 
 
 class Edge(IntEnum):
@@ -50,25 +53,6 @@ class Edge(IntEnum):
     SIDE = 0
     TOP = 1
     BOTTOM = 2
-
-
-@dataclass(frozen=True)
-class BoundaryConfig(Settings):
-    """Objects whose boundaries are used."""
-
-    max_range_m: float = setting(
-        60.0,
-        at_least=1.0,
-        at_most=1000.0,
-        doc="Range beyond which objects are not used. Lower it where labels of far objects are poor, "
-        "raise it for long-range LiDARs.",
-    )
-    min_points: int = setting(
-        15,
-        at_least=1,
-        at_most=1_000_000,
-        doc="Objects with fewer returns are not used. Lower it for LiDARs with few rings.",
-    )
 
 
 @dataclass(frozen=True)
@@ -122,7 +106,7 @@ def joined(parts: Sequence[Boundaries]) -> Boundaries:
 def find_boundaries(
     scan: Scan,
     classes: Sequence[SemanticClass],
-    config: BoundaryConfig | None = None,
+    max_range_m: float = MAX_RANGE_M,
     with_lower_edges: bool = True,
 ) -> dict[SemanticClass, Boundaries]:
     """Boundary points of each class in a scan; a class without any has no entry.
@@ -130,14 +114,13 @@ def find_boundaries(
     Args:
         with_lower_edges: find edges towards the ground, too.
     """
-    config = config or BoundaryConfig()
     points = scan.points.astype(np.float64)
     apart = np.einsum("ij,ij->i", points, points) > 0.25
     usable = slice(None) if apart.all() else apart
     points, labels = points[usable], scan.classes[usable]
     # Compared with plain ints: compared with an enum, all labels are converted to int64.
     members = {c: labels == int(c) for c in classes}
-    present = [c for c in classes if np.count_nonzero(members[c]) >= config.min_points]
+    present = [c for c in classes if np.count_nonzero(members[c]) >= _MIN_POINTS]
     if not present:
         return {}
     beams = arrange_beams(points, None if scan.rings is None else scan.rings[usable])
@@ -146,7 +129,7 @@ def find_boundaries(
     found = {}
     for c in present:
         mask = members[c]
-        objects = split_objects(points, mask, instances, config.min_points)
+        objects = split_objects(points, mask, instances, _MIN_POINTS)
         parts = [
             _side_edges(points, mask, beams, +1),
             _side_edges(points, mask, beams, -1),
@@ -154,7 +137,7 @@ def find_boundaries(
         ]
         if with_lower_edges:
             parts.append(_ring_edges(points, mask, beams, _ground_heights(points, objects)))
-        found[c] = _collect(parts, offsets, objects, config.max_range_m)
+        found[c] = _collect(parts, offsets, objects, max_range_m)
     return {c: b for c, b in found.items() if len(b)}
 
 

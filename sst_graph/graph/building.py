@@ -179,7 +179,7 @@ def _add_biases(
     state: State,
     config: GraphConfig,
 ) -> None:
-    noise = gtsam.noiseModel.Isotropic.Sigma(1, config.bias_sigma_px)
+    noise = gtsam.noiseModel.Isotropic.Sigma(1, config.mask_bias_sigma_px)
     for drive, c in classes:
         graph.add(gtsam.PriorFactorVector(bias_key(drive, c), np.zeros(1), noise))
         values.insert(bias_key(drive, c), np.array([state.biases_px.get((drive, c), 0.0)]))

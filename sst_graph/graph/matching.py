@@ -29,7 +29,7 @@ from sst_graph.association.edge_matching import (
 from sst_graph.association.time_pairing import Pair, pair_by_time
 from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
-from sst_graph.config import Settings, internal, setting
+from sst_graph.config import internal, setting
 from sst_graph.drive.preparation import Drive, outlines
 from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
 from sst_graph.errors import ConfigError
@@ -53,21 +53,18 @@ DynamicObjects = dict[tuple[SemanticClass, int], DynamicObject]
 
 
 @dataclass(frozen=True)
-class GraphConfig(Settings):
+class GraphConfig(MatchConfig):
     """Noise of the joint graph.
 
     Attributes:
-        match: how boundary points meet contours.
-        lower_edges: classes whose edges towards the ground are matched too. They sharpen roll and height
-            where both sides label them alike; hand-drawn outlines often cover the gap above the ground.
         lower_edges: classes whose edges towards the ground are matched too; chosen by
-            :mod:`sst_graph.batch.lower_edges`.
+            :mod:`sst_graph.batch.lower_edges`. They sharpen roll and height where both sides label them
+            alike; hand-drawn outlines often cover the gap above the ground.
         estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
             the settings of the assumptions.
     """
 
-    match: MatchConfig = field(default_factory=MatchConfig)
-    bias_sigma_px: float = setting(
+    mask_bias_sigma_px: float = setting(
         3.0,
         at_least=0.001,
         at_most=1000.0,
@@ -311,7 +308,7 @@ class DriveEdges:
         # 4. Their matches.
         scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
         deviation = deviation_of(state.nuisances, scene)
-        found = match_edges(paired, state.cTl, offset_s, kernel, self.config.match, deviation)
+        found = match_edges(paired, state.cTl, offset_s, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if shares is not None and not (shares == 1.0).all():

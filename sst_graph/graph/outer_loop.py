@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
@@ -47,6 +47,10 @@ MIN_EXPLAINED = 0.2
 MIN_EXPLAINED_VAGUE = 0.45
 """... and where the rotation is not observable: with so little in view, a pose that leaves more of it
 unexplained may be a wrong one."""
+MAX_OUTER = 40
+"""Most outer iterations: a bound on the time; what has not converged by then is reported."""
+MIN_MATCHES = 30
+"""Fewest matches of a solution: single frames with few objects have more, and seven unknowns need them."""
 MIN_CONCENTRATION = 0.6
 """Least :func:`concentration` of a solution that is not wrong altogether."""
 
@@ -56,22 +60,14 @@ class JointConfig(Settings):
     """The joint method.
 
     Attributes:
-        graph: matches, priors.
+        graph: noise of matches and priors.
+        max_outer: most outer iterations.
+        min_matches: fewest matches of a solution.
     """
 
     graph: GraphConfig = field(default_factory=GraphConfig)
-    max_outer: int = setting(
-        40,
-        at_least=1,
-        at_most=1000,
-        doc="Most outer iterations (matching anew). Raise it where a result says that it has not converged.",
-    )
-    min_matches: int = setting(
-        30,
-        at_least=1,
-        at_most=1_000_000,
-        doc="Fewest matches for a result. Lower it for single frames with few objects.",
-    )
+    max_outer: int = internal(MAX_OUTER)
+    min_matches: int = internal(MIN_MATCHES)
 
 
 @dataclass(frozen=True)

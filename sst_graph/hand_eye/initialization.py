@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.drive.path import SensorPath
 from sst_graph.hand_eye.graph import CameraStep, MotionPair, pair_motions
 
@@ -17,6 +16,8 @@ FloatArray = NDArray[np.float64]
 
 LEAST_SHARE = 0.4
 """A time offset for which a smaller share of the pairs has LiDAR motion is not tried."""
+MAX_OFFSET_S = 0.5
+"""Half width of the time offsets that are tried [s]: clocks of one machine differ by less."""
 _STEP_S = 0.02
 """Between time offsets [s]: a fifth of the usual time between scans."""
 _SELECTED = 4
@@ -34,19 +35,6 @@ _ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class MotionStartConfig(Settings):
-    """The time offsets that are tried."""
-
-    max_offset_s: float = setting(
-        0.5,
-        at_least=0.0,
-        at_most=4.0,
-        doc="Half width of the time offsets tried by method motion. Raise it where the clocks may "
-        "differ by more.",
-    )
-
-
-@dataclass(frozen=True)
 class MotionStart:
     """A rotation and a time offset to begin with, and what they cost a pair."""
 
@@ -60,16 +48,19 @@ def motion_starts(
     paths: Sequence[SensorPath],
     guess: gtsam.Rot3 | None,
     guess_offset_s: float,
-    config: MotionStartConfig,
+    max_offset_s: float = MAX_OFFSET_S,
 ) -> list[MotionStart]:
     """The best starts, one for each minimum over the time offset, cheapest first; none without motion.
 
     Rotation vectors and directions of travel of the LiDAR are turned into the camera's (Kabsch, robustly
     weighted) at every time offset of the grid. Directions leave out the lever arm.
+
+    Args:
+        max_offset_s: half width of the time offsets that are tried around the guess [s].
     """
     chosen = np.unique(np.linspace(0, len(steps) - 1, min(_MAX_PAIRS, len(steps))).astype(int))
     some = [steps[i] for i in chosen] if steps else []
-    count = int(np.ceil(config.max_offset_s / _STEP_S))
+    count = int(np.ceil(max_offset_s / _STEP_S))
     grid = guess_offset_s + _STEP_S * np.arange(-count, count + 1)
     found: list[MotionStart | None] = []
     for offset_s in grid:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
@@ -32,13 +31,15 @@ from sst_graph.hand_eye.graph import (
     pair_motions,
     state_values,
 )
-from sst_graph.hand_eye.initialization import LEAST_SHARE, MotionStartConfig, motion_starts
+from sst_graph.hand_eye.initialization import LEAST_SHARE, MAX_OFFSET_S, motion_starts
 
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
 
 VAGUE_DEG, VAGUE_S = 5.0, 0.03
 """A rotation or a time offset with a larger sigma than this is as good as unknown [deg], [s]."""
+MIN_PAIRS = 5
+"""Fewest pairs of camera and LiDAR motions of a solution: fewer tell nothing of the noise."""
 _MAX_OUTER = 20
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 _FIRST_OUTER = 4
@@ -53,24 +54,6 @@ _INNER_ITERATIONS = 10
 ALTERNATIVE_CHI2 = 9.0
 """A different solution that costs at most this much more makes the answer ambiguous: three sigmas of one
 unknown. Solutions farther apart than this (chi-squared of 7) are different."""
-
-
-@dataclass(frozen=True)
-class MotionConfig(Settings):
-    """Hand-eye calibration.
-
-    Attributes:
-        start: time offsets that are tried first.
-    """
-
-    start: MotionStartConfig = field(default_factory=MotionStartConfig)
-    min_pairs: int = setting(
-        5,
-        at_least=2,
-        at_most=1_000_000,
-        doc="Fewest pairs of camera and LiDAR motions for a result of method motion. Lower it for "
-        "short drives.",
-    )
 
 
 @dataclass(frozen=True)
@@ -102,23 +85,26 @@ def solve_motion(
     drives: Sequence[Drive],
     guess_cTl: gtsam.Pose3 | None,
     guess_offset_s: float,
-    config: MotionConfig,
+    max_offset_s: float = MAX_OFFSET_S,
     progress: Progress | None = None,
 ) -> list[MotionSolution]:
     """Solutions from the best starts, the likeliest first.
+
+    Args:
+        max_offset_s: half width of the time offsets that are tried around the guess [s].
 
     Raises:
         EstimationError: too few pairs of motions.
     """
     # 1. The motions, which depend on no calibration.
     steps, paths = camera_steps(drives), lidar_paths(drives)
-    if len(steps) < config.min_pairs:
-        raise EstimationError(_too_few(len(steps), config))
+    if len(steps) < MIN_PAIRS:
+        raise EstimationError(_too_few(len(steps)))
     # 2. Rotation and time offset on a grid of offsets.
     guess = None if guess_cTl is None else guess_cTl.rotation()
-    starts = motion_starts(steps, paths, guess, guess_offset_s, config.start)
+    starts = motion_starts(steps, paths, guess, guess_offset_s, max_offset_s)
     if not starts:
-        raise EstimationError(_too_few(len(steps), config))
+        raise EstimationError(_too_few(len(steps)))
     # 3. The graph from each of them, a few steps; from those that differ and fit alike to the end.
     translation = np.zeros(3) if guess_cTl is None else guess_cTl.translation()
     solutions: list[MotionSolution] = []
@@ -126,14 +112,14 @@ def solve_motion(
         cTl = gtsam.Pose3(start.cRl, translation)
         centre = State(guess_cTl or cTl, (guess_offset_s,))
         first = State(cTl, (start.offset_s,))
-        solution = _solve(steps, paths, first, centre, config, _FIRST_OUTER)
+        solution = _solve(steps, paths, first, centre, _FIRST_OUTER)
         if solution is not None:
             solutions.append(solution)
         if progress is not None:
             progress("motion", number + 1, len(starts))
     if not solutions:
         raise EstimationError("from every start the time offset left the time that the LiDAR's motion covers")
-    finished = [_finished(steps, paths, s, config) for s in _different(solutions)]
+    finished = [_finished(steps, paths, s) for s in _different(solutions)]
     _LOG.info("motion: %d pairs, costs %s", len(steps), [round(s.cost, 1) for s in finished])
     return sorted(finished, key=lambda s: s.cost)
 
@@ -150,12 +136,12 @@ def _different(solutions: Sequence[MotionSolution]) -> list[MotionSolution]:
 
 
 def _finished(
-    steps: Sequence[CameraStep], paths: Sequence[SensorPath], solution: MotionSolution, config: MotionConfig
+    steps: Sequence[CameraStep], paths: Sequence[SensorPath], solution: MotionSolution
 ) -> MotionSolution:
     """A solution with its outer loop run to the end."""
     if solution.converged:
         return solution
-    return _solve(steps, paths, solution.state, solution.centre, config) or solution
+    return _solve(steps, paths, solution.state, solution.centre) or solution
 
 
 def _apart(a: MotionSolution, b: MotionSolution) -> float:
@@ -169,7 +155,6 @@ def _solve(
     paths: Sequence[SensorPath],
     state: State,
     centre: State,
-    config: MotionConfig,
     max_outer: int = _MAX_OUTER,
 ) -> MotionSolution | None:
     """Look the LiDAR's motion up at the time offset, optimise, until nothing moves.
@@ -181,7 +166,7 @@ def _solve(
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
         pairs = pair_motions(steps, paths, state.offsets_s[0])
-        if len(pairs) < max(config.min_pairs, LEAST_SHARE * len(steps)):
+        if len(pairs) < max(MIN_PAIRS, LEAST_SHARE * len(steps)):
             return None
         terms, scales = hand_eye_terms(pairs, state)
         # 2. Inner optimisation.
@@ -210,9 +195,9 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
 
 
-def _too_few(pairs: int, config: MotionConfig) -> str:
+def _too_few(pairs: int) -> str:
     return (
-        f"{pairs} pairs of camera and LiDAR motion over the same time, expected {config.min_pairs} or more: "
+        f"{pairs} pairs of camera and LiDAR motion over the same time, expected {MIN_PAIRS} or more: "
         "motion alone needs consecutive frames of a moving vehicle"
     )
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.factors.camera import PinholeCamera
@@ -19,6 +18,8 @@ from sst_graph.graph.building import Tracks
 from sst_graph.graph.state import State
 from sst_graph.initialization.global_search import (
     COARSE,
+    FRAMES,
+    POINTS_PER_CLASS,
     Candidate,
     SearchConfig,
     SearchProblem,
@@ -37,22 +38,6 @@ _LABEL_BLUR_PX = 10.0
 of 1242 [px]: a degree is 13 px, what some of them are still off."""
 _MIN_CLASS_POINTS = 30
 """Fewest points of the searched classes that make a frame worth looking at."""
-
-
-@dataclass(frozen=True)
-class StartConfig(Settings):
-    """Whether and where the start is searched.
-
-    Attributes:
-        search: where.
-    """
-
-    search: SearchConfig = field(default_factory=SearchConfig)
-    enabled: bool = setting(
-        True,
-        doc="Search globally for an initial extrinsic and time offset. Set to false where the guess "
-        "is within a degree and ten centimetres, to save time.",
-    )
 
 
 @dataclass(frozen=True)
@@ -79,7 +64,7 @@ class StartProblem:
         return State(cTl, (self.offset_s,) * len(start.offsets_s))
 
 
-def candidate_steps(problem: StartProblem, config: StartConfig) -> Stepwise[list[Candidate]]:
+def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[list[Candidate]]:
     """Candidates from the drive that shows most, best first.
 
     Raises:
@@ -89,8 +74,8 @@ def candidate_steps(problem: StartProblem, config: StartConfig) -> Stepwise[list
         if problem.guess is None:
             raise EstimationError("no guess to start from, and the search is switched off")
         return [Candidate(problem.guess, problem.offset_s, 0.0)]
-    frames, camera = _richest_frames(problem, config.search.frames)
-    search = SearchProblem(frames, camera, problem.classes, problem.guess, problem.offset_s, config.search)
+    frames, camera = _richest_frames(problem, FRAMES)
+    search = SearchProblem(frames, camera, problem.classes, problem.guess, problem.offset_s, config)
     candidates = yield from search_steps(search, COARSE)
     _LOG.info("start: %d frames, best scores %s", len(frames), [round(c.score, 4) for c in candidates[:5]])
     return candidates
@@ -104,9 +89,9 @@ def label_score_steps(problem: StartProblem, states: States, config: SearchConfi
     Raises:
         EstimationError: no frame shows a searched class to both sensors.
     """
-    frames, camera = _richest_frames(problem, config.frames)
+    frames, camera = _richest_frames(problem, FRAMES)
     rng = np.random.default_rng(config.seed)
-    points = LabelledPoints.sampled(frames, camera, problem.classes, config.points_per_class, rng)
+    points = LabelledPoints.sampled(frames, camera, problem.classes, POINTS_PER_CLASS, rng)
     yield 5
     agreement = points.agreement_map(_LABEL_BLUR_PX, 1.0, "dependence")
     yield 5

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.initialization.label_agreement import (
     CELLS,
@@ -44,6 +44,10 @@ _APART = np.radians(3.0)
 _NEAR_TRANSLATION_M = 0.1
 """Half width of the translations of the first family of candidates [m]: with less to give way, they are hard
 to mislead."""
+FRAMES = 6
+"""Frames that take part: more cost time; scans one after the other show much the same."""
+POINTS_PER_CLASS = 250
+"""Points of each class and frame that take part: the cost grows with them, the best candidates stay."""
 _WITHOUT_GUESS = 4
 """Without a guess so many times more candidates are kept."""
 _SCORES: tuple[LabelScore, ...] = ("votes", "dependence")
@@ -53,22 +57,18 @@ drives with bad labels or few objects, votes alone lose one more start without a
 
 @dataclass(frozen=True)
 class SearchConfig(Settings):
-    """Where a start is searched."""
+    """Whether and where a start is searched.
 
-    frames: int = setting(
-        6,
-        at_least=1,
-        at_most=50,
-        doc="Frames that take part in the search. Raise it where few objects are in view.",
+    Attributes:
+        seed: of the sampler; the calibration's.
+    """
+
+    enabled: bool = setting(
+        True,
+        doc="Search globally for an initial extrinsic and time offset. Set to false where the guess "
+        "is within a degree and ten centimetres, to save time.",
     )
-    points_per_class: int = setting(
-        250,
-        at_least=1,
-        at_most=5000,
-        doc="Points of each class and frame that take part in the search. Raise it where the search "
-        "misses, at a cost in time.",
-    )
-    box_deg: float = setting(
+    rotation_deg: float = setting(
         30.0,
         at_least=0.0,
         at_most=180.0,
@@ -92,14 +92,10 @@ class SearchConfig(Settings):
         0.5,
         at_least=0.0,
         at_most=5.0,
-        doc="Half width of the time offsets searched. Raise it where the clocks may differ by more.",
+        doc="Half width of the time offsets searched, by method motion too. Raise it where the clocks "
+        "may differ by more.",
     )
-    seed: int = setting(
-        0,
-        at_least=0,
-        at_most=10**15,
-        doc="Seed of the global search's sampler. Change it to see whether the answer depends on it.",
-    )
+    seed: int = internal(0)
 
 
 @dataclass(frozen=True)
@@ -169,7 +165,7 @@ class SearchProblem:
         """Rotations to begin with, at the guess's translation."""
         rotations, translation = _so3_grid(_GRID_STEP), np.zeros(3)
         if self.guess is not None:
-            box = np.radians(self.config.box_deg)
+            box = np.radians(self.config.rotation_deg)
             axis = _BOX_STEP * np.arange(-round(box / _BOX_STEP), round(box / _BOX_STEP) + 1)
             vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
             vectors = vectors[np.linalg.norm(vectors, axis=1) <= _REACH * box]
@@ -183,7 +179,7 @@ class SearchProblem:
         every = np.arange(len(states))
         if self.guess is None:
             return every
-        reach = min(_REACH * np.radians(self.config.box_deg), np.pi)
+        reach = min(_REACH * np.radians(self.config.rotation_deg), np.pi)
         trace = np.einsum("mij,ij->m", states.rotations, np.asarray(self.guess.rotation().matrix()))
         inside = np.flatnonzero(trace >= 1.0 + 2.0 * np.cos(reach))
         return inside if len(inside) else every
@@ -199,9 +195,7 @@ def search_steps(problem: SearchProblem, stages: Sequence[Stage]) -> Stepwise[li
     """
     config = problem.config
     rng = np.random.default_rng(config.seed)
-    points = LabelledPoints.sampled(
-        problem.frames, problem.camera, problem.classes, config.points_per_class, rng
-    )
+    points = LabelledPoints.sampled(problem.frames, problem.camera, problem.classes, POINTS_PER_CLASS, rng)
     yield 5
     free_m = config.free_translation_m if problem.guess is None else config.translation_m
     families = []

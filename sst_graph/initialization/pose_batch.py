@@ -29,7 +29,6 @@ from sst_graph.association.time_pairing import nearest_images
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import cross
 from sst_graph.factors.robust import RobustKernel
-from sst_graph.features.lidar_edges import Edge
 from sst_graph.features.mask_contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
 from sst_graph.graph.matching import DriveEdges
 
@@ -154,7 +153,7 @@ class PoseBatch:
 
     def equations(self, poses: Poses, kernel: RobustKernel) -> BatchEquations:
         """Match every pose's boundary points to the nearest contours; the kernel's scale is in pixels."""
-        config, owners = self.edges.config.match, self.edges.owners
+        config, owners = self.edges.config, self.edges.owners
         pairing = self._pairing(poses.offsets)
         seen = self._in_image(poses, pairing)
         image = pairing.images[seen.pose, self._scans[seen.point]]
@@ -229,10 +228,7 @@ class PoseBatch:
             poses.rotations[:, row] @ self._lPs + poses.translations[:, row, None] for row in (0, 2)
         )
         near = (ahead > _MIN_DEPTH_M - margin) & (np.abs(across) <= side * (ahead + margin) + margin)
-        near &= pairing.images[:, self._scans] >= 0
-        if not self.edges.config.match.top_edges:
-            near &= self.edges.points.edges != Edge.TOP
-        return np.asarray(near)
+        return np.asarray(near & (pairing.images[:, self._scans] >= 0))
 
     def _moved(
         self, poses: Poses, pairing: _Pairing, pose: IntArray, point: IntArray

@@ -97,7 +97,7 @@ def _stepped(poses: Poses, centres: Poses, equations: BatchEquations, config: Gr
     k = equations.g.shape[1]
     diagonal = range(k)
     rad, m = PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M
-    information = _of_each(k, rad, m, config.time_offset_sigma_s, config.bias_sigma_px) ** -2.0
+    information = _of_each(k, rad, m, config.time_offset_sigma_s, config.mask_bias_sigma_px) ** -2.0
     away = [
         _rotation_vectors(poses.rotations @ np.swapaxes(centres.rotations, 1, 2)),
         poses.translations - centres.translations,

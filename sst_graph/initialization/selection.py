@@ -22,7 +22,7 @@ from sst_graph.graph.building import GraphConfig
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, NARROW_KERNELS_PX, JointSolution, agreement
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartConfig, StartProblem, candidate_steps, label_score_steps
+from sst_graph.initialization.candidates import StartProblem, candidate_steps, label_score_steps
 from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
@@ -87,7 +87,7 @@ class Selection:
 def select_start_steps(
     problem: StartProblem,
     graph: GraphConfig,
-    config: StartConfig,
+    config: SearchConfig,
     most_scans: int = SELECTION_SCANS,
     most_candidates: int = _CANDIDATES,
 ) -> Stepwise[Selection]:
@@ -108,14 +108,14 @@ def select_start_steps(
         start = ((candidates[0].cTl, candidates[0].offset_s),)
         return Selection(start, start, candidates[0].score)
     candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
-    selection = yield from select_among_steps(problem, candidates, graph, config.search, most_scans)
+    selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
     if problem.guess is not None:
         return selection
     closer = []
     for cTl, offset_s in selection.distant:
         around = yield from candidate_steps(replace(problem, guess=cTl), config)
         closer += [Candidate(cTl, offset_s, selection.score), *around[:most_candidates]]
-    return (yield from select_among_steps(problem, closer, graph, config.search, most_scans))
+    return (yield from select_among_steps(problem, closer, graph, config, most_scans))
 
 
 def select_among_steps(

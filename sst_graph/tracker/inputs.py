@@ -60,7 +60,7 @@ class SensorInputs:
         self.window.restart()
 
     def _restart_motion(self) -> None:
-        self.odometry = LidarOdometry(self.config.calibration.prepare.lidar_odometry)
+        self.odometry = LidarOdometry(self.config.calibration.lidar_odometry)
         self.stamps = StampMonitor(self.config.alarm.chi2)
 
     def check_image(self, image: CameraImage) -> tuple[CameraImage, int]:
@@ -93,9 +93,7 @@ class SensorInputs:
         self.image_order.add(image.stamp_ns, clock_step_ns != 0)
         self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
-        features = image_features(
-            self.window.next_image, image, calibration.classes, calibration.prepare.picture.use
-        )
+        features = image_features(self.window.next_image, image, calibration.classes, calibration.image_edges)
         self.window.add_image(features)
         self._forget_images(estimate)
         self.first_frames.add(image)
@@ -108,7 +106,7 @@ class SensorInputs:
         jump = self.stamps.add_scan(scan.stamp_ns, self.window.place)
         calibration = self.config.calibration
         prepare = dataclasses.replace(calibration.prepare, use_visual_odometry=False)
-        used = calibration.lower_edges.use != "never"
+        used = calibration.lower_edges != "never"
         features = scan_features(
             self.window.next_scan, scan, calibration.classes, prepare, with_lower_edges=used
         )

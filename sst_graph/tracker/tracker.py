@@ -65,7 +65,7 @@ class Tracker:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
         self.setup = Setup(camera, config or TrackerConfig(), initial, initial_offset_s)
         config = self.setup.config.estimating
-        guess = Guess(initial, initial_offset_s, search=config.calibration.start.enabled)
+        guess = Guess(initial, initial_offset_s, search=config.calibration.search.enabled)
         self.inputs = SensorInputs(camera, config, searched_scans(config))
         self.matcher = WindowMatcher(self.inputs.window, config)
         self.initializer = Initializer(guess, config)

@@ -115,15 +115,13 @@ def test_faces_that_look_another_way_do_not_match() -> None:
     assert match(turned).index.tolist() == np.flatnonzero(~half).tolist()
 
 
-def test_sides_objects_and_top_edges() -> None:
+def test_sides_and_objects() -> None:
     points = ring()
     found = match(points)
     angles = np.linspace(0.0, 2.0 * np.pi, 90, endpoint=False) + 0.01
     top = np.sin(angles) < -0.5
     np.testing.assert_array_equal(found.sides, np.where(top, 2, (np.cos(angles) > 0.0).astype(int)))
     np.testing.assert_array_equal(found.objects, points.objects)
-    without = match(points, config=MatchConfig(top_edges=False))
-    np.testing.assert_array_equal(without.index, np.flatnonzero(~top))
 
 
 def test_an_object_without_a_mask_is_left_out() -> None:

@@ -29,7 +29,7 @@ from sst_graph.inspect.budget_text import budget_lines
 from sst_graph.result import CalibrationResult
 
 CONFIG = with_overrides(
-    CalibrationConfig(), ["start.enabled=false", "use_motion=never", "contradictions.check=false"]
+    CalibrationConfig(), ["search.enabled=false", "use_motion=never", "check_contradictions=false"]
 )
 """Of what is beside the point here nothing: the global search, the motion, parts of the drive."""
 
@@ -107,12 +107,10 @@ def problem() -> SolvedProblem:
     truth = crowded_street().truth
     assert truth is not None and truth.time_offset_s is not None
     guess = State(truth.cTl, (truth.time_offset_s,))
-    joint = dataclasses.replace(CONFIG.joint, max_outer=6)
-    config = dataclasses.replace(CONFIG, joint=joint)
-    problem = CalibrationProblem.of(drives, Guess(truth.cTl, truth.time_offset_s), config)
-    return SolvedProblem(
-        problem, solve_joint(dataclasses.replace(problem.joint(), centre=guess), guess, (5.0, 3.0))
-    )
+    problem = CalibrationProblem.of(drives, Guess(truth.cTl, truth.time_offset_s), CONFIG)
+    joint = problem.joint()
+    short = dataclasses.replace(joint, config=dataclasses.replace(joint.config, max_outer=6), centre=guess)
+    return SolvedProblem(problem, solve_joint(short, guess, (5.0, 3.0)))
 
 
 def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(problem: SolvedProblem) -> None:
@@ -173,7 +171,7 @@ def test_a_wrong_focal_length_is_contradicted() -> None:
 
 
 def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -> None:
-    wide = with_overrides(CONFIG, ["assumptions.sigmas.focal=0.01", "assumptions.test=false"])
+    wide = with_overrides(CONFIG, ["assumptions.focal=0.01", "assumptions.test=false"])
     result = calibrated(prepared(), wide)
     report, told = result.diagnostics["assumptions"], clean.diagnostics["assumptions"]
     assert "estimate" not in report["focal"]

@@ -30,7 +30,7 @@ from sst_graph.types import Frame, Source
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 STOP = DATA / "kitti_2011_09_26_stop"
-CONFIG = with_overrides(CalibrationConfig(), ["start.enabled=false"])
+CONFIG = with_overrides(CalibrationConfig(), ["search.enabled=false"])
 STREET = SimulationConfig(
     seed=101,
     frames=24,
@@ -168,7 +168,7 @@ def test_masks_that_slide() -> None:
 
 
 def test_no_check_no_contradiction() -> None:
-    config = with_overrides(CONFIG, ["contradictions.check=false"])
+    config = with_overrides(CONFIG, ["check_contradictions=false"])
     result = calibrated([Edited(street(), knocked(frames_of(), 12, 2.0))], config)
     assert not [reason for reason in result.reasons if "contradict each other" in reason]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
-from sst_graph.batch.config import LowerEdgesConfig
+from sst_graph.batch.config import UseLowerEdges
 from sst_graph.batch.lower_edges import MIN_CONCENTRATION, lower_edge_support, with_lower_edges
 from sst_graph.drive.preparation import Drive, image_features
 from sst_graph.features.lidar_edges import Edge
@@ -26,7 +26,6 @@ from sst_graph.types import CameraImage, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT = JointConfig(min_matches=10)
-CONFIG = LowerEdgesConfig()
 
 
 @cache
@@ -74,7 +73,7 @@ def test_matched_where_they_are_asked_for() -> None:
 
 def test_used_where_the_labels_agree() -> None:
     drive = street()
-    below = with_lower_edges(JointProblem([drive], Tracks([drive]), JOINT), [solved(drive)], CONFIG)
+    below = with_lower_edges(JointProblem([drive], Tracks([drive]), JOINT), [solved(drive)], "auto")
     assert below.joint.graph.lower_edges == (VEHICLE,)
     assert below.concentration[VEHICLE] > MIN_CONCENTRATION
     truth = standing_street().truth.cTl
@@ -86,14 +85,13 @@ def test_used_where_the_labels_agree() -> None:
 
 
 @pytest.mark.parametrize("use", ["auto", "never", "always"])
-def test_left_out_where_the_shadow_belongs_to_the_mask(use: str) -> None:
+def test_left_out_where_the_shadow_belongs_to_the_mask(use: UseLowerEdges) -> None:
     drive = street(shadow_px=5)
     one, centre = solved(drive)
-    config = replace(CONFIG, use=use)
     tracks = Tracks([drive])
-    shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(config)[1]
+    shares = lower_edge_support([drive], tracks, one.state, JOINT).agreed(use)[1]
     assert shares[VEHICLE] < MIN_CONCENTRATION
-    below = with_lower_edges(JointProblem([drive], tracks, JOINT), [(one, centre)], config)
+    below = with_lower_edges(JointProblem([drive], tracks, JOINT), [(one, centre)], use)
     if use == "always":
         assert below.joint.graph.lower_edges == (VEHICLE,)
     else:
@@ -104,6 +102,6 @@ def test_too_few_say_nothing() -> None:
     drive = street()
     one, _ = solved(drive)
     assert (
-        lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed(CONFIG, min_support=1e6)[1]
+        lower_edge_support([drive], Tracks([drive]), one.state, JOINT).agreed("auto", min_support=1e6)[1]
         == {}
     )

@@ -97,7 +97,7 @@ def test_a_start_of_other_pairs_is_said(
     street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     start = str(shifted / "calibration.json")
-    command = ["track", str(street), "--init", start, "--set", "calibration.start.enabled=false"]
+    command = ["track", str(street), "--init", start, "--set", "calibration.search.enabled=false"]
     assert main(command) == 3
     assert "was made with --image-shift 1, found --image-shift 0" in capsys.readouterr().err
     assert main([*command, "--image-shift", "1"]) == 3

@@ -13,7 +13,7 @@ ENTRIES = [
 
 
 def test_there_are_few_enough_to_read() -> None:
-    assert len(ENTRIES) <= 75
+    assert len(ENTRIES) <= 60
 
 
 def test_every_setting_says_what_it_is() -> None:

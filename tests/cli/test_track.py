@@ -22,7 +22,7 @@ from sst_graph.cli import main
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
 
-SOON = ["--set", "start_scans=8", "--set", "calibration.start.enabled=false"]
+SOON = ["--set", "start_scans=8", "--set", "calibration.search.enabled=false"]
 
 
 @pytest.fixture(scope="module")

@@ -38,6 +38,7 @@ class Online(Settings):
 
 
 OLD = {"delay_s": "time_offset_s", "undersides.use": "lower_edges.use", "scans": "window"}
+SAME = {"delay_s": "time_offset_s", "lag.s": "time_offset_s"}
 GONE = {"undersides.support": "sst_graph.edges.SUPPORT = 30.0"}
 
 
@@ -78,6 +79,21 @@ def test_a_constant_is_named_with_its_value(name: str) -> None:
 def test_old_and_new_name_together_are_refused() -> None:
     with pytest.raises(ConfigError, match="'delay_s' and 'time_offset_s': found both"):
         new(Method, {"delay_s": 0.2, "time_offset_s": 0.3})
+
+
+def test_several_old_names_of_one_setting_must_agree() -> None:
+    assert with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.2}}, SAME, {}) == {"time_offset_s": 0.2}
+    with pytest.raises(ConfigError, match=r"'delay_s' and 'lag\.s', both called 'time_offset_s'"):
+        with_new_names(Method, {"delay_s": 0.2, "lag": {"s": 0.0}}, SAME, {})
+
+
+def test_a_table_that_is_a_single_setting_now() -> None:
+    moved = {"time_offset_s.mean": "time_offset_s"}
+    assert with_new_names(Method, {"time_offset_s": {"mean": 0.2}}, moved, {}) == {"time_offset_s": 0.2}
+    both = {"time_offset_s": {"mean": 0.2, "sigma": 0.1}}
+    with pytest.raises(ConfigError, match="found both"):
+        with_new_names(Method, both, moved, {})
+    assert from_dict(CalibrationConfig, {"lower_edges": {"use": "never"}}).lower_edges == "never"
 
 
 @pytest.mark.parametrize(

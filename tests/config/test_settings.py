@@ -196,17 +196,17 @@ def test_wrong_values_in_files_are_refused_by_file_and_name(command: str, tmp_pa
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ("calibration.start.search.box_deg=60", ""),
-        ("calibration.joint.graph.object_bias_sigma_px=0", ""),
-        ("calibration.joint.graph.object_bias_sigma_px=1e-9", "found 1e-09, expected 0 or at least 0.001 px"),
+        ("calibration.search.rotation_deg=60", ""),
+        ("calibration.noise.object_bias_sigma_px=0", ""),
+        ("calibration.noise.object_bias_sigma_px=1e-9", "found 1e-09, expected 0 or at least 0.001 px"),
         (
-            "calibration.motion.start.max_offset_s=5",
-            "max_offset_s: found 5, expected at least 0 and at most 4 s",
+            "calibration.motion.start.max_offset_s=6",
+            "calibration.search.time_offset_s: found 6, expected at least 0 and at most 5 s",
         ),
-        ("calibration.prepare.lidar_odometry.near_m=100", ""),
-        ("calibration.prepare.lidar_odometry.far_m=1", ""),
+        ("calibration.lidar_odometry.near_m=100", ""),
+        ("calibration.lidar_odometry.far_m=1", ""),
         (
-            'calibration.prepare.lidar_odometry={"near_m": 60, "far_m": 50}',
+            'calibration.lidar_odometry={"near_m": 60, "far_m": 50}',
             r"near_m: found 60, expected at most 50 m \(far_m\)",
         ),
         ("window=10", r"^window: found 10, expected at least 12 \(start_scans\)"),
@@ -223,18 +223,19 @@ def test_rules_between_settings(settings: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("joint.max_outer=0", "joint.max_outer: found 0, expected at least 1 and at most 1000"),
-        ("joint.graph.lower_edges=[vehicle]", "unknown setting 'joint.graph.lower_edges'"),
-        ("joint.graph.focal=1", "unknown setting 'joint.graph.focal'"),
-        ("start.search.frames=0", "start.search.frames: found 0, expected at least 1"),
-        ("prepare.lidar_odometry.voxel_m=0", "voxel_m: found 0, expected at least 0.02 and at most 10 m"),
-        ("motion.min_pairs=0", "motion.min_pairs: found 0, expected at least 2"),
+        ("joint.max_outer=0", "'joint.max_outer' is not a setting any more: sst_graph.graph.outer_loop."),
+        ("noise.lower_edges=[vehicle]", "unknown setting 'noise.lower_edges'"),
+        ("noise.estimate=[focal]", "unknown setting 'noise.estimate'"),
+        ("search.seed=1", "unknown setting 'search.seed'; did you mean 'seed'?"),
+        ("seed=-1", "seed: found -1, expected at least 0"),
+        ("lidar_odometry.voxel_m=0", "voxel_m: found 0, expected at least 0.02 and at most 10 m"),
+        ("paper.static_frames=0", "paper.static_frames: found 0, expected at least 1"),
         (
-            "lower_edges.use=sometimes",
-            "lower_edges.use: found 'sometimes', expected one of auto, always, never",
+            "lower_edges=sometimes",
+            "lower_edges: found 'sometimes', expected one of auto, always, never",
         ),
         ("foo=1", "unknown setting 'foo'; no setting has a name like it; known at the top: assumptions, "),
-        ("max_outer=3", "unknown setting 'max_outer'; did you mean 'joint.max_outer'?"),
+        ("voxel_m=3", "unknown setting 'voxel_m'; did you mean 'lidar_odometry.voxel_m'?"),
     ],
 )
 def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, message: str) -> None:
@@ -244,7 +245,7 @@ def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, m
 
 def test_the_bounds_of_some_settings_end_in_a_result_or_a_typed_error() -> None:
     """A sample of what ``benchmarks/settings_walk.py`` goes through."""
-    quick = [case for case in cases() if not case.settings[-1].startswith(("start.", "semalign."))]
+    quick = [case for case in cases() if not case.settings[-1].startswith("search.")]
     chosen = np.random.default_rng(8).choice(len(quick), 8, replace=False)
     worker = Worker(seconds=60.0, memory_gb=4.0)
     try:

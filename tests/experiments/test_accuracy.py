@@ -84,13 +84,13 @@ def test_starts_are_within_their_limits() -> None:
 
 
 def test_one_small_run() -> None:
-    start = dataclasses.replace(CalibrationConfig().start, enabled=False)
+    search = dataclasses.replace(CalibrationConfig().search, enabled=False)
     config = AccuracyConfig(
         streets=1,
         scenarios=("standing",),
         start_deg=0.5,
         start_m=0.02,
-        calibration=dataclasses.replace(CalibrationConfig(), start=start),
+        calibration=dataclasses.replace(CalibrationConfig(), search=search),
     )
     seen: list[tuple[str, int, int]] = []
     header, rule, row = accuracy.run(config, lambda *step: seen.append(step)).splitlines()

@@ -20,9 +20,8 @@ from sst_graph.experiments.windows import (
     spread_cells,
     spread_in_sigmas,
 )
-from sst_graph.initialization.candidates import StartConfig
+from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.metrics import CalibrationErrors
-from sst_graph.odometry.sweep import SweepConfig
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
@@ -74,7 +73,7 @@ def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     )
     write_drive(simulate(small), folder)
     # The simulated clouds have no sweep, which scans of so short windows cannot tell.
-    known = replace(CalibrationConfig(), start=StartConfig(enabled=False), sweep=SweepConfig(decide=False))
+    known = replace(CalibrationConfig(), search=SearchConfig(enabled=False), decide_sweep=False)
     table = windows.run(WindowsConfig((str(folder),), (2,), calibration=known))
     cells = [cell.strip() for cell in table.splitlines()[-1].strip("|").split("|")]
     assert cells[:2] == ["street/00", "2"] and len(table.splitlines()) == 3
@@ -93,7 +92,7 @@ def test_several_drives_have_rows_of_their_own_and_one_together(tmp_path: Path) 
         )
         write_drive(simulate(small), Path(folders[-1]))
     # The simulated clouds have no sweep, which scans of so short windows cannot tell.
-    known = replace(CalibrationConfig(), start=StartConfig(enabled=False), sweep=SweepConfig(decide=False))
+    known = replace(CalibrationConfig(), search=SearchConfig(enabled=False), decide_sweep=False)
     table = windows.run(WindowsConfig(tuple(folders), (2,), calibration=known))
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()[2:]]
     assert [row[0] for row in rows] == ["no_stop/00", "mixed/00", "no_stop/00 + mixed/00"]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sst_graph.features.lidar_edges import Boundaries, BoundaryConfig, Edge, find_boundaries, split_objects
+from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries, split_objects
 from sst_graph.types import Scan, SemanticClass
 
 VEHICLE, OTHER = SemanticClass.VEHICLE, SemanticClass.OTHER
@@ -39,8 +39,8 @@ def scene(
     )
 
 
-def found_in(scan: Scan, config: BoundaryConfig | None = None, with_lower_edges: bool = True) -> Boundaries:
-    return find_boundaries(scan, [VEHICLE], config, with_lower_edges)[VEHICLE]
+def found_in(scan: Scan, max_range_m: float = MAX_RANGE_M, with_lower_edges: bool = True) -> Boundaries:
+    return find_boundaries(scan, [VEHICLE], max_range_m, with_lower_edges)[VEHICLE]
 
 
 def polar_deg(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -112,7 +112,7 @@ def test_the_range_is_carried_on() -> None:
     # A side that recedes by 0.3 m a step towards the left, as a car's flank does.
     recedes = 8.0 + 0.3 * np.arange(len(AZIMUTHS)) * (-np.inf < AZIMUTHS)
     recedes = recedes - recedes[np.argmin(np.abs(AZIMUTHS))] + 12.0
-    found = found_in(scene(plate_m=recedes, wall_m=60.0), BoundaryConfig(max_range_m=100.0))
+    found = found_in(scene(plate_m=recedes, wall_m=60.0), max_range_m=100.0)
     sides = found.take(np.flatnonzero(found.edges == Edge.SIDE))
     azimuth, _, rho = polar_deg(sides.lPs)
     members = np.flatnonzero(np.abs(AZIMUTHS) < np.radians(5.0))
@@ -179,9 +179,17 @@ def test_times_ranges_and_sizes() -> None:
     azimuth, _, _ = polar_deg(found.lPs)
     np.testing.assert_allclose(found.offsets_s, 0.01 * np.radians(azimuth), atol=0.011 * np.radians(STEP_DEG))
     assert (found_in(scene()).offsets_s == 0.0).all()
-    assert not find_boundaries(scene(), [VEHICLE], BoundaryConfig(max_range_m=9.0))
-    assert not find_boundaries(scene(), [VEHICLE], BoundaryConfig(min_points=100_000))
+    assert not find_boundaries(scene(), [VEHICLE], max_range_m=9.0)
     assert not find_boundaries(scene(), [SemanticClass.POLE])
+
+
+def test_an_object_of_few_returns_is_left_out() -> None:
+    scan = scene()
+    members = np.flatnonzero(scan.classes == VEHICLE)
+    for kept, found in ((14, False), (15, True)):
+        classes = scan.classes.copy()
+        classes[members[kept:]] = SemanticClass.OTHER
+        assert (VEHICLE in find_boundaries(replace(scan, classes=classes), [VEHICLE])) == found
 
 
 def test_objects_by_instance_and_by_place() -> None:

@@ -22,8 +22,8 @@ from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
-from sst_graph.hand_eye.initialization import MotionStartConfig, motion_starts
-from sst_graph.hand_eye.solution import MotionConfig, MotionSolution, alternative, difference, solve_motion
+from sst_graph.hand_eye.initialization import motion_starts
+from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.features import Tracks as ImageTracks
 from sst_graph.odometry.relative import DirectionMotion
@@ -96,7 +96,7 @@ def error_of(solution: MotionSolution) -> np.ndarray:
 
 @pytest.mark.parametrize("guess", [None, off(20.0)])
 def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
-    solution = solve_motion([made_drive(weaving, noise=0.0)], guess, 0.0, MotionConfig())[0]
+    solution = solve_motion([made_drive(weaving, noise=0.0)], guess, 0.0)[0]
     error = error_of(solution)
     assert solution.converged
     assert np.degrees(np.linalg.norm(error[:3])) < 0.1
@@ -106,7 +106,7 @@ def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
 
 def test_covariance_fits_the_errors() -> None:
     """NEES of rotation and offset over drives whose noise is as modelled."""
-    config = MotionConfig(start=MotionStartConfig(max_offset_s=0.06))
+    config = 0.06
     nees = []
     for seed in range(10):
         solution = solve_motion([made_drive(weaving, 40, seed)], off(5.0), 0.1, config)[0]
@@ -120,7 +120,7 @@ def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
     """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
     nees, some = [], [0, 1, 2, 6]
     for seed in range(10):
-        solution = solve_motion([made_drive(weaving, 12, seed)], TRUE, OFFSET_S, MotionConfig())[0]
+        solution = solve_motion([made_drive(weaving, 12, seed)], TRUE, OFFSET_S)[0]
         error = error_of(solution)
         nees.append(error[some] @ np.linalg.solve(solution.covariance[np.ix_(some, some)], error[some]))
     assert 0.45 < np.mean(nees) / len(some) < 1.6
@@ -142,10 +142,7 @@ def test_a_straight_road_leaves_the_roll_and_the_offset_open() -> None:
 
 def test_noise_is_no_turning() -> None:
     """On a straight road the LiDAR's noise alone must tell no offset, wherever between stamps it falls."""
-    found = [
-        solve_motion([made_drive(straight, seed=seed)], TRUE, OFFSET_S, MotionConfig())[0]
-        for seed in range(2)
-    ]
+    found = [solve_motion([made_drive(straight, seed=seed)], TRUE, OFFSET_S)[0] for seed in range(2)]
     assert min(np.sqrt(s.covariance[6, 6]) for s in found) > 0.03
 
 
@@ -163,7 +160,7 @@ def test_too_few_frames() -> None:
 
 def test_two_drives_are_better_than_one() -> None:
     one, two = made_drive(weaving, seed=1), made_drive(weaving, seed=2)
-    alone, both = (solve_motion(drives, TRUE, 0.1, MotionConfig())[0] for drives in ([one], [one, two]))
+    alone, both = (solve_motion(drives, TRUE, 0.1)[0] for drives in ([one], [one, two]))
     assert len(both.terms) == 2 * len(alone.terms)
     assert both.covariance[6, 6] < 0.8 * alone.covariance[6, 6]
 
@@ -179,7 +176,7 @@ def test_outliers_count_little() -> None:
         )
         pairs[k] = dataclasses.replace(pairs[k], direction=motion)
     spoilt = dataclasses.replace(drive, image_pairs=tuple(pairs))
-    error = error_of(solve_motion([spoilt], None, 0.0, MotionConfig())[0])
+    error = error_of(solve_motion([spoilt], None, 0.0)[0])
     assert np.degrees(np.linalg.norm(error[:3])) < 0.3 and abs(error[6]) < 3e-3
 
 
@@ -198,7 +195,7 @@ def test_noise_scales_follow_the_residuals() -> None:
 
 def test_start_without_a_guess() -> None:
     drive = made_drive(weaving)
-    starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), None, 0.0, MotionStartConfig())
+    starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), None, 0.0)
     best = starts[0]
     assert abs(best.offset_s - OFFSET_S) <= 0.02
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.cRl.between(TRUE.rotation())))) < 2.0
@@ -206,7 +203,7 @@ def test_start_without_a_guess() -> None:
 
 
 def test_an_alternative_is_another_solution_that_fits_alike() -> None:
-    best = solve_motion([made_drive(weaving)], TRUE, OFFSET_S, MotionConfig())[0]
+    best = solve_motion([made_drive(weaving)], TRUE, OFFSET_S)[0]
     elsewhere = dataclasses.replace(
         best, state=State(best.state.cTl, (OFFSET_S - 0.1,)), cost=best.cost + 1.0
     )
@@ -265,7 +262,7 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
 def test_the_joint_method_hears_the_motion(street: Path) -> None:
     source = open_source(street, frames="0:12")
     # Labels that tell the offset to 11 ms, not to 3: the motion alone tells it to 32 ms.
-    weak = ["start.enabled=false", "joint.graph.match.side_sigma_px=10"]
+    weak = ["search.enabled=false", "noise.side_sigma_px=10"]
     settings = with_overrides(CalibrationConfig(), weak)
     deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))
     hearing = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="always"))

@@ -51,7 +51,7 @@ def left_edge(u: float, turned: bool = False) -> tuple[Drive, GraphConfig]:
     points = Boundaries(lPs, lPs + outward, np.full(20, 0.01), np.zeros(20), zeros.astype(np.uint8), zeros)
     scan = scan_of(0, {VEHICLE: points})
     image = ImageFeatures(0, 0, mask, {VEHICLE: contour})
-    config = GraphConfig(match=MatchConfig(side_sigma_px=1e-3))
+    config = GraphConfig(side_sigma_px=1e-3)
     return Drive("edge", CAMERA, (scan,), (image,), (), ()), config
 
 
@@ -151,7 +151,9 @@ def test_normal_equations_are_the_graphs(scale_px: float) -> None:
         H, g = A.T @ found.H[0] @ A, A.T @ found.g[0]
         # Without the weak priors: their means are the state.
         prior = [1.0, 1.0, 1.0, *[PRIOR_TRANSLATION_SIGMA_M**-2.0] * 3]
-        expected = system.H - np.diag([*prior, graph.time_offset_sigma_s**-2.0, graph.bias_sigma_px**-2.0])
+        expected = system.H - np.diag(
+            [*prior, graph.time_offset_sigma_s**-2.0, graph.mask_bias_sigma_px**-2.0]
+        )
         some = np.ix_([*range(6), 7], [*range(6), 7])
         assert np.abs(expected[some]).max() > 1.0
         np.testing.assert_allclose(H[some], expected[some], atol=2e-3 * np.abs(expected[some]).max())

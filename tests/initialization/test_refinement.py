@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 from streets import prepared_street, standing_street
 
-from sst_graph.drive.preparation import Drive, PictureConfig, PrepareConfig, prepare_drive
+from sst_graph.drive.preparation import Drive, PrepareConfig, prepare_drive
 from sst_graph.graph.building import GraphConfig, Tracks
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, solve_joint
@@ -47,7 +47,7 @@ def around(*degrees: tuple[float, float, float]) -> Poses:
 
 def test_starts_lead_to_the_graphs_solution() -> None:
     """Contours as the masks have them."""
-    config = PrepareConfig(use_visual_odometry=False, picture=PictureConfig(use=False))
+    config = PrepareConfig(use_visual_odometry=False, image_edges=False)
     drive = prepare_drive(standing_street(), [SemanticClass.VEHICLE], config)
     start = around((-2.0, 1.0, -1.0), (1.0, 1.0, 0.5), (0.0, 0.0, 0.0))
     poses = refined(drive, start)

@@ -25,8 +25,8 @@ from sst_graph.graph.outer_loop import (
     support,
 )
 from sst_graph.graph.state import State
-from sst_graph.initialization.candidates import StartConfig, StartProblem, label_score_steps
-from sst_graph.initialization.global_search import Candidate
+from sst_graph.initialization.candidates import StartProblem, label_score_steps
+from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import Poses
 from sst_graph.initialization.selection import (
@@ -43,7 +43,7 @@ from sst_graph.stepwise import whole
 from sst_graph.types import SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
-JOINT, START = JointConfig(), StartConfig()
+JOINT, START = JointConfig(), SearchConfig()
 
 
 def start_problem(guess: gtsam.Pose3 | None, offset_s: float = 0.0) -> StartProblem:
@@ -121,7 +121,7 @@ def test_the_right_one_of_three_is_selected() -> None:
     candidates = [
         Candidate(turned(*a), 0.0, 1.0) for a in ((25.0, 0.0, 0.0), (0.0, 1.0, 2.0), (0.0, -30.0, 0.0))
     ]
-    selection = whole(select_among_steps(start_problem(truth()), candidates, JOINT.graph, START.search))
+    selection = whole(select_among_steps(start_problem(truth()), candidates, JOINT.graph, START))
     assert off_deg(selection.starts[0][0]) < 1.0
     assert len(selection.starts) <= 3
 
@@ -130,7 +130,7 @@ def test_a_pose_far_from_the_guess_is_no_answer() -> None:
     candidates = [Candidate(turned(0.0, 1.0, 2.0), 0.0, 1.0)]
     far = gtsam.Pose3(truth().rotation(), truth().translation() + np.array([0.0, 0.9, 0.0]))
     with pytest.raises(EstimationError, match="near the guess"):
-        whole(select_among_steps(start_problem(far), candidates, JOINT.graph, START.search))
+        whole(select_among_steps(start_problem(far), candidates, JOINT.graph, START))
 
 
 @pytest.mark.parametrize("guess", [True, False])
@@ -161,5 +161,5 @@ def test_labels_tell_a_pose_that_shows_none_of_the_vehicles() -> None:
         np.stack([cTl.translation() for cTl in poses]),
         np.zeros(3),
     )
-    scores = whole(label_score_steps(start_problem(None), states, START.search))
+    scores = whole(label_score_steps(start_problem(None), states, START))
     assert scores[0] > 1.5 * scores[1] and scores[0] > 1.5 * scores[2] and scores[0] > 5.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from streets import tracker_from_truth
+from streets import saved_tracker
 
 from sst_graph import Tracker
 from sst_graph.errors import DataError
@@ -95,14 +95,11 @@ def _changed(rng: Rng, data: Scan | CameraImage, stamp_ns: int) -> Any:
 
 
 @pytest.fixture(scope="module")
-def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Checkpoint of a tracker that has an estimate, after 14 frames."""
-    tracker = tracker_from_truth(street)
-    for frame in frames[:14]:
-        tracker.add(frame)
-    assert tracker.estimate.exists
     path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
-    tracker.save(path)
+    path.write_bytes(saved_tracker(14))
+    assert Tracker.load(path).estimate.exists
     return path
 
 

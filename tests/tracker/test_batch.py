@@ -7,6 +7,7 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.batch.lower_edges import with_lower_edges
@@ -17,14 +18,14 @@ from sst_graph.graph.outer_loop import KERNELS_PX, JointProblem, solve_joint
 from sst_graph.graph.state import State, lower_edge_track
 from sst_graph.objects.dynamic_objects import find_dynamic_objects
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 
 @pytest.mark.parametrize("by_object", [True, False])
 def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     """With a mask bias for each object and moving cars left out, and with one bias a class."""
-    street = simulate(
+    street = simulated(
         SimulationConfig(
             seed=5,
             frames=30,
@@ -39,11 +40,10 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
         )
     )
     default = TrackerConfig(start_scans=10)
-    search = dataclasses.replace(default.calibration.start, enabled=False)
-    joint = default.calibration.joint
-    graph = joint.graph if by_object else dataclasses.replace(joint.graph, object_bias_sigma_px=0.0)
-    joint = dataclasses.replace(joint, graph=graph)
-    calibration = dataclasses.replace(default.calibration, start=search, joint=joint)
+    search = dataclasses.replace(default.calibration.search, enabled=False)
+    noise = default.calibration.noise
+    noise = noise if by_object else dataclasses.replace(noise, object_bias_sigma_px=0.0)
+    calibration = dataclasses.replace(default.calibration, search=search, noise=noise)
     config = dataclasses.replace(default, calibration=calibration)
     tracker = Tracker(street.camera, config, street.truth.cTl, 0.04)
     tracker.initializer.work_per_frame = None

@@ -7,9 +7,10 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
+from stored import simulated
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.sums.linearized_pair import linearize_pair
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.pending_pairs import MOST, OtherPairing, PendingPairs
@@ -99,7 +100,7 @@ def test_few_are_kept_and_none_that_would_break_the_past() -> None:
 @pytest.fixture(scope="module")
 def tracker() -> Tracker:
     """At an offset of half an image period, every scan lies between two images."""
-    street = simulate(
+    street = simulated(
         SimulationConfig(
             seed=3,
             frames=24,
@@ -113,8 +114,8 @@ def tracker() -> Tracker:
         )
     )
     default = TrackerConfig(start_scans=8, window=10)
-    start = dataclasses.replace(default.calibration.start, enabled=False)
-    calibration = dataclasses.replace(default.calibration, start=start)
+    search = dataclasses.replace(default.calibration.search, enabled=False)
+    calibration = dataclasses.replace(default.calibration, search=search)
     tracker = Tracker(
         street.camera, dataclasses.replace(default, calibration=calibration), street.truth.cTl, 0.05
     )

@@ -2,39 +2,39 @@
 
 from __future__ import annotations
 
-import dataclasses
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from streets import TRACKED_STREET, sigmas_apart, tracker_from_truth
+from stored import simulated, stored
+from streets import TRACKED_STREET, checkpoint_of, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker, TrackerConfig
-from sst_graph.simulator import SimulatedDrive, simulate
 from sst_graph.tracker.window.relinearization import SCANS
 from sst_graph.types import Frame
 
-
-@cache
-def _street() -> SimulatedDrive:
-    return simulate(dataclasses.replace(TRACKED_STREET, frames=40))
+CONFIG = TrackerConfig(start_scans=8, window=18)
 
 
-@pytest.fixture(scope="module")
-def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
-    """Checkpoint of a tracker one frame into a relinearization of its window, and the frames to come."""
-    street, config = _street(), TrackerConfig(start_scans=8, window=18)
-    tracker = tracker_from_truth(street, config)
-    frames = list(street)
-    for k, frame in enumerate(frames):
+def _begun() -> tuple[bytes, int]:
+    """Checkpoint of a tracker one frame into a relinearization of its window, and the frames it has seen."""
+    street = simulated(TRACKED_STREET)
+    tracker = tracker_from_truth(street, CONFIG)
+    for k, frame in enumerate(street):
         under_way = tracker.estimate.relinearization is not None
         tracker.add(frame)
         if under_way and tracker.estimate.relinearization is not None:
-            path = tmp_path_factory.mktemp("tracker") / "settling.npz"
-            tracker.save(path)
-            return path, frames[k + 1 :]
+            return checkpoint_of(tracker), k + 1
     raise AssertionError("the window is not relinearized")
+
+
+@pytest.fixture(scope="module")
+def begun(frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
+    """The checkpoint, and the frames to come."""
+    content, seen = stored(("begun", TRACKED_STREET, CONFIG), _begun)
+    path = tmp_path_factory.mktemp("tracker") / "settling.npz"
+    path.write_bytes(content)
+    return path, frames[seen:]
 
 
 def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]]) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from streets import EARLY_START, sigmas_apart, tracker_from_truth
+from streets import EARLY_START, saved_tracker, sigmas_apart, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.covariance.cluster_robust import robust_covariance
@@ -24,14 +24,11 @@ from sst_graph.types import Frame
 
 
 @pytest.fixture(scope="module")
-def running(street: SimulatedDrive, frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def running(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Checkpoint of a tracker after 20 frames."""
-    tracker = tracker_from_truth(street)
-    for frame in frames[:20]:
-        tracker.add(frame)
-    assert tracker.estimate.exists
     path = tmp_path_factory.mktemp("tracker") / "tracker.npz"
-    tracker.save(path)
+    path.write_bytes(saved_tracker(20))
+    assert Tracker.load(path).estimate.exists
     return path
 
 
@@ -48,11 +45,9 @@ def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[
     )  # chi-square of 7: 24
 
 
-def test_the_covariance_is_the_batch_s(street: SimulatedDrive, frames: list[Frame]) -> None:
+def test_the_covariance_is_the_batch_s(running: Path) -> None:
     """Of the same matches: those towards the ground included, where the tracker makes any."""
-    tracker = tracker_from_truth(street)
-    for frame in frames[:20]:
-        tracker.add(frame)
+    tracker = Tracker.load(running)
     tracker.optimize()
     drive, _ = tracker.inputs.window.drive()
     state, config = tracker.estimate.point.state(tracker.matcher.classes), tracker.matcher.graph

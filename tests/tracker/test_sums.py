@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from stored import simulated
 
 from sst_graph.covariance.cluster_robust import (
     RobustCovariance,
@@ -18,7 +19,7 @@ from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph
 from sst_graph.graph.linear import unit_scale
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Point
@@ -30,7 +31,7 @@ VEHICLE, CONFIG, OFFSET_S = SemanticClass.VEHICLE, GraphConfig(), 0.03
 @pytest.fixture(scope="module")
 def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
     """The batch's covariance of six frames at the truth, and the same frames as a tracker linearizes them."""
-    street = simulate(
+    street = simulated(
         SimulationConfig(
             seed=4,
             frames=6,

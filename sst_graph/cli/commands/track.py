@@ -125,7 +125,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     if not (args.resume and args.checkpoint.exists()):
         initial, offset_s = starting_point(args.init or "dataset", source, args.camera)
         tracker = Tracker(source.camera, config, initial, offset_s)
-        swept = with_sweep(source, config.calibration.sweep.decide)
+        swept = with_sweep(source, config.calibration.decide_sweep)
         return tracker, swept, iter(swept)
     tracker = Tracker.load(args.checkpoint)
     made = tracker.setup
@@ -135,7 +135,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     # What is not asked for is the checkpoint's.
     asked = settings(made.config, args, flags)
     check_setup(tracker, Setup(source.camera, asked, initial, offset_s), args.checkpoint)
-    swept = with_sweep(source, made.config.calibration.sweep.decide)
+    swept = with_sweep(source, made.config.calibration.decide_sweep)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 
 

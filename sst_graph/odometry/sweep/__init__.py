@@ -6,7 +6,6 @@ from __future__ import annotations
 from sst_graph.odometry.sweep.decision import (
     FRACTIONS,
     REMEDY,
-    SweepConfig,
     SweepDecision,
     SweepKind,
     decide_sweep,
@@ -18,7 +17,6 @@ __all__ = [
     "FRACTIONS",
     "REMEDY",
     "SWEEP_KEY",
-    "SweepConfig",
     "SweepDecision",
     "SweepKind",
     "SweepStamp",

@@ -9,7 +9,6 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.sweep.estimate import Estimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
@@ -55,17 +54,6 @@ _LONG_SWEEP_M = 1.0
 hypotheses are tried as starts [m]."""
 _MIN_EXPECTED = 0.5
 """Share of the evidence needed below which no more windows are registered."""
-
-
-@dataclass(frozen=True)
-class SweepConfig(Settings):
-    """Scans without times of their points."""
-
-    decide: bool = setting(
-        True,
-        doc="Decide from the scans whether points without times are compensated for the sweep. Set to"
-        " false where they are known to be.",
-    )
 
 
 @dataclass(frozen=True)

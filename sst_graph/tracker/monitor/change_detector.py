@@ -108,7 +108,7 @@ class ChangeDetector:
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig) -> None:
         self.matcher, self.config = matcher, config.alarm
-        sigma_px = config.calibration.joint.graph.object_bias_sigma_px
+        sigma_px = config.calibration.noise.object_bias_sigma_px
         self.statistic = ChangeStatistic(config.alarm.chi2, sigma_px)
         self.start_threshold, self.warm_up_scans = _START_CHI2, _WARM_UP_SCANS
         self.max_pending = _MAX_PENDING_FRAMES

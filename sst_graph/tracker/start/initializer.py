@@ -157,7 +157,7 @@ class InitialGraph:
 
     def __init__(self, point: Point, chosen: Sequence[int], config: TrackerConfig) -> None:
         self.point, self.chosen, self.waiting = point, tuple(chosen), tuple(chosen)
-        self.support = None if config.calibration.lower_edges.use == "never" else LowerEdgeSupport()
+        self.support = None if config.calibration.lower_edges == "never" else LowerEdgeSupport()
         self.found: dict[int, MatchedPair] = {}
 
     def advance(self, matcher: WindowMatcher, work: int | None) -> bool:
@@ -288,7 +288,7 @@ class Initializer:
         while not initial.advance(matcher, work):
             if work is not None:
                 return None
-        graph, point = config.calibration.joint.graph, initial.point
+        graph, point = config.calibration.noise, initial.point
         prior = prior_gaussian(point, self.guess, matcher.classes, graph)
         found = {scan: one for scan, one in initial.found.items() if scan >= window.first_scan}
         stamps = window.stamps_ns()

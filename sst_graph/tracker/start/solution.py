@@ -102,7 +102,7 @@ def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> S
             explains the labels less well than another that did not converge.
     """
     searched = guess.search or guess.cTl is None
-    reach = config.calibration.start.search.time_offset_s if guess.search else 0.0
+    reach = config.calibration.search.time_offset_s if guess.search else 0.0
     # 1. Candidates, with time offsets around the guess's.
     starts = yield from _starts(drive, guess, config, reach)
     # 2. Their poses with the guess's time offset; then as they are.
@@ -194,12 +194,11 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
         EstimationError: nothing to search for, or no guess and no search.
     """
     calibration = config.calibration
-    search = dataclasses.replace(calibration.start.search, time_offset_s=reach_s)
     enabled = guess.search or guess.cTl is None
-    start = dataclasses.replace(calibration.start, search=search, enabled=enabled)
+    search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
     problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s)
-    selection = yield from select_start_steps(problem, joint.graph, start)
+    selection = yield from select_start_steps(problem, joint.graph, search)
     return [State(cTl, (offset_s,)) for cTl, offset_s in selection.starts]
 
 
@@ -219,7 +218,7 @@ def _solution(
     solution = yield from solve_joint_steps(problem, start, kernels_px)
     state = solution.state
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
-    names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
+    names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
     parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
     cTl, offset_s = state.cTl, state.offset_s(0)
     point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
@@ -252,7 +251,7 @@ def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, conf
     ]
     if pairs < _LEAST_PAIRS_SHARE * len(seen):
         raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
-    reach = config.calibration.start.search.time_offset_s
+    reach = config.calibration.search.time_offset_s
     if abs(offset_s - start_s) > reach:
         raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
 
@@ -268,7 +267,7 @@ def prior_gaussian(
     estimated = dict(named_sigmas(config.estimate))
     sigmas = [PRIOR_ROTATION_SIGMA_RAD] * 3 + [PRIOR_TRANSLATION_SIGMA_M] * 3 + [config.time_offset_sigma_s]
     k = len(classes)
-    sigmas += [config.bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
+    sigmas += [config.mask_bias_sigma_px] * k + [np.inf] * k + [estimated[name] for name in point.names]
     information = np.diag(1.0 / np.square(sigmas))
     tie, biases = LOWER_EDGE_BIAS_SIGMA_PX**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
     information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])

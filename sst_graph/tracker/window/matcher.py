@@ -39,7 +39,7 @@ class WindowMatcher:
         self.window = window
         self.config = config
         self.classes = config.calibration.classes
-        self.graph = config.calibration.joint.graph
+        self.graph = config.calibration.noise
         self.held_names = held_at_zero(self.graph.estimate)
         self.kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
         self._twists: tuple[int, Tracks] | None = None
@@ -52,7 +52,7 @@ class WindowMatcher:
 
     def check_lower_edges(self, point: Point) -> None:
         """Match lower edges from now on, of classes whose labels agree about them."""
-        if self.config.calibration.lower_edges.use != "never":
+        if self.config.calibration.lower_edges != "never":
             self.set_lower_edges(self.lower_edge_support(point, None))
 
     def lower_edge_support(self, point: Point, chosen: Collection[int] | None) -> LowerEdgeSupport:
@@ -64,7 +64,7 @@ class WindowMatcher:
     def set_lower_edges(self, support: LowerEdgeSupport) -> None:
         """Match lower edges from now on, of classes whose labels agree by this support."""
         chosen, _ = support.agreed(self.config.calibration.lower_edges)
-        self.graph = replace(self.config.calibration.joint.graph, lower_edges=chosen)
+        self.graph = replace(self.config.calibration.noise, lower_edges=chosen)
 
     def match(
         self,

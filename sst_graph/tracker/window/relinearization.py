@@ -119,7 +119,7 @@ class WindowRelinearization:
     def __init__(self, matcher: WindowMatcher) -> None:
         self._matcher = matcher
         self.passes = _PASSES
-        never = matcher.config.calibration.lower_edges.use == "never"
+        never = matcher.config.calibration.lower_edges == "never"
         self.below = None if never else LowerEdgeSupport()
         self.done: set[int] = set()
 
