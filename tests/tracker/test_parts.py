@@ -83,8 +83,7 @@ def test_error_model_of_simulated_sides() -> None:
             sides += [side] * 12
             frames += [frame] * 12
     r, ones = np.concatenate(residuals), np.ones(len(sides))
-    moved = np.ones(len(sides), np.bool_)
-    model = fit_error_model(SideResiduals.of(r, ones, np.array(sides), np.array(frames), moved))
+    model = fit_error_model(SideResiduals.of(r, ones, np.array(sides), np.array(frames)))
     found = np.sqrt([model.side, model.side_frame, model.match])
     np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)  # floors: 0.36, 0.32
 
@@ -95,7 +94,7 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     which = np.repeat(np.arange(4), 50)
     r = -J @ truth + rng.standard_normal(200) + 0.5 * rng.standard_normal(4)[which]
     ones, still = np.ones(200), np.zeros(200, np.intp)
-    residuals = SideResiduals.of(r, ones, side + which, still, np.ones(200, np.bool_))
+    residuals = SideResiduals.of(r, ones, side + which, still)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     information = Gaussian(point, J.T @ J, -J.T @ r)
     scores = ScoreSums.of_frame(J, ones, side + which)
