@@ -186,8 +186,7 @@ class OnlineEstimate:
         chosen = scans_to_match(
             scan, self.matcher, smoother, self.entered, self.covariance, self.relinearization
         )
-        sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
-        found, missing = self.matcher.match(smoother.point, chosen, None, self._share, sigma_s)
+        found, missing = self.matcher.match(smoother.point, chosen, None, self._share)
         waiting = [n for n in chosen if n not in smoother.entries and n not in self.entered]
         return FrameMatches(scan, frozenset(chosen), found, frozenset(missing), tuple(waiting))
 
