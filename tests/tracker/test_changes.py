@@ -221,13 +221,12 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
 ) -> None:
     """All that is in view moves from then on: no alarm can be raised, and the status says so."""
     tracker, ages = _sure_tracker(street), []
+    window = tracker.inputs.window
     for frame in frames:
         assert frame.image is not None
         image = frame.image
         if frame.index == STEP:
-            monkeypatch.setattr(
-                tracker.inputs.window, "recently_moving", lambda: set(tracker.inputs.window.objects.live)
-            )
+            monkeypatch.setattr(window.dynamics, "recently_moving", lambda: set(window.objects.live))
         if frame.index >= STEP:
             image = knocked(image, street, 1.5)
         update = tracker.add(dataclasses.replace(frame, image=image))
