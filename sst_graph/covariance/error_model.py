@@ -17,23 +17,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.association.edge_matching import SIDES
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-BoolArray = NDArray[np.bool_]
 
-_SIDE, _VIEW, _SIDE_FRAME = 0.17, 0.42, 0.17
-"""Least variances as shares of a match's own: of a side for good, of a side while it is seen from one place
-(beams and mask are then the same in every frame), of a side in one frame.
+_SIDE, _SIDE_FRAME = 0.17, 0.17
+"""Least variances as shares of a match's own: of a side over all frames, of a side in one frame.
 
 The mask biases of the objects are fitted to the same residuals and swallow most of what a side has in
 common, so the residuals alone would make a short drive far too sure. Where contours are rough within a
 side, they are rough as a whole too: hence shares."""
 _LEAST_MATCH = 0.05
 """Least variance of a match's own error: residuals that are all but zero are a simulation's."""
-_LEAST_FREEDOM = 0.25
-"""Least share of the sides' spread that is taken to be left."""
 
 
 @dataclass(frozen=True)
@@ -50,11 +44,10 @@ class SideResiduals:
     """Whitened residuals, summed over the matches of one side of an object in one frame; k such sums.
 
     Attributes:
-        sides: (k,) number of the side, the same in all frames; ``side // SIDES`` is its object.
+        sides: (k,) number of the side, the same in all frames.
         means: (k,) weighted mean.
         weights, weights2: (k,) sums of the weights and of their squares.
         within: (k,) weighted sum of squares around the mean.
-        moved: (k,) whether the LiDAR moved: frames that see a side at standstill are one view.
     """
 
     sides: IntArray
@@ -62,13 +55,10 @@ class SideResiduals:
     weights: FloatArray
     weights2: FloatArray
     within: FloatArray
-    moved: BoolArray
 
     @classmethod
-    def of(
-        cls, r: FloatArray, weights: FloatArray, sides: IntArray, frames: IntArray, moved: BoolArray
-    ) -> SideResiduals:
-        """From residuals, weights, sides, numbers of the frames, and whether the LiDAR moved, all (m,)."""
+    def of(cls, r: FloatArray, weights: FloatArray, sides: IntArray, frames: IntArray) -> SideResiduals:
+        """From residuals, weights, sides and numbers of the frames, all (m,)."""
         first, which = by_side_and_frame(sides, frames)
         total, squares, sums = (
             np.asarray(np.bincount(which, values, len(first)), np.float64)
@@ -76,12 +66,12 @@ class SideResiduals:
         )
         means = sums / np.maximum(total, 1e-12)
         within = np.bincount(which, weights * (r - means[which]) ** 2, len(first))
-        return cls(sides[first], means, total, squares, np.asarray(within, np.float64), moved[first])
+        return cls(sides[first], means, total, squares, np.asarray(within, np.float64))
 
     @classmethod
     def joined(cls, parts: Sequence[SideResiduals]) -> SideResiduals:
         """Those of different frames."""
-        names = ("sides", "means", "weights", "weights2", "within", "moved")
+        names = ("sides", "means", "weights", "weights2", "within")
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
@@ -94,12 +84,8 @@ def by_side_and_frame(sides: IntArray, frames: IntArray) -> tuple[IntArray, IntA
     return first, which.reshape(-1)
 
 
-def fit_error_model(residuals: SideResiduals, views: float | None = None) -> ErrorModel:
-    """The three variances by moments of weighted means, each with a floor.
-
-    Args:
-        views: from how many places a side was seen; by default :func:`effective_views`.
-    """
+def fit_error_model(residuals: SideResiduals) -> ErrorModel:
+    """The three variances by moments of weighted means, each with a floor."""
     means, weights, weights2 = residuals.means, residuals.weights, residuals.weights2
     names, sides = np.unique(residuals.sides, return_inverse=True)
     sides = sides.reshape(-1)
@@ -111,39 +97,12 @@ def fit_error_model(residuals: SideResiduals, views: float | None = None) -> Err
     v = 1.0 / (match / count + side_frame)
     side_means, total, _ = _means(means, v, sides)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(names), dtype=np.intp), centre=0.0)
-    side /= freedom_of_sides(len(names), len(np.unique(names // SIDES)))
-    views = effective_views(sides, weights, residuals.moved) if views is None else views
-    return with_floors(side, side_frame, match, views)
+    return with_floors(side, side_frame, match)
 
 
-def with_floors(side: float, side_frame: float, match: float, views: float) -> ErrorModel:
-    """The error model with each variance at its least or above; sides were seen from so many places."""
-    least = (_SIDE + _VIEW / max(views, 1.0)) * match
-    return ErrorModel(max(side, least), max(side_frame, _SIDE_FRAME * match), match)
-
-
-def effective_views(sides: IntArray, weights: FloatArray, moved: BoolArray) -> float:
-    """(sum of weights)^2 / sum of squared weights of the views of a side, averaged over sides by weight
-    (harmonic mean).
-
-    Args:
-        sides, weights, moved: (k,) number of the side from 0 on, weight, and whether the LiDAR moved, of each
-            side in each frame. All frames at standstill are one view.
-    """
-    count = int(sides.max()) + 1 if len(sides) else 0
-    at_rest = np.bincount(sides, np.where(moved, 0.0, weights), count)
-    squares = np.bincount(sides, np.where(moved, weights**2, 0.0), count) + at_rest**2
-    total = np.bincount(sides, weights, count)
-    alone = squares / np.maximum(total, 1e-12) ** 2
-    return float(total.sum() / max(float((total * alone).sum()), 1e-12))
-
-
-def freedom_of_sides(sides: int, objects: int) -> float:
-    """Share of the variance of sides that is left in their residuals.
-
-    The pose and a mask bias of each object are fitted to the same sides and swallow the rest.
-    """
-    return max((sides - objects - 6) / max(sides, 1), _LEAST_FREEDOM)
+def with_floors(side: float, side_frame: float, match: float) -> ErrorModel:
+    """The error model with each variance at its least or above."""
+    return ErrorModel(max(side, _SIDE * match), max(side_frame, _SIDE_FRAME * match), match)
 
 
 def spread_beyond(

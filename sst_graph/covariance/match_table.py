@@ -41,7 +41,6 @@ class MatchTable:
         r: (m,) whitened residuals, unweighted.
         sides: (m,) number of the object's side, the same in all frames; ``sides // SIDES`` is its object.
         frames: (m,) number of the frame.
-        moved: (m,) whether the LiDAR moved.
     """
 
     J: csr_array
@@ -50,7 +49,6 @@ class MatchTable:
     r: FloatArray
     sides: IntArray
     frames: IntArray
-    moved: NDArray[np.bool_]
 
     @cached_property
     def objects(self) -> IntArray:
@@ -59,7 +57,7 @@ class MatchTable:
 
     def take(self, index: IntArray) -> MatchTable:
         """Some of the matches, by position."""
-        names = ("J", "root_weights", "curvatures", "r", "sides", "frames", "moved")
+        names = ("J", "root_weights", "curvatures", "r", "sides", "frames")
         return MatchTable(*(getattr(self, name)[index] for name in names))
 
     def after(self, step: FloatArray) -> MatchTable:
@@ -75,7 +73,7 @@ class MatchTable:
     @property
     def residuals(self) -> SideResiduals:
         """Their residuals by side and frame."""
-        return SideResiduals.of(self.r, self.root_weights**2, self.sides, self.frames, self.moved)
+        return SideResiduals.of(self.r, self.root_weights**2, self.sides, self.frames)
 
     @property
     def weight_curvature_ratio(self) -> float:
@@ -119,7 +117,6 @@ def match_table(
         np.concatenate(residuals),
         np.concatenate(sides),
         np.repeat(np.arange(len(pairs)), counts),
-        np.repeat(np.array([pair.moved for pair in pairs]), counts),
     )
 
 

@@ -137,11 +137,6 @@ class PairMatches:
             found[c] = (names.tolist(), groups.reshape(-1))
         return found
 
-    @property
-    def moved(self) -> bool:
-        """Whether the LiDAR is known to move at the image's instant."""
-        return self.l_twist is not None and bool(self.l_twist.twist.any())
-
 
 class Tracks:
     """Twist tracks of all drives, and tracks of their objects where those are given; made once."""

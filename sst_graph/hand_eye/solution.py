@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sst_graph.drive.path import SensorPath
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
+from sst_graph.graph.convergence import STEP_SIGMAS, step_share
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (
@@ -44,11 +45,6 @@ _MAX_OUTER = 20
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 _FIRST_OUTER = 4
 """Outer iterations from every start, before the best of them go on."""
-_FULL_STEPS = 6
-"""Outer steps after which ever smaller parts of each are made: robust weights and the LiDAR's motion at the
-new offset may alternate for ever."""
-_STEP_SIGMAS = 0.1
-"""An outer step shorter than this many standard deviations ends the outer loop."""
 _INNER_ITERATIONS = 10
 """Most Levenberg-Marquardt iterations on frozen motions: the next outer iteration goes on from there."""
 ALTERNATIVE_CHI2 = 9.0
@@ -173,12 +169,12 @@ def _solve(
         graph = hand_eye_graph(terms, centre)
         values = _optimise(graph, state_values(state))
         covariance = hand_eye_covariance(graph, values, terms)
-        # 3. Move; stop when the step is small.
+        # 3. Move, by less and less of the step where robust weights and the LiDAR's motion at the new offset
+        # alternate; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
-        step = difference(state, moved)
-        step /= 1 + max(0, outer - _FULL_STEPS)
+        step = step_share(outer) * difference(state, moved)
         state = State(state.cTl.retract(step[:6]), (state.offsets_s[0] + float(step[6]),))
-        converged = float(step @ np.linalg.solve(covariance, step)) < _STEP_SIGMAS**2
+        converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
 

@@ -190,10 +190,7 @@ def fit_errors(rows: Sequence[TermRows], config: RematchConfig) -> ErrorModel:
         return least
     precisions = joined.weights / joined.sigmas_px**2
     image = np.repeat(np.arange(len(rows)), [len(each) for each in rows])
-    moved = np.ones(len(joined), np.bool_)
-    residuals = SideResiduals.of(joined.r, precisions, joined.sides, image, moved)
-    # The least error of a side, below, is in pixels: views do not matter to it.
-    model = fit_error_model(residuals, np.inf)
+    model = fit_error_model(SideResiduals.of(joined.r, precisions, joined.sides, image))
     of_claimed = float((precisions / joined.sigmas_px**2).sum()) / max(float(precisions.sum()), 1e-300)
     match = max(model.match * of_claimed, least.match)
     if config.side_sigma_px == 0.0:  # what sides have in common is not wanted

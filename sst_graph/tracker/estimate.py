@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.covariance.considered import Considered, considered
 from sst_graph.errors import EstimationError
-from sst_graph.graph.convergence import FULL_STEPS
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.config import TrackerConfig
@@ -187,8 +186,7 @@ class OnlineEstimate:
         chosen = scans_to_match(
             scan, self.matcher, smoother, self.entered, self.covariance, self.relinearization
         )
-        sigma_s = 0.0 if self.config.drift.enabled else float(np.sqrt(self.covariance[6, 6]))
-        found, missing = self.matcher.match(smoother.point, chosen, None, self._share, sigma_s)
+        found, missing = self.matcher.match(smoother.point, chosen, None, self._share)
         waiting = [n for n in chosen if n not in smoother.entries and n not in self.entered]
         return FrameMatches(scan, frozenset(chosen), found, frozenset(missing), tuple(waiting))
 
@@ -258,7 +256,7 @@ class OnlineEstimate:
         live = window.objects.live
         try:
             converged = relinearize_window(
-                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, FULL_STEPS, live, self._share
+                smoother, self.matcher, NARROW_KERNELS_PX, max_iterations, live, self._share
             )
             self.uncertainty = Uncertainty.of(smoother)
             self.tests.run(smoother)

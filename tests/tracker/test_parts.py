@@ -72,19 +72,17 @@ def test_gaussians_add_about_one_point() -> None:
 
 
 def test_error_model_of_simulated_sides() -> None:
-    """Known variances of side, side in a frame, and match come back, though a bias an object was fitted."""
+    """Known variances of side, side in a frame, and match come back."""
     rng = np.random.default_rng(0)
     residuals, sides, frames = [], [], []
-    shared = rng.normal(0.0, 0.6, (100, 4))
-    shared = (shared - shared.mean(axis=1, keepdims=True)).ravel()
+    shared = rng.normal(0.0, 0.6, 400)
     for side in range(400):
         for frame in range(8):
             residuals.append(shared[side] + rng.normal(0.0, 0.4) + rng.normal(0.0, 0.9, 12))
             sides += [side] * 12
             frames += [frame] * 12
     r, ones = np.concatenate(residuals), np.ones(len(sides))
-    moved = np.ones(len(sides), np.bool_)
-    model = fit_error_model(SideResiduals.of(r, ones, np.array(sides), np.array(frames), moved))
+    model = fit_error_model(SideResiduals.of(r, ones, np.array(sides), np.array(frames)))
     found = np.sqrt([model.side, model.side_frame, model.match])
     np.testing.assert_allclose(found, [0.6, 0.4, 0.9], rtol=0.1)  # floors: 0.36, 0.32
 
@@ -95,7 +93,7 @@ def _score(rng: np.random.Generator, truth: FloatArray, side: int) -> Linearized
     which = np.repeat(np.arange(4), 50)
     r = -J @ truth + rng.standard_normal(200) + 0.5 * rng.standard_normal(4)[which]
     ones, still = np.ones(200), np.zeros(200, np.intp)
-    residuals = SideResiduals.of(r, ones, side + which, still, np.ones(200, np.bool_))
+    residuals = SideResiduals.of(r, ones, side + which, still)
     point = Point(gtsam.Pose3(), 0.0, np.zeros(2))
     information = Gaussian(point, J.T @ J, -J.T @ r)
     scores = ScoreSums.of_frame(J, ones, side + which)

@@ -122,12 +122,12 @@ def linearize_pair(
     J = J - JV @ gain  # as the estimate follows a residual, the twist following the estimate
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
-    own, frame, moved = roots / np.sqrt(share), np.zeros(len(r), np.intp), np.full(len(r), pair.moved)
+    own, frame = roots / np.sqrt(share), np.zeros(len(r), np.intp)
     return LinearizedPair(
         information,
         observed,
         _with_share(ScoreSums.of_frame(J, roots, side), share),
-        SideResiduals.of(unweighted(r, roots), own**2, side, frame, moved),
+        SideResiduals.of(unweighted(r, roots), own**2, side, frame),
         len(pair),
         places,
         ObjectInformation.of(J[:, :n], r, roots, track, point) if by_object else None,

@@ -14,7 +14,6 @@ from sst_graph.graph.building import PairMatches
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
-from sst_graph.tracker.window.pending_pairs import OtherPairing
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +31,6 @@ class MatchedPair:
         linear: the pair about the point of the matches.
         stamp_ns: of the scan.
         image: number of the image; scans that meet the same one share its twist.
-        other: the scan with its other image, where the pairing is not certain and the scan leaves.
         left_out: dynamic objects, with the tenths of their weight that they lost.
         epoch: number of the calibration it sees, once it is in the graph.
     """
@@ -43,7 +41,6 @@ class MatchedPair:
     linear: LinearizedPair
     stamp_ns: int
     image: int
-    other: OtherPairing | None = None
     left_out: frozenset[tuple[SemanticClass, int, int]] = frozenset()
     epoch: int = 0
 

@@ -22,7 +22,6 @@ from sst_graph.tracker.monitor.adoption import mean_cost
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair, with_share
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
-from sst_graph.tracker.window.pending_pairs import REACH_SIGMAS, OtherPairing
 from sst_graph.tracker.window.window import Window
 from sst_graph.types import SemanticClass
 
@@ -72,14 +71,11 @@ class WindowMatcher:
         chosen: Collection[int] | None,
         kernel: RobustKernel | None = None,
         share: float = 1.0,
-        offset_sigma_s: float = 0.0,
     ) -> tuple[dict[int, MatchedPair], set[int]]:
         """Matches of some scans (None: all) at a point, and the scans that have none.
 
         Args:
             share: factor on the weights of all matches.
-            offset_sigma_s: standard deviation of the time offset; where its image is not certain, the scan
-                that leaves the window next is matched with the other one too [s].
         """
         pairs, numbers = self._pairs(point, chosen, kernel or self.kernel)
         if kernel is None:
@@ -94,34 +90,7 @@ class WindowMatcher:
                 image = self.window.images[pair.pair.image]
                 out = self.left_out(pair, number, point.offset_s)
                 found[number] = MatchedPair(pair, linear, stamps[number], image.index, left_out=out)
-        for number in self.window.leaving():
-            if number in found and offset_sigma_s > 0.0:
-                other = self._other(point, found[number], number, kernel or self.kernel, offset_sigma_s)
-                found[number] = replace(found[number], other=other)
         return found, set(numbers) - set(found)
-
-    def _other(
-        self, point: Point, found: MatchedPair, number: int, kernel: RobustKernel, offset_sigma_s: float
-    ) -> OtherPairing | None:
-        """The scan with the image on its other side, if the offset may still move it there."""
-        images = {image.index: k for k, image in enumerate(self.window.images)}
-        used = images[found.image]
-        stamps = [image.stamp_ns for image in self.window.images]
-        early = stamps[used] + round(point.offset_s * 1e9) <= found.stamp_ns
-        position = used + 1 if early else used - 1
-        if not 0 <= position < len(stamps):
-            return None
-        middle_s = (found.stamp_ns - 0.5 * (stamps[used] + stamps[position])) * 1e-9
-        if abs(point.offset_s - middle_s) > REACH_SIGMAS * offset_sigma_s:
-            return None
-        part, numbers = self.window.drive(lambda k: k == number)
-        part = replace(part, images=(self.window.images[position],))
-        tracks, state = self._tracks(part, numbers), point.state(self.classes)
-        pairs = associate([part], tracks, state, kernel, self.graph)
-        if not pairs or len(pairs[0]) < _MIN_MATCHES:
-            return None
-        linear = self._linearized(pairs[0], number, point, 1.0, False, self.held_names)
-        return OtherPairing(linear.observed, middle_s, early)
 
     def linearized_at(
         self, point: Point, chosen: Collection[int], kernel: RobustKernel, without: Collection[int] = ()

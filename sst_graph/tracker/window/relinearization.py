@@ -13,6 +13,7 @@ import numpy as np
 
 from sst_graph.batch.lower_edges import LowerEdgeSupport
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.graph.convergence import step_share
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 from sst_graph.tracker.window.smoother import WindowSmoother
@@ -59,7 +60,6 @@ def relinearize_window(
     matcher: WindowMatcher,
     kernel_px: Sequence[float],
     most: int,
-    whole_steps: int,
     alive: Container[int],
     share: float = 1.0,
 ) -> bool:
@@ -72,7 +72,6 @@ def relinearize_window(
     Args:
         kernel_px: scales of the robust kernel, one a step.
         most: further steps under the last one.
-        whole_steps: those of them before the steps are shortened.
         alive: tracks of objects that may be seen again.
         share: factor on the weights of all matches.
 
@@ -96,9 +95,8 @@ def relinearize_window(
             and left @ np.linalg.solve(smoother.covariance()[0][:n, :n], left) < _CONVERGED_SIGMAS**2
         ):
             return True
-        shorter = 1.0 / (1.0 + max(0, last - whole_steps))
         back = np.zeros(smoother.point.size)
-        back[:n] = (1.0 - shorter) * left
+        back[:n] = (1.0 - step_share(last)) * left
         at = smoother.point.moved(back)
     smoother.set_point(at)
     return False

@@ -32,7 +32,6 @@ from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.epochs import Epoch, EpochSums, MatchedPair, RetiredEpoch
 from sst_graph.tracker.window.gaussian import Gaussian, Point, insert_point
-from sst_graph.tracker.window.pending_pairs import PendingPairs
 from sst_graph.tracker.window.smoother_update import SmootherUpdate, TwistFactor, read_point
 from sst_graph.types import SemanticClass
 
@@ -76,7 +75,6 @@ class WindowSmoother:
         past: information of the prior and of all that has left the window, matches weighted as in the graph.
         observed: the same with the robust loss's second derivatives; one linear factor of the graph.
         static: the same as ``past`` by static objects alone.
-        pending: pairs of the past whose image is not certain.
         sums: of the covariance, over all that has left the window.
         model: error model of the matches.
         retired: epochs that have left the window, until the history takes them over.
@@ -95,7 +93,6 @@ class WindowSmoother:
         self.held_names = held_at_zero(graph.estimate)
         self.prior = self.static = prior
         self.past = self.observed = prior.holding(len(self.held_names))
-        self.pending = PendingPairs.none(len(self.observed.vector))
         self.sums = RunningSums.empty(prior.point.size, len(self.held_names))
         self.entries: dict[int, MatchedPair] = {}
         self.model = ErrorModel(0.0, 0.0, 1.0)
@@ -163,7 +160,7 @@ class WindowSmoother:
         self.isam, self.past_id, self._epochs = update.isam, update.past_id, update.epochs
         self.ids, self.twists, self.entries = update.ids, update.twists, update.entries
         self.past, self.observed, self.static = update.past, update.observed, update.static
-        self.pending, self.sums, self.epoch_sums = update.pending, update.sums, update.epoch_sums
+        self.sums, self.epoch_sums = update.sums, update.epoch_sums
         self._point = update.point
         self.retired += update.retired
         if self.entries or self.sums.recent:

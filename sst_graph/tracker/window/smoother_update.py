@@ -12,7 +12,7 @@ import numpy as np
 from sst_graph.graph.linear import scaled_inverse
 from sst_graph.graph.state import object_bias_key, twist_key
 from sst_graph.tracker.window.epochs import EPOCH_S, Epoch, EpochSums, MatchedPair, RetiredEpoch
-from sst_graph.tracker.window.gaussian import Point, with_room
+from sst_graph.tracker.window.gaussian import Point
 
 if TYPE_CHECKING:
     from sst_graph.tracker.window.smoother import WindowSmoother
@@ -70,7 +70,7 @@ class SmootherUpdate:
         self.entries, self.ids = dict(smoother.entries), dict(smoother.ids)
         self.twists = dict(smoother.twists)
         self.past, self.past_id = smoother.past, smoother.past_id
-        self.observed, self.static, self.pending = smoother.observed, smoother.static, smoother.pending
+        self.observed, self.static = smoother.observed, smoother.static
         self.epochs = smoother.epochs
         self.epoch_sums = smoother.epoch_sums.copy()
         self.sums = smoother.sums.copy()
@@ -90,7 +90,6 @@ class SmootherUpdate:
         self._tie_twists()
         self._close_epochs()
         self._marginalize_objects()
-        self._resolve_pending()
         if self.past is not self._smoother.past or self.observed is not self._smoother.observed:
             self._replace_past()
         # 2. Everything at once.
@@ -111,8 +110,6 @@ class SmootherUpdate:
             self.past = self.past.plus(linear.information)
             self.observed = self.observed.plus(linear.observed)
             self.static = self.static.plus(linear.by_static_objects)
-            if entry.other is not None:
-                self.pending = self.pending.plus(linear.observed, entry.other, self.past.point)
             own = linear.information
             columns = self.past.point.columns(own.point.tracks, own.held)
             self.sums.add(linear, columns, scan, by_object=not drift.enabled)
@@ -133,8 +130,6 @@ class SmootherUpdate:
         gaussians = (self.past, self.observed, self.static)
         self.past, self.observed, self.static = (g.with_objects(new, sigma_px) for g in gaussians)
         self.sums.grow(self.past.point.size)
-        size = self.past.point.size
-        self.pending = self.pending.through(with_room(size - len(new), size, self.observed.held))
         for track, place in new.items():
             bias = float(self._smoother.point.biases_px[place])
             self._values.insert(object_bias_key(0, track), np.array([bias]))
@@ -148,16 +143,9 @@ class SmootherUpdate:
             self._close_objects()
         if gone:
             self.past, T = self.past.without(gone)
-            self.observed, observed_T = self.observed.without(gone)
+            self.observed, _ = self.observed.without(gone)
             self.static, _ = self.static.without(gone)
             self.sums.transform(T)
-            self.pending = self.pending.through(observed_T)
-
-    def _resolve_pending(self) -> None:
-        """Pairings of scans that have left, by the time offset that the new matches were made at."""
-        points = [found.linear.information.point for found in self._found.values()]
-        at = points[0] if points else self._smoother.point
-        self.pending, self.observed = self.pending.resolved(self.observed, at.offset_s)
 
     def _close_objects(self) -> None:
         """Objects that are gone for good are no longer kept one by one."""
@@ -245,10 +233,8 @@ class SmootherUpdate:
 
     def _replace_past(self) -> None:
         self._remove.append(self.past_id)
-        before = self.observed.point
         gaussians = (self.past, self.observed, self.static)
         self.past, self.observed, self.static = (g.at(self.point) for g in gaussians)
-        self.pending = self.pending.moved(before.local(self.observed.point))
         keys = self._smoother.keys(self.epochs[0].number, self.past.point.tracks)
         self._add(self.observed.without_held().factor(keys), "past", 0)
 
