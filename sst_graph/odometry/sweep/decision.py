@@ -117,7 +117,7 @@ class SweepDecision:
         if self.kind == "undecided":
             return (
                 f"not determined by the scans ({share}; compensated 0, clockwise -1, counter-clockwise +1); "
-                f"assumed compensated, the doubt is in the sigmas; if you know it, {REMEDY}"
+                f"assumed compensated, its effect is in the sigmas; if you know it, {REMEDY}"
             )
         if self.kind == "compensated":
             return f"compensated ({share}, 0 expected)"
