@@ -170,8 +170,8 @@ def _add_estimate(command: _Parser) -> None:
         "--estimate",
         metavar="NAMES",
         help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
-        "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the standard "
-        "deviation of its prior about 0 (docs/assumptions.md)",
+        "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the "
+        "standard deviation of its prior about 0 (docs/assumptions.md)",
     )
 
 
@@ -226,7 +226,9 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
 
 def _add_inspect(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "how far a result can be trusted: sigmas, correlations, weak directions, what to record next"
-    inspect = commands.add_parser("inspect", help=text, description=f"{text[0].upper()}{text[1:]}; docs/inspect.md explains each line.")
+    inspect = commands.add_parser(
+        "inspect", help=text, description=f"{text[0].upper()}{text[1:]}; docs/inspect.md explains each line."
+    )
     inspect.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     inspect.add_argument("--all-frames", action="store_true", help="every frame in the table")
     inspect.add_argument(
