@@ -100,8 +100,8 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
         blocks += [
             "## Where the sigmas come from",
             "```\n" + "\n".join(parts) + "\n```",
-            "More frames reduce matches and motion. The others are assumptions that no residual shows, such as "
-            "a principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named.",
+            "More frames reduce matches and motion. The others are assumptions that no residual shows, such "
+            "as a principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named.",
         ]
     if result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
