@@ -9,9 +9,11 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from stored import written
 
 from sst_graph.export import CalibrationMarginal
 from sst_graph.factors import FactorError, check_jacobians
+from sst_graph.simulator import SimulationConfig
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 
@@ -62,8 +64,33 @@ def test_the_checker_finds_the_mistake_that_the_page_warns_of() -> None:
         exec(compile(wrong, "extending.md", "exec"), {"check_jacobians": check_jacobians})
 
 
+def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
+    street = SimulationConfig(
+        seed=5,
+        frames=16,
+        width=621,
+        height=188,
+        azimuth_limit_deg=50.0,
+        azimuth_step_deg=0.3,
+        vehicle_density=0.3,
+        time_offset_s=0.03,
+        motion="no_stop",
+        moving_fraction=0.0,
+    )
+    (tmp_path / "drive").symlink_to(written(street))
+    found: dict[str, Any] = {}
+    exec(compile(code_of("slam.md"), "slam.md", "exec"), found)
+    solution, truth = found["solution"], found["drive"].truth
+    sigmas = np.sqrt(np.diag(solution.covariance))
+    apart = truth.cTl.localCoordinates(solution.values.atPose3(found["E"](0)))
+    late = solution.values.atVector(found["D"](0))[0] - truth.time_offset_s
+    assert (np.abs([*apart, late]) < 4.0 * sigmas).all()
+    start = truth.cTl.localCoordinates(found["drive"].nominal)
+    assert np.linalg.norm(apart[:3]) < 0.25 * np.linalg.norm(start[:3]) and abs(late) < 0.01
+
+
 def test_links_between_pages_lead_somewhere() -> None:
-    for page in (*DOCS.glob("*.md"), DOCS.parent / "README.md"):
+    for page in (*DOCS.rglob("*.md"), DOCS.parent / "README.md"):
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 

@@ -170,7 +170,8 @@ def _add_estimate(command: _Parser) -> None:
         "--estimate",
         metavar="NAMES",
         help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
-        "k2, sweep, skew, line_delay, range_bias, range_scale; NAME=SIGMA gives its deviation from 0",
+        "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the "
+        "standard deviation of its prior about 0 (docs/assumptions.md)",
     )
 
 
@@ -216,7 +217,8 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     evaluate.add_argument(
         "--truth-sigma",
         metavar="ROT_DEG,TRANS_CM,MS",
-        help="how well the truth is known itself, one sigma along each axis; the NEES counts it in",
+        help="how well the truth is known itself, one sigma along each axis; the NEES counts it in "
+        "(0.1,1,2 for KITTI's published calibration)",
     )
     evaluate.add_argument("--json", action="store_true", help="print JSON (degrees, metres, seconds)")
     return evaluate
@@ -224,11 +226,13 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
 
 def _add_inspect(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "how far a result can be trusted: sigmas, correlations, weak directions, what to record next"
-    inspect = commands.add_parser("inspect", help=text, description=f"{text}; docs/inspect.md explains it.")
+    inspect = commands.add_parser(
+        "inspect", help=text, description=f"{text[0].upper()}{text[1:]}; docs/inspect.md explains each line."
+    )
     inspect.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     inspect.add_argument("--all-frames", action="store_true", help="every frame in the table")
     inspect.add_argument(
-        "--next", type=int, default=10, metavar="N", help="frames that predictions add (default %(default)s)"
+        "--next", type=int, default=10, metavar="N", help="frames to record next (default %(default)s)"
     )
     inspect.add_argument("--json", action="store_true", help="print JSON (units in the names)")
     inspect.add_argument(
@@ -306,7 +310,11 @@ def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argp
     text = "list the settings of calibrate and track: default, unit, range, and when to change them"
     settings = commands.add_parser("settings", help=text, description=text)
     settings.add_argument(
-        "name", metavar="NAME", nargs="?", default="", help="only those whose dotted name contains this"
+        "name",
+        metavar="NAME",
+        nargs="?",
+        default="",
+        help="only those whose dotted name contains this, such as start or joint.graph",
     )
     form = settings.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print JSON")
@@ -315,10 +323,14 @@ def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argp
 
 
 def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
-    text = "make a table of accuracy on simulated streets, as Markdown"
+    text = "make a table of accuracy, as Markdown: on simulated streets, or on real drives"
     experiment = commands.add_parser("experiment", help=text, description=text)
     experiment.add_argument(
-        "name", metavar="NAME", help="paper-table: the paper's table; an unknown name lists all"
+        "name",
+        metavar="NAME",
+        help="accuracy, assumptions, consistency, drives, motion, paper-table, slam or windows; any other "
+        "name prints what each of them shows; drives and windows need real drives: "
+        "--set 'data=[\"DATA\"]'",
     )
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")
     experiment.add_argument("--seed", type=int, help="seed of the first street")

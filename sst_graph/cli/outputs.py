@@ -68,11 +68,15 @@ def write_calibration(
 
 
 def exit_code(result: CalibrationResult) -> int:
-    """Exit code of a result; one line on stderr says why it is not to be trusted."""
+    """Exit code of a result; one line on stderr says why it is not to be trusted: the first reason.
+
+    The summary and the report hold all of them.
+    """
     if result.status == "ok":
         return 0
-    reasons = "; ".join(result.reasons) or "the result carries no reason"
-    complain(f"{result.status}: {reasons}")
+    first, *others = result.reasons or ("the result carries no reason",)
+    more = f" ({len(others)} more in the summary and in report.md)" if others else ""
+    complain(f"{result.status}: {first}{more}")
     return 3
 
 

@@ -43,7 +43,7 @@ def with_new_names(
         short = name.removeprefix(CALIBRATION)
         prefix = name[: len(name) - len(short)]
         if short in constants:
-            raise ConfigError(f"'{printable(name)}' is not a setting any more: {constants[short]}")
+            raise ConfigError(f"'{printable(name)}' is not a setting: {constants[short]}; leave it out")
         new = prefix + renamed.get(short, short)
         if new != name and new in known:
             _LOG.warning("setting '%s' is called '%s': use that name", name, new)

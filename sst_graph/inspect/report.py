@@ -97,13 +97,19 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
         "```\n" + summary(result, comparison) + "\n```",
     ]
     if parts := budget_lines(result):
-        blocks += ["## Where the sigmas come from", "```\n" + "\n".join(parts) + "\n```"]
+        blocks += [
+            "## Where the sigmas come from",
+            "```\n" + "\n".join(parts) + "\n```",
+            "More frames reduce matches and motion. The others are assumptions that no residual shows, such "
+            "as a principal point (cx, cy) or a distortion (k1, k2) that is off by the amount named.",
+        ]
     if result.weak_directions:
         items = [f"- {weak.sentence} {weak.advice}" for weak in result.weak_directions]
         blocks += ["## What the data hardly determine", "\n".join(items)]
     if pictures:
         blocks += [
             "## Before and after",
+            "Above the start, below the result. "
             "Vehicle points: green inside the image's vehicle mask, red outside; the contour is the mask's.",
             "\n\n".join(f"![{name}]({name})" for name in pictures),
         ]

@@ -49,7 +49,9 @@ class TermWarning:
     detail: str = ""
 
     def __str__(self) -> str:
-        what = f"{self.kind.value}: {self.value:.3g} {self.unit}, at most {self.limit:.3g} {self.unit}"
+        what = f"{self.kind.value}: {self.value:.3g} {self.unit}"
+        if self.unit != "times the limit":
+            what += f", at most {self.limit:.3g} {self.unit}"
         return f"{what}: {self.detail}" if self.detail else what
 
 

@@ -70,9 +70,13 @@ def tracker_result(
 def _unconfirmed(last: TrackUpdate, new_start: bool) -> tuple[str, ...]:
     if new_start:
         return ("no frames that came after the start have been found to agree with those it was made of",)
+    of_offset = (
+        f", nor one of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"
+        if last.offset_unconfirmed_s > 0.0
+        else ""
+    )
     return (
         "no frame would have shown a change of where the camera looks for the last "
-        f"{last.unconfirmed_s:.1f} s, nor one of the time offset for "
-        f"{last.offset_unconfirmed_s:.1f} s of driving"
+        f"{last.unconfirmed_s:.1f} s{of_offset}"
         + (f"; {last.suspected_change}" if last.suspected_change else ""),
     )

@@ -223,7 +223,7 @@ def _strip(width: int, caption: str, inside: int, outside: int) -> Picture:
         (f"vehicle points in the mask: {share}   ", IN_MASK),
         (f"outside: {outside}   ", OUT_OF_MASK),
         ("contour   ", CONTOUR),
-        ("not asked", NOT_ASKED),
+        ("not matched", NOT_ASKED),
     ]
     text = "".join(words for words, _ in parts)
     font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.6

@@ -77,7 +77,9 @@ def test_what_cannot_be_told_is_said(
     result = read_result(out / "calibration.json")
     assert result.status == "unobservable" and result.reasons
     assert captured.err.startswith("sst-graph: unobservable: ") and captured.err.count("\n") == 1
-    assert "time offset" in captured.err
+    assert " ".join(result.reasons[0].split()) in captured.err
+    assert any("time offset" in reason for reason in result.reasons)
+    assert all(reason in captured.out for reason in result.reasons)
     assert result.sigmas().time_offset_ms > 100.0
     assert (out / "report.md").is_file()
 

@@ -71,7 +71,7 @@ def test_a_constant_is_named_with_its_value(name: str) -> None:
     tree: Any = 3.0
     for key in reversed(name.split(".")):
         tree = {key: tree}
-    message = f"'{name}' is not a setting any more: sst_graph.edges.SUPPORT = 30.0"
+    message = f"'{name}' is not a setting: sst_graph.edges.SUPPORT = 30.0; leave it out"
     with pytest.raises(ConfigError, match=f"^{message}$"):
         new(Online if "calibration" in name else Method, tree)
 

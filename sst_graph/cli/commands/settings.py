@@ -38,7 +38,9 @@ def run(args: argparse.Namespace) -> int:
         say(settings_page(of_calibrate, of_track), end="")
     else:
         for command, entries in (("calibrate", of_calibrate), ("track", of_track)):
-            say(f"{command}: {len(entries)} settings\n\n{as_text(entries)}")
+            plural = "s" * (len(entries) != 1)
+            text = f"\n\n{as_text(entries)}" if entries else "\n"
+            say(f"{command}: {len(entries)} setting{plural}{text}")
     return 0
 
 

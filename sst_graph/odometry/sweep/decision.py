@@ -103,7 +103,10 @@ class SweepDecision:
         if self.kind == "standstill":
             return "assumed compensated: at standstill it does not matter"
         if self.kind == "undecided":
-            return f"not determined by the scans ({share}); assumed compensated"
+            return (
+                f"not determined by the scans ({share}; compensated 0, clockwise -1, counter-clockwise +1); "
+                f"assumed compensated, its effect is in the sigmas; if you know it, {REMEDY}"
+            )
         if self.kind == "compensated":
             return f"compensated ({share}, 0 expected)"
         where = f"a turn begins at {np.degrees(self.timing.start_rad):.0f} deg" if self.start_known else ""
