@@ -221,7 +221,6 @@ def test_a_knock_that_nothing_can_show_is_not_called_ok(
 ) -> None:
     """All that is in view moves from then on: no alarm can be raised, and the status says so."""
     tracker, ages = _sure_tracker(street), []
-    window = tracker.inputs.window
     for frame in frames:
         assert frame.image is not None
         image = frame.image
