@@ -1,7 +1,7 @@
 """SemAlign (Liu et al., IROS 2021) as a baseline: many sampled starts, then points to nearest pixels.
 
 Spatial only. Each start is scored by the mean truncated distance of its class points to the mask; the best
-one is refined by least squares on point-to-pixel matches, found anew at every step.
+one is refined by least squares on point-to-pixel matches, found again at every step.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class SemAlignConfig(Settings):
         0,
         at_least=0,
         at_most=10**15,
-        doc="Seed of SemAlign's samples. Change it to see whether the answer depends on it.",
+        doc="Seed of SemAlign's samples. Change it to see whether the result depends on it.",
     )
 
 

@@ -1,7 +1,7 @@
 """SST-Calib as printed (Kodaira, Zhou, Zang, Zhan, Tomizuka, ITSC 2022): the static and the joint stage.
 
 Where the print is silent: frames are those of equal stamps, spread over the drive; the time offset starts
-at the guess; camera velocity comes from visual odometry with LiDAR depth, computed anew every few
+at the guess; camera velocity comes from visual odometry with LiDAR depth, computed again every few
 steps because the depth depends on extrinsic and offset; one Levenberg-Marquardt step follows each match.
 """
 
@@ -80,7 +80,7 @@ class PaperConfig(Settings):
         0,
         at_least=0,
         at_most=10**15,
-        doc="Seed of the pixels that SST-Calib samples. Change it to see whether the answer depends on it.",
+        doc="Seed of the pixels that SST-Calib samples. Change it to see whether the result depends on it.",
     )
 
 
@@ -202,10 +202,10 @@ def solve_static(problem: PaperProblem, guess: Calibration) -> NearestSolution:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
     still = still_frames(problem, guess)
-    answer, remaining = _static_stage(still.frames, guess, problem.progress)
-    covariance = frozen_covariance(still.frames, answer, _STATIC_PHASES[-1][0])
+    result, remaining = _static_stage(still.frames, guess, problem.progress)
+    covariance = frozen_covariance(still.frames, result, _STATIC_PHASES[-1][0])
     counts: dict[str, object] = {"frames": len(still.frames)}
-    return NearestSolution(answer, covariance, remaining, still.frames, still.reasons, counts)
+    return NearestSolution(result, covariance, remaining, still.frames, still.reasons, counts)
 
 
 def still_frames(problem: PaperProblem, guess: Calibration) -> StillFrames:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.answer import Guess
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
@@ -27,7 +27,7 @@ from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 
 FloatArray = NDArray[np.float64]
 
@@ -81,7 +81,9 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        return whole(select_start_steps(self._start_problem(), self.config.joint.graph, self.config.start))
+        return run_to_end(
+            select_start_steps(self._start_problem(), self.config.joint.graph, self.config.start)
+        )
 
     def with_joint(self, joint: JointConfig) -> CalibrationProblem:
         """The problem with other settings of the joint method."""
@@ -115,7 +117,7 @@ class CalibrationProblem:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class JointEstimate:
     """A solution and its covariance by the matches.
 
     Attributes:
@@ -131,7 +133,7 @@ class Estimate:
     by_static_objects: FloatArray
 
     @classmethod
-    def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> Estimate:
+    def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> JointEstimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))

@@ -7,7 +7,7 @@ its own, of which no more is known than its range, from s0 to the assumption's s
 
     B(tau) = N(t; 0, s^2 + tau^2) / N(t; 0, s^2 + s0^2),
 
-and the answer, which holds the parameter at zero, is to be covered for the mean square of it,
+and the estimate, which holds the parameter at zero, is to be covered for the mean square of it,
 
     E[theta^2 | t] = v (1 + v t^2 / s^4),   v = (s^-2 + tau^-2)^-1,
 
@@ -69,7 +69,7 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
 
 
 def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:
-    """Deviation of each assumption's parameter from zero, by name, that the answer is to be covered for.
+    """Deviation of each assumption's parameter from zero, by name, that the estimate is to be covered for.
 
     Never below the prior one; that stays 0 where it is 0: the assumption holds exactly.
     """

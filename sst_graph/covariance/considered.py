@@ -1,6 +1,6 @@
 """How an estimate follows the assumptions it rests on, and what that adds to its covariance.
 
-A parameter theta that is held at 0 but has deviation sigma moves the answer by (dx/dtheta) theta: Schmidt's
+A parameter theta that is held at 0 but has deviation sigma moves the estimate by (dx/dtheta) theta: Schmidt's
 considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
 the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the covariance that
 the solve itself claims,
@@ -133,7 +133,7 @@ def columns_of(
     for pair in pairs:
         assert pair.scene is not None
         c_twist = values.atVector(twist_key(pair.drive, pair.pair.image))
-        at = state.cTl, state.offset_s(pair.drive), c_twist
+        at = state.cTl, state.time_offset_s(pair.drive), c_twist
         for matches in pair.matches.values():
             found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
             blocks.append(np.stack([found[name] for name in names], axis=1))
@@ -146,14 +146,14 @@ def weighted_columns(table: MatchTable, pairs: Sequence[PairMatches], columns: F
     return np.asarray(columns * (table.root_weights / sigmas)[:, None])
 
 
-def consider(
+def considered_by_matches(
     robust: RobustCovariance,
     pairs: Sequence[PairMatches],
     values: gtsam.Values,
     state: State,
     config: AssumptionConfig,
 ) -> Considered:
-    """How an answer follows every assumption that is not estimated beside it.
+    """How an estimate follows every assumption that is not estimated beside it.
 
     Args:
         robust: its covariance and matches.
@@ -161,9 +161,9 @@ def consider(
     """
     names = held_at_zero(config.estimate)
     columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
-    size = 6 + len(state.offsets_s)
+    size = 6 + len(state.time_offsets_s)
     steps = steps_by(names, robust.bread, robust.table.J.T @ columns, size)
-    return considered(steps, config)
+    return considered_by_steps(steps, config)
 
 
 def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int) -> dict[str, FloatArray]:
@@ -176,7 +176,7 @@ def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: 
     return dict(zip(names, -(bread @ shared)[:size].T, strict=True))
 
 
-def considered(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
+def considered_by_steps(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
     """What parameters that are held at 0 add to a covariance.
 
     Args:

@@ -1,11 +1,11 @@
-"""Whether parts of the data agree: the difference of their own answers against its covariance.
+"""Whether parts of the data agree: the difference of their own estimates against its covariance.
 
-Every part (a drive, a stretch of a drive) has an answer of its own, as a step from a common reference with a
-cluster-robust covariance. The squared Mahalanobis length of the difference of two answers would be
+Every part (a drive, a stretch of a drive) has an estimate of its own, as a step from a common reference with
+a cluster-robust covariance. The squared Mahalanobis length of the difference of two estimates would be
 chi-squared if the covariances were known. They are estimated from a limited number of clusters (sides of
 objects), which makes it Hotelling's T^2: an F with about as many degrees of freedom in the denominator as
 clusters (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI). A direction
-that a part does not know has a large variance in the difference and so does not count.
+that a part does not determine has a large variance in the difference and so does not count.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ _WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
 
 
 @dataclass(frozen=True)
-class PartAnswer:
+class PartEstimate:
     """What a part of the data says by itself.
 
     Attributes:
-        step: (7,) from the common reference to the part's answer, in the tangent space of the reference
+        step: (7,) from the common reference to the part's estimate, in the tangent space of the reference
             (right perturbation: rotation [rad], translation [m], offset [s]).
         covariance: (7, 7) of it, cluster-robust.
         clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
@@ -65,7 +65,7 @@ class Difference:
     freedom: float = np.inf
 
     @classmethod
-    def of(cls, one: PartAnswer, other: PartAnswer, own_offsets: bool = False) -> Difference:
+    def of(cls, one: PartEstimate, other: PartEstimate, own_offsets: bool = False) -> Difference:
         """From one part to another that is independent of it.
 
         The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
@@ -103,12 +103,12 @@ class Difference:
         return self.p_value, -self.chi2
 
 
-def combined(parts: Sequence[PartAnswer]) -> PartAnswer:
-    """The answer of several independent parts together, weighted by their information."""
+def combined(parts: Sequence[PartEstimate]) -> PartEstimate:
+    """The estimate of several independent parts together, weighted by their information."""
     information = [np.linalg.inv(part.covariance) for part in parts]
     covariance = np.asarray(np.linalg.inv(np.sum(information, axis=0)))
     weighted = np.sum([H @ part.step for H, part in zip(information, parts, strict=True)], axis=0)
-    return PartAnswer(covariance @ weighted, covariance, sum(part.clusters for part in parts))
+    return PartEstimate(covariance @ weighted, covariance, sum(part.clusters for part in parts))
 
 
 @dataclass(frozen=True)

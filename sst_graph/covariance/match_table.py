@@ -157,7 +157,7 @@ def _rows(
         columns[own] = unknowns.column(key)
         if some is not None:
             biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
-    r, J, _ = weighted_residuals(alignment, state.cTl, state.offset_s(pair.drive), c_twist, biases_px)
+    r, J, _ = weighted_residuals(alignment, state.cTl, state.time_offset_s(pair.drive), c_twist, biases_px)
     roots = np.abs(J[:, 13]) * alignment.sigmas_px
     block = J[:, 7:13] @ response
     block[:, :6] += J[:, :6]

@@ -55,7 +55,7 @@ MOTION = Advice(
 
 @dataclass(frozen=True)
 class ObservabilityConfig(Settings):
-    """Largest standard deviations of an answer that may be called ok."""
+    """Largest standard deviations of an estimate that may be called ok."""
 
     rotation_deg: float = setting(
         0.5,
@@ -110,7 +110,7 @@ def open_directions(
     objects alone.
 
     Args:
-        covariance: (7, 7) of the answer.
+        covariance: (7, 7) of the estimate.
         by_static_objects: (7, 7) by static objects alone, where dynamic ones are among the matches.
     """
     weak = weak_directions(covariance, cTl, config, advice)

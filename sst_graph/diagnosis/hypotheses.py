@@ -119,10 +119,10 @@ def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterato
 def mirrored(
     drive: Drive, guess: gtsam.Pose3, offset_s: float, fit: Fitter, given: Fit, sideways: bool
 ) -> Finding | None:
-    """Clouds or pictures that are mirrored: of all mistakes the one that an answer may survive.
+    """Clouds or pictures that are mirrored: of all mistakes the one that an estimate may survive.
 
     Args:
-        sideways: left and right only: around a start that was given, no answer survives what also turns the
+        sideways: left and right only: around a start that was given, no estimate survives what also turns the
             cloud by 180 degrees.
     """
     tried = itertools.islice(_mirrorings(drive, guess, offset_s), 1 if sideways else None)

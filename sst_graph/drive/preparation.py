@@ -363,14 +363,16 @@ def apart(
     )
 
 
-def outlines(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
+def boundaries_of(
+    scan: ScanFeatures, lower_edges: Collection[SemanticClass]
+) -> dict[SemanticClass, Boundaries]:
     """A scan's boundary points, of some classes with those towards the ground."""
     some = {c: scan.lower_edges[c] for c in lower_edges if c in scan.lower_edges}
     return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
-def outline_size(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> int:
-    """Number of the points of :func:`outlines`."""
+def boundary_count(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> int:
+    """Number of the points of :func:`boundaries_of`."""
     below = sum(len(points) for c, points in scan.lower_edges.items() if c in lower_edges)
     return below + sum(map(len, scan.boundaries.values()))
 

@@ -28,11 +28,11 @@ class Unknowns:
 
     @classmethod
     def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
-        delays = [time_offset_key(clock) for clock in range(len(state.offsets_s))]
+        clocks = [time_offset_key(clock) for clock in range(len(state.time_offsets_s))]
         names = dict.fromkeys(name for pair in pairs for own in pair.terms.values() for name in own)
         biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
         objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
-        return cls((EXTRINSIC, *delays, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
+        return cls((EXTRINSIC, *clocks, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
 
     @property
     def size(self) -> int:

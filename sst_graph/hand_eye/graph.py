@@ -169,7 +169,7 @@ def hand_eye_graph(terms: Sequence[HandEyeTerm], centre: State) -> gtsam.Nonline
     # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
     # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
     pull = sum(term.noise_pull for term in terms)
-    mean_s = centre.offsets_s[0] + pull * sigma_s**2
+    mean_s = centre.time_offsets_s[0] + pull * sigma_s**2
     graph.add(time_offset_prior(time_offset_key(), mean_s, sigma_s))
     return graph
 
@@ -178,7 +178,7 @@ def state_values(state: State) -> gtsam.Values:
     """E and D of a state."""
     values = gtsam.Values()
     values.insert(EXTRINSIC, state.cTl)
-    values.insert(time_offset_key(), np.array(state.offsets_s[:1]))
+    values.insert(time_offset_key(), np.array(state.time_offsets_s[:1]))
     return values
 
 
@@ -196,7 +196,7 @@ def _term(pair: MotionPair, state: State) -> HandEyeTerm:
     Ad = np.asarray(state.cTl.AdjointMap())
     covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     # 2. The factor.
-    offset_0, turn = state.offsets_s[0], pair.camera.rotation
+    offset_0, turn = state.time_offsets_s[0], pair.camera.rotation
     if directed:
         measured = gtsam.Pose3(turn, length * motion.direction)
         motions = (measured, step.aTb, step.twist_a, step.twist_b)

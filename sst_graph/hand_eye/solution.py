@@ -51,7 +51,7 @@ _STEP_SIGMAS = 0.1
 _INNER_ITERATIONS = 10
 """Most Levenberg-Marquardt iterations on frozen motions: the next outer iteration goes on from there."""
 ALTERNATIVE_CHI2 = 9.0
-"""A different solution that costs at most this much more makes the answer ambiguous: three sigmas of one
+"""A different solution that costs at most this much more makes the estimate ambiguous: three sigmas of one
 unknown. Solutions farther apart than this (chi-squared of 7) are different."""
 
 
@@ -180,7 +180,7 @@ def _solve(
     while outer < max_outer and not converged:
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
-        pairs = pair_motions(steps, paths, state.offsets_s[0])
+        pairs = pair_motions(steps, paths, state.time_offsets_s[0])
         if len(pairs) < max(config.min_pairs, LEAST_SHARE * len(steps)):
             return None
         terms, scales = hand_eye_terms(pairs, state)
@@ -192,7 +192,7 @@ def _solve(
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
         step = difference(state, moved)
         step /= 1 + max(0, outer - _FULL_STEPS)
-        state = State(state.cTl.retract(step[:6]), (state.offsets_s[0] + float(step[6]),))
+        state = State(state.cTl.retract(step[:6]), (state.time_offsets_s[0] + float(step[6]),))
         converged = float(step @ np.linalg.solve(covariance, step)) < _STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
@@ -200,7 +200,7 @@ def _solve(
 
 def difference(a: State, b: State) -> FloatArray:
     """(7,) step from one state to another, in the tangent space of the covariance."""
-    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
+    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

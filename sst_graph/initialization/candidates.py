@@ -76,7 +76,7 @@ class StartProblem:
     def centre(self, start: State) -> State:
         """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
         cTl = gtsam.Pose3(start.cTl.rotation(), np.zeros(3)) if self.guess is None else self.guess
-        return State(cTl, (self.offset_s,) * len(start.offsets_s))
+        return State(cTl, (self.offset_s,) * len(start.time_offsets_s))
 
 
 def candidate_steps(problem: StartProblem, config: StartConfig) -> Stepwise[list[Candidate]]:

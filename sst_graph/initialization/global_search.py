@@ -98,7 +98,7 @@ class SearchConfig(Settings):
         0,
         at_least=0,
         at_most=10**15,
-        doc="Seed of the global search's sampler. Change it to see whether the answer depends on it.",
+        doc="Seed of the global search's sampler. Change it to see whether the result depends on it.",
     )
 
 

@@ -5,7 +5,7 @@ differs is there for speed, for a search matches some hundred poses where a grap
 far out of view are sorted out first; motion is of second order in the interval; the contours' distances and
 normals come from one bilinear cell; objects are taken as static, points as measured. The unknowns are pose,
 time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of that of
-:class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the answer itself.
+:class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the estimate itself.
 """
 
 from __future__ import annotations

@@ -51,9 +51,9 @@ _SELECTED = 2
 _SELECTED_RATIO = 0.7
 """... if their score is at least this fraction of the best one's."""
 ALTERNATIVE_RATIO = 0.9
-"""A different solution with at least this fraction of the best one's score makes the answer ambiguous."""
+"""A different solution with at least this fraction of the best one's score makes the estimate ambiguous."""
 _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
-"""Solutions on a few frames that are closer than all of these lead to one answer."""
+"""Solutions on a few frames that are closer than all of these lead to one estimate."""
 _STILL_ALIKE = 3.0
 """While kernels are wide, candidates count as one at this many times the distance."""
 _SAME_RAD = float(np.radians(2.0))
@@ -188,11 +188,11 @@ def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
 
 
 def _alike(one: State, other: State) -> bool:
-    """Whether two solutions lead to one answer."""
+    """Whether two solutions lead to one estimate."""
     step = one.cTl.between(other.cTl)
     near = _turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
     near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
-    return near and abs(one.offsets_s[0] - other.offsets_s[0]) <= _ALIKE_S
+    return near and abs(one.time_offsets_s[0] - other.time_offsets_s[0]) <= _ALIKE_S
 
 
 def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:

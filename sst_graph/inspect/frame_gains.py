@@ -1,6 +1,6 @@
 """What each frame adds to the covariance: by itself, beside all the others, and one after the other.
 
-Without a frame, the covariance is made anew from all other matches as
+Without a frame, the covariance is made again from all other matches as
 :mod:`sst_graph.covariance.cluster_robust` makes it: information, error model, and the objects left out in
 turn. The matches and their robust weights stay as they are; the estimate takes the Gauss-Newton step to the
 optimum of the other frames, and the residuals follow. Without that step, the left-out frame's gradient would
@@ -115,7 +115,7 @@ def _left_out(
 ) -> FloatArray:
     """(n, n) covariance of a calibration without a frame, its matches and their weights as they are.
 
-    The whole of it is made anew from the matches that are left, error model and objects left out in turn
+    The whole of it is made again from the matches that are left, error model and objects left out in turn
     included: a frame that contradicts the others widens both, and leaving it out narrows them.
     """
     information = sums.information.copy()

@@ -1,6 +1,6 @@
 """How far a result can be trusted, in numbers for people: sigmas, correlations, weak directions, frames.
 
-Pure functions of a :class:`~sst_graph.result.CalibrationResult`; nothing is measured anew.
+Pure functions of a :class:`~sst_graph.result.CalibrationResult`; nothing is measured again.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One image and one scan in a graph of the user's own: matched anew at every estimate.
+"""One image and one scan in a graph of the user's own: matched again at every estimate.
 
 A term holds its data, and where extrinsic, time offset and the trajectory stand in the graph. At any values
 it finds the two poses between which the image was taken in true time, stamp + offset, matches scan and image

@@ -11,8 +11,9 @@ of ``calibrate`` (:func:`sst_graph.covariance.cluster_robust.fit_error_model`). 
 factors claim, for a match, and ``side_sigma_px``, for a side in all images: a short drive shows less than
 there is, for pose and offset are fitted to the same sides.
 
-A class whose mask bias is no variable keeps it in the answer. What the matches say of it is worked out as if
-it were one (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C (Schmidt).
+The mask bias of a class for which it is no variable shifts the estimate. It is estimated from the matches as
+if it were a variable (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C
+(Schmidt).
 
 Along a direction that the data hardly determine, as forward against later at one speed, a common error of a
 pixel is many times what independent matches leave: there the two covariances differ most.

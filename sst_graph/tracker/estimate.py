@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import with_test_results
-from sst_graph.covariance.considered import Considered, considered
+from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.errors import EstimationError
 from sst_graph.graph.convergence import FULL_STEPS
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
-from sst_graph.tracker.monitor.statistic import Estimate
+from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
@@ -162,21 +162,21 @@ class OnlineEstimate:
 
     def considered(self) -> Considered:
         """How the present estimate depends on the assumptions that are not estimated beside it."""
-        beside = considered(self.uncertainty.steps, self.config.calibration.assumptions)
-        return with_test_results(beside, self.tests.findings)
+        extra = considered_by_steps(self.uncertainty.steps, self.config.calibration.assumptions)
+        return with_test_results(extra, self.tests.findings)
 
-    def for_comparison(self) -> Estimate:
+    def for_comparison(self) -> ComparedEstimate:
         """The running estimate as frames are compared with it."""
         assert self.smoother is not None
-        return Estimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
+        return ComparedEstimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
         if self.smoother is None:
             return []
         entries = self.past_epochs.smoothed(self.smoother)
-        beside = self.considered().covariance(7)
-        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
+        extra = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + extra) for entry in entries]
 
     # ------------------------------------------------------------------ a frame
 
@@ -205,7 +205,7 @@ class OnlineEstimate:
             smoother.update(matches.found, set(matches.missing), window.first_scan, window.objects.live)
             window.dynamics.changed_scans -= matches.chosen
         self.entered.extend(new)
-        # 2. Now and then the whole window is matched and linearized anew, some scans with each frame.
+        # 2. Now and then the whole window is matched and linearized again, some scans with each frame.
         self._schedule_relinearization(matches.scan)
         # 3. Covariance, and what the scan contributed to it.
         self.uncertainty = Uncertainty.of(smoother)
@@ -216,7 +216,7 @@ class OnlineEstimate:
         self.past_epochs.take(smoother)
 
     def begin_relinearization(self) -> None:
-        """Match the window anew with the frames to come; no scan leaves meanwhile if none has yet."""
+        """Match the window again with the frames to come; no scan leaves meanwhile if none has yet."""
         window = self.matcher.window
         window.dynamics.test_all()
         self.relinearization = WindowRelinearization(self.matcher)

@@ -13,8 +13,8 @@ from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
-from sst_graph.batch.answer import Guess
-from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects
+from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects_factor
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
@@ -123,7 +123,7 @@ def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(probl
         robust = robust_covariance(alone.graph, alone.values, alone.pairs, alone.state, problem.objects)
         column = robust.unknowns.column(nuisance_key(name))
         sigma = np.sqrt(robust.matrix[column, column])
-        few = few_objects(int(robust.table.objects.max()) + 1, 3.3)
+        few = few_objects_factor(int(robust.table.objects.max()) + 1, 3.3)
         found = linear.alone(name, CONFIG.assumptions)
         assert found.value == pytest.approx(alone.state.nuisances[name], abs=0.5 * sigma)
         assert found.sigma == pytest.approx(few * sigma, rel=0.4)
@@ -190,8 +190,8 @@ def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -
 
 
 def test_few_objects_ask_for_more() -> None:
-    assert few_objects(1000, 3.3) == pytest.approx(1.0, abs=0.01)
-    assert few_objects(9, 3.3) == few_objects(3, 3.3) > few_objects(20, 3.3) > 1.1
+    assert few_objects_factor(1000, 3.3) == pytest.approx(1.0, abs=0.01)
+    assert few_objects_factor(9, 3.3) == few_objects_factor(3, 3.3) > few_objects_factor(20, 3.3) > 1.1
 
 
 @pytest.mark.parametrize(

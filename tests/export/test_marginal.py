@@ -244,7 +244,7 @@ def test_fusing_two_drives_equals_the_joint_batch() -> None:
 @pytest.mark.parametrize("seeds", [(3, 4), (5, 6), (7, 8)])
 def test_fusing_drives_through_marginals_equals_one_graph_of_both(seeds: tuple[int, int]) -> None:
     # Each drive linearized at its own optimum: thousandths to hundredths of a sigma from the joint LM, for
-    # the frozen graphs are not quadratic. Marginals taken anew at the fused point close the gap.
+    # the frozen graphs are not quadratic. Marginals taken again at the fused point close the gap.
     drives = []
     for seed in seeds:
         graph, start = drive(seed, 20)
@@ -263,7 +263,7 @@ def test_fusing_drives_through_marginals_equals_one_graph_of_both(seeds: tuple[i
 
 def test_a_stored_marginal_follows_the_second_drive() -> None:
     # one after the other: the first drive's marginal goes as a factor into the second one's graph, is then
-    # asked for anew where that ends, and goes in again
+    # asked for again where that ends, and goes in again
     (one, at_one), (two, start) = drive(3, 20), drive(4, 20)
     at_one = _optimum(one, at_one)
     answer = _batch([(one, at_one), (two, start)])

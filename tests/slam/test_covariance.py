@@ -101,7 +101,7 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     estimate, sigma = found.mask_biases_px[VEHICLE]
     assert estimate == pytest.approx(joint[7], rel=1e-9) == pytest.approx(-bias, abs=4.0 * sigma)
     assert sigma == pytest.approx(np.sqrt(np.linalg.inv(H)[7, 7]), rel=0.01)
-    # the whole of the step between the two answers is within the covariance
+    # the whole of the step between the two estimates is within the covariance
     assert found.clustered[0, 0] < found.covariance[0, 0]
     off = joint[:7] - step
     assert off @ np.linalg.solve(found.covariance, off) < 1.0

@@ -190,7 +190,7 @@ def test_few_matches_are_told(street: Street) -> None:
 
 
 def test_constants_a_double_and_a_body_may_stand_in(street: Street) -> None:
-    """The offset as a double, the poses those of a body: the same answer."""
+    """The offset as a double, the poses those of a body: the same estimate."""
     bTl = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(len(street.scans)):

@@ -15,7 +15,7 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
 from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, consider
+from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
@@ -26,7 +26,7 @@ from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
@@ -114,7 +114,7 @@ def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> 
     robust = robust_covariance(
         graph, values, pairs, state, [settled.inputs.window.objects_of(list(entries))[0]]
     )
-    plain = consider(robust, pairs, values, state, settled.setup.config.calibration.assumptions)
+    plain = considered_by_matches(robust, pairs, values, state, settled.setup.config.calibration.assumptions)
     expected = with_test_results(plain, settled.estimate.tests.findings)
     found = settled.estimate.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
@@ -205,7 +205,7 @@ def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) ->
 
 
 def test_a_clean_street_contradicts_nothing(settled: Tracker) -> None:
-    update = current(settled)
+    update = current_update(settled)
     assert update.contradictions == () and update.status == "ok" and update.estimated == {}
     report = settled.result().diagnostics["assumptions"]
     assert list(report) == list(ASSUMPTIONS)
@@ -218,7 +218,7 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     drive = with_principal_point(street, 20.0, 0.0)
     # A dozen vehicles in half-size pictures tell it to 16 px at most: asked for one deviation.
     tracker = _tracked(drive, "calibration.assumptions.threshold=1.0", settle=False)
-    update = current(tracker)
+    update = current_update(tracker)
     assert update.status == "contradicted" and "principal point cx" in update.contradictions[0]
     assert update.to_dict()["contradictions"] == list(update.contradictions)
     result = tracker.result()
@@ -228,16 +228,16 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     assert 10.0 < found.value < 30.0  # one step from where matches are near
     # Not tested: nothing is found, and no more is considered than beforehand.
     tracker.estimate.tests.restart()
-    assert current(tracker).contradictions == () and current(tracker).status != "contradicted"
+    assert current_update(tracker).contradictions == () and current_update(tracker).status != "contradicted"
     assert tracker.estimate.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
-    assert np.all(current(tracker).sigmas < update.sigmas)
+    assert np.all(current_update(tracker).sigmas < update.sigmas)
 
 
 def test_what_is_estimated_agrees_with_the_batch(
     street: KeptDrive, bent: KeptDrive, settled: Tracker, estimating: Tracker
 ) -> None:
     """And it is the answer of the street without distortion."""
-    update = current(estimating)
+    update = current_update(estimating)
     assert update.contradictions == (), update
     value, sigma = update.estimated["k1"]
     assert abs(value - K1) < 3.0 * sigma and sigma < 0.05
@@ -256,13 +256,13 @@ def test_what_is_estimated_agrees_with_the_batch(
     robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
     state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))
     turn = gtsam.Pose3.Logmap(update.T_camera_lidar.between(state.cTl))
-    step = np.array([*turn, state.offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
+    step = np.array([*turn, state.time_offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
     sigmas = np.sqrt(np.diag(robust.matrix)[[*range(7), column]])
     assert np.abs(step / sigmas).max() < 1.0, np.round(step / sigmas, 2)
     own = np.sqrt(np.diag(estimating.estimate.covariance)[:7])
     np.testing.assert_allclose([*own, sigma], sigmas, rtol=0.3)
     # Without distortion.
-    clean = current(settled)
+    clean = current_update(settled)
     back = gtsam.Pose3.Logmap(update.T_camera_lidar.between(clean.T_camera_lidar))
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
@@ -271,15 +271,15 @@ def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive,
     assert leaving.estimate.smoother is not None and leaving.estimate.smoother.sums.recent
     leaving.save(tmp_path / "tracker")
     again = Tracker.load(tmp_path / "tracker")
-    assert current(again).to_dict() == current(leaving).to_dict()
-    assert current(again).to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
+    assert current_update(again).to_dict() == current_update(leaving).to_dict()
+    assert current_update(again).to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
     last = bent[len(bent) - 1]
     assert last.scan is not None and last.image is not None
     later = [dataclasses.replace(one, stamp_ns=one.stamp_ns + 100_000_000) for one in (last.image, last.scan)]
     for tracker in (leaving, again):
         tracker.add_image(later[0])  # type: ignore[arg-type]
         tracker.add_scan(later[1])  # type: ignore[arg-type]
-    assert current(again).to_dict() == current(leaving).to_dict()
+    assert current_update(again).to_dict() == current_update(leaving).to_dict()
 
 
 def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None:

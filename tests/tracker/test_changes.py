@@ -14,9 +14,9 @@ from streets import EARLY_START, knocked, sigmas_apart, tracker_from_truth, turn
 from sst_graph import Tracker
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
 from sst_graph.tracker.config import AlarmConfig, DriftConfig
 from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Frame, SemanticClass
 
@@ -256,7 +256,7 @@ def test_frames_that_show_nothing_let_the_estimate_age(
         status.append(update.status)
         if frame.index == STEP + 5:
             tracker.save(tmp_path / "tracker.npz")
-            resumed = current(Tracker.load(tmp_path / "tracker.npz"))
+            resumed = current_update(Tracker.load(tmp_path / "tracker.npz"))
             assert resumed.unconfirmed_s == update.unconfirmed_s > 0.5
             assert resumed.offset_unconfirmed_s == update.offset_unconfirmed_s > 0.5
     assert status[CHECKED - 5 : CHECKED] == ["unconfirmed"] * 5
@@ -315,7 +315,7 @@ def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -
     off, sigmas = np.array(errors).T
     assert np.abs(off).max() < 0.25 and np.mean(np.abs(off) < 2.5 * sigmas) > 0.8
     last_deg = 0.25e-9 * ((follows.inputs.window.last_stamp_ns or 0) - start_ns)
-    at_end = [_yaw_error(street, current(tracker), last_deg)[0] for tracker in (follows, steady)]
+    at_end = [_yaw_error(street, current_update(tracker), last_deg)[0] for tracker in (follows, steady)]
     assert abs(at_end[0]) < 0.5 * abs(at_end[1])
 
 

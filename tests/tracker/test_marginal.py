@@ -13,7 +13,7 @@ from sst_graph import Tracker
 from sst_graph.errors import EstimationError
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, fuse_marginals
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.marginal import TrackedMarginal, increment, moved_to
 from sst_graph.types import Frame
 
@@ -60,7 +60,7 @@ def test_the_parts_together_are_the_whole(
     np.testing.assert_allclose(fused.information / scale, whole.information / scale, atol=1e-6)
     assert fused.cTl.equals(whole.cTl, 1e-9)
     assert fused.offset_s == pytest.approx(whole.offset_s, abs=1e-9)
-    np.testing.assert_allclose(whole.covariance(), current(tracker).covariance, rtol=1e-6)
+    np.testing.assert_allclose(whole.covariance(), current_update(tracker).covariance, rtol=1e-6)
     # And it did grow on the way.
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
 
@@ -72,7 +72,7 @@ def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMargin
     for part in (first, *parts):
         graph.add(part.factor())
     values = gtsam.LevenbergMarquardtOptimizer(graph, first.point()).optimize()
-    update = current(tracker)
+    update = current_update(tracker)
     assert update.covariance is not None
     sigmas = np.sqrt(np.diag(update.covariance))
     step = gtsam.Pose3.Logmap(update.T_camera_lidar.between(values.atPose3(EXTRINSIC)))
@@ -103,7 +103,7 @@ def test_before_a_start_and_after_a_change(street: SimulatedDrive, frames: list[
     tracker = tracker_from_truth(street)
     with pytest.raises(EstimationError, match="no estimate yet"):
         tracker.marginal()
-    assert current(tracker).covariance is None and current(tracker).covariance_reason
+    assert current_update(tracker).covariance is None and current_update(tracker).covariance_reason
     for frame in frames[:9]:
         tracker.add(frame)
     known = tracker.marginal()

@@ -13,7 +13,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.state import State
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.tracker.start import solution as tracker_start
 from sst_graph.tracker.start.solution import Guess, first_estimate_steps
 from sst_graph.tracker.window.gaussian import Point
@@ -41,7 +41,7 @@ def test_a_better_pose_that_has_not_converged_prevents_a_start(
 
     def solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[tracker_start._Solved]:
         yield 1
-        if start.offset_s(0) > 0.0:
+        if start.time_offset_s(0) > 0.0:
             raise tracker_start._NotConverged("still moved", _solved(turn_deg, cost))
         return _solved(0.0, 3.0)
 
@@ -51,9 +51,9 @@ def test_a_better_pose_that_has_not_converged_prevents_a_start(
         with pytest.raises(
             EstimationError, match=r"cost 2\.500 against 3\.000 a point\), but has not converged"
         ):
-            whole(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig()))
+            run_to_end(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig()))
     else:
-        assert whole(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig())).cTl.equals(
+        assert run_to_end(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig())).cTl.equals(
             gtsam.Pose3(), 1e-9
         )
 

@@ -11,7 +11,7 @@ from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.types import Frame
@@ -38,7 +38,7 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
 ) -> None:
     """The start is given up within some frames, not ok before; the next one is of the frames since."""
     tracker, updates = answers(street, frames, step)
-    given_up = [i for i, update in enumerate(updates) if "estimated anew" in update.reason]
+    given_up = [i for i, update in enumerate(updates) if "estimated again" in update.reason]
     assert given_up and step <= given_up[0] < step + 12 and len(given_up) <= 2
     assert not any(update.status == "ok" for update in updates[: given_up[0]])
     assert all(updates[i].status == "starting" and not updates[i].accepted for i in given_up)
@@ -51,7 +51,7 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
 
 def test_quiet_frames_contradict_no_start(street: SimulatedDrive, frames: list[Frame]) -> None:
     _, updates = answers(street, frames[:26], None)
-    assert not any("estimated anew" in update.reason for update in updates)
+    assert not any("estimated again" in update.reason for update in updates)
     assert updates[7].accepted
 
 
@@ -62,7 +62,7 @@ def test_labels_that_always_contradict_are_no_way_without_end(
     tracker = tracker_from_truth(street)
     tracker.monitor.changes.start_threshold = 0.1
     updates = [tracker.add(frame) for frame in frames[:30]]
-    assert sum("estimated anew" in update.reason for update in updates) == 2
+    assert sum("estimated again" in update.reason for update in updates) == 2
     assert tracker.estimate.exists
 
 
@@ -94,7 +94,7 @@ def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, fram
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     for by_static_objects, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
         tracker.estimate.uncertainty = Uncertainty(joint, 1.0, by_static_objects)
-        update = current(tracker)
+        update = current_update(tracker)
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)
     assert "by static objects alone" in update.weak_directions[0].sentence

@@ -11,7 +11,7 @@ import numpy as np
 
 from sst_graph.config import Settings, setting
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.odometry.sweep.estimate import Estimate, at_hypothesis, estimate, start_of
+from sst_graph.odometry.sweep.estimate import SweepEstimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
 from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
@@ -243,7 +243,9 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
     return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
 
 
-def _compare_hypotheses(windows: Sequence[Window], found: Estimate, timing: SweepTiming) -> SweepDecision:
+def _compare_hypotheses(
+    windows: Sequence[Window], found: SweepEstimate, timing: SweepTiming
+) -> SweepDecision:
     """The three hypotheses by their evidence, that of compensated points being 1."""
     evidence = found.evidence(windows)
     ratios: dict[str, FloatArray] = {name: evidence.log_ratio(f) for name, f in FRACTIONS.items()}

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sst_graph.association.edge_matching import GATE
-from sst_graph.drive.preparation import Drive, outline_size
+from sst_graph.drive.preparation import Drive, boundary_count
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
@@ -85,7 +85,7 @@ def held_out_cost(
     A point that finds no contour costs as much as the farthest match.
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
-    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
+    counted = [(pair, boundary_count(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
     return mean_cost(counted, point, classes, kernel)
 
 

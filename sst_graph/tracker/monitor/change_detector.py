@@ -23,7 +23,7 @@ from sst_graph.tracker.monitor.statistic import (
     CONFIRMATIONS,
     FRAMES,
     ChangeStatistic,
-    Estimate,
+    ComparedEstimate,
     EstimateCovariance,
 )
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
@@ -124,7 +124,7 @@ class ChangeDetector:
         self._moving: set[int] = set()
 
     def restart(self) -> None:
-        """Forget the frames: the calibration is estimated anew."""
+        """Forget the frames: the calibration is estimated again."""
         self.statistic.restart()
         self.scans.clear()
         self._before.clear()
@@ -140,7 +140,7 @@ class ChangeDetector:
         self._start_scan, self._recheck_after = scan, self._first_recheck
         self.start_unconfirmed = self.config.enabled
 
-    def check_start(self, scans: Sequence[int], estimate: Estimate) -> str:
+    def check_start(self, scans: Sequence[int], estimate: ComparedEstimate) -> str:
         """In what way frames contradict the estimate that was made of them; empty where they do not.
 
         Where the calibration changed among the frames of a start, or where the start was wrong, its estimate
@@ -155,9 +155,9 @@ class ChangeDetector:
         if value <= self.start_threshold:
             return ""
         self.refused_starts += 1
-        return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated anew"
+        return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated again"
 
-    def recheck_start(self, scan: int, scans: Sequence[int], estimate: Estimate) -> None:
+    def recheck_start(self, scan: int, scans: Sequence[int], estimate: ComparedEstimate) -> None:
         """The same when half as many frames again have come, and then each time after twice as many.
 
         Labels that err for a while contradict a start as a step does, so it is no longer given up; but until
@@ -167,7 +167,7 @@ class ChangeDetector:
             self._recheck_after *= 2
             self._confirm_start(scans, estimate, self._moving, self.start_threshold)
 
-    def check_start_at_end(self, scans: Sequence[int], estimate: Estimate) -> None:
+    def check_start_at_end(self, scans: Sequence[int], estimate: ComparedEstimate) -> None:
         """At the end of a drive, the same of all frames in the graph for a start that no frame came after.
 
         They are more, in more parts, than a start is made of: new frames' threshold holds.
@@ -179,12 +179,14 @@ class ChangeDetector:
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
     def _confirm_start(
-        self, scans: Sequence[int], estimate: Estimate, moving: Collection[int], threshold: float
+        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int], threshold: float
     ) -> None:
         if self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= threshold:
             self.refused_starts, self.start_unconfirmed = 0, False
 
-    def _disagreement(self, scans: Sequence[int], estimate: Estimate, moving: Collection[int]) -> float:
+    def _disagreement(
+        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int]
+    ) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
         The parts are its first ones, its last ones, and any few in a row.
@@ -205,7 +207,9 @@ class ChangeDetector:
 
     # ------------------------------------------------------------------ new frames
 
-    def check(self, waiting: Sequence[int], matches: Mapping[int, int], estimate: Estimate) -> float | None:
+    def check(
+        self, waiting: Sequence[int], matches: Mapping[int, int], estimate: ComparedEstimate
+    ) -> float | None:
         """The statistic of the latest frames with some new ones; None while there are too few.
 
         Args:
@@ -247,7 +251,7 @@ class ChangeDetector:
             self._confirm(estimate)
         return value
 
-    def change(self, estimate: Estimate) -> Change | None:
+    def change(self, estimate: ComparedEstimate) -> Change | None:
         """The change that the frames so far make certain; what they only suggest is noted.
 
         Args:
@@ -293,7 +297,7 @@ class ChangeDetector:
         latest = [unmet for unmet, _ in self._unmatched][-frames:]
         return len(latest) == frames and sum(latest) >= frames - 1
 
-    def _confirm(self, estimate: Estimate) -> None:
+    def _confirm(self, estimate: ComparedEstimate) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
         comparison = self.statistic.latest
         if unreliable := self.confirmation.unreliable:
@@ -308,7 +312,7 @@ class ChangeDetector:
             tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
             self.confirmation.add(self.statistic.detectable(comparison, tried))
 
-    def _contradicted(self, reference: Reference, estimate: Estimate) -> bool:
+    def _contradicted(self, reference: Reference, estimate: ComparedEstimate) -> bool:
         """Whether all frames since the reference contradict it.
 
         They must do so with any one object left out, too. Where a single object contradicts, its labels may
@@ -317,7 +321,7 @@ class ChangeDetector:
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
-        against = Estimate(reference.point, reference.covariance, estimate.model)
+        against = ComparedEstimate(reference.point, reference.covariance, estimate.model)
 
         def value(*without: int) -> float:
             return self._value(
@@ -333,5 +337,5 @@ class ChangeDetector:
         objects = self.matcher.objects_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)
 
-    def _value(self, scores: Collection[LinearizedPair], estimate: Estimate) -> float:
+    def _value(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> float:
         return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))

@@ -32,7 +32,7 @@ class Monitor:
         self.adoption.restart()
 
     def restart(self) -> None:
-        """The calibration is estimated anew."""
+        """The calibration is estimated again."""
         self.changes.restart()
         self.adoption.restart()
 
@@ -51,7 +51,7 @@ class Monitor:
                 return chi2, Restart(near, change.scans, "the calibration has changed", True, chi2)
             self.changes.refused_starts += 1
             near = Guess(estimate.point.cTl, estimate.point.offset_s)
-            why = "new frames contradict the start: it is estimated anew"
+            why = "new frames contradict the start: it is estimated again"
             return chi2, Restart(near, change.scans, why)
         if matches.new:
             cost = partial(self.matcher.cost, chosen=matches.new)

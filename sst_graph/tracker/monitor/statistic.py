@@ -59,7 +59,7 @@ class EstimateCovariance:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ComparedEstimate:
     """An estimate that frames are compared with.
 
     Attributes:

@@ -35,7 +35,7 @@ NUMERICAL_ERRORS = (
 
 _WORK_PER_FRAME = 48
 """Work on a start with each frame, in units of 1 to 4 ms: the estimate comes when all is done, some frames
-later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal answers."""
+later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal results."""
 _RESTART_SCANS = 8
 """Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""
 _MAX_ATTEMPTS = 2
@@ -51,7 +51,7 @@ def searched_scans(config: TrackerConfig) -> int:
 
 @dataclass(frozen=True)
 class Restart:
-    """Why, and from where, the calibration is to be estimated anew.
+    """Why, and from where, the calibration is to be estimated again.
 
     Attributes:
         guess: where the new start begins.

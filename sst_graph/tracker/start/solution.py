@@ -224,7 +224,7 @@ def _solution(
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     names = tuple(name for name, _ in named_sigmas(calibration.joint.graph.estimate))
     parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    cTl, offset_s = state.cTl, state.offset_s(0)
+    cTl, offset_s = state.cTl, state.time_offset_s(0)
     point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
@@ -232,7 +232,7 @@ def _solution(
     if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
-    _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
+    _check_pairs(drive, start.time_offset_s(0), len(solution.pairs), state.time_offset_s(0), config)
     return _Solved(_cost(drive, point, config), point)
 
 

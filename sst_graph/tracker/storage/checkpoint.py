@@ -30,7 +30,7 @@ from sst_graph.files import atomic_write_in_steps
 from sst_graph.files.checked_values import checked_camera
 from sst_graph.files.object_store import Block, Blocks, Node, class_name, lay_out, restored, stored
 from sst_graph.files.reading import FileKind, parse_json, read_file
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
 from sst_graph.types import NO_PICTURE, CameraImage
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 19
+VERSION = 20
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -154,7 +154,7 @@ class Saver:
 
 
 def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
-    """Build iSAM2 and the odometry's map anew from what a checkpoint holds.
+    """Build iSAM2 and the odometry's map again from what a checkpoint holds.
 
     The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
 
@@ -287,13 +287,13 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
         checked_camera(tracker.inputs.camera, "camera")
         check_inputs(tracker)
         tracker.initializer.catch_up()
-        current(tracker).to_dict()
+        current_update(tracker).to_dict()
         consolidate(tracker)
         _again(tracker)
-        current(tracker).to_dict()
+        current_update(tracker).to_dict()
         stored(tracker)
     except Exception as error:
-        found = f"a tracker that does not answer ({type(error).__name__}: {error})"
+        found = f"a tracker that gives no estimate ({type(error).__name__}: {error})"
         raise CheckpointError(path, found, "all of a tracker") from error
 
 

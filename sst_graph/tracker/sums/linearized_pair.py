@@ -17,7 +17,7 @@ from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, GraphConfig, PairMatches
-from sst_graph.graph.nuisances import columns_beside
+from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.tracker.sums.object_sums import ObjectInformation
@@ -205,7 +205,7 @@ def _rows(
             block[:, place] = pair.terms[c][name] * J[:, 13]
         if held:
             assert pair.scene is not None
-            own = columns_beside(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
+            own = columns_of_jacobian(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
             block[:, point.size :] = own
         blocks.append(block)
         twists.append(J[:, 7:13])

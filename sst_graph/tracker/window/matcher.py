@@ -11,7 +11,7 @@ import numpy as np
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
-from sst_graph.drive.preparation import Drive, outline_size, outlines
+from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import PairMatches, Tracks, associate
@@ -29,7 +29,7 @@ from sst_graph.types import SemanticClass
 _MIN_MATCHES = 8
 """Fewest matches of a scan that enters the graph: fewer hardly determine anything."""
 _SMOOTHED = 12
-"""So many of the latest motions are smoothed anew with every scan."""
+"""So many of the latest motions are smoothed again with every scan."""
 
 
 class WindowMatcher:
@@ -163,7 +163,7 @@ class WindowMatcher:
         ):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
-            for c, points in outlines(part.scans[pair.scan], self.graph.lower_edges).items():
+            for c, points in boundaries_of(part.scans[pair.scan], self.graph.lower_edges).items():
                 if c in contours:
                     cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
                     inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
@@ -203,7 +203,7 @@ class WindowMatcher:
         else:
             pairs, _ = self._pairs(point, chosen, self.kernel)
         scans, below = dict(self.window.scans), self.graph.lower_edges
-        counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
+        counted = [(pair, boundary_count(scans[number], below)) for number, pair in pairs.items()]
         return mean_cost(counted, point, self.classes, self.kernel)
 
     def _pairs(

@@ -22,7 +22,7 @@ _CONVERGED_SIGMAS = 0.02
 _INNER = 2
 """Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
 SCANS = 5
-"""Scans matched with each frame while the window is matched anew: more make these frames slower."""
+"""Scans matched with each frame while the window is matched again: more make these frames slower."""
 _PASSES = 2
 """How often a running tracker matches the whole window when it relinearizes."""
 
@@ -57,7 +57,7 @@ class RelinearizationSchedule:
 def relinearize_window(
     smoother: WindowSmoother,
     matcher: WindowMatcher,
-    kernel_px: Sequence[float],
+    kernels_px: Sequence[float],
     most: int,
     whole_steps: int,
     alive: Container[int],
@@ -70,7 +70,7 @@ def relinearize_window(
     are shortened and end in the middle of it, as the batch's do.
 
     Args:
-        kernel_px: scales of the robust kernel, one a step.
+        kernels_px: scales of the robust kernel, one a step.
         most: further steps under the last one.
         whole_steps: those of them before the steps are shortened.
         alive: tracks of objects that may be seen again.
@@ -83,12 +83,12 @@ def relinearize_window(
         EstimationError: an update fails; what the steps before it reached stays.
     """
     at = smoother.point
-    for i in range(len(kernel_px) + most):
-        kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
+    for i in range(len(kernels_px) + most):
+        kernel = RobustKernel("geman_mcclure", kernels_px[min(i, len(kernels_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         smoother.update(found, missing, 0, alive)
         smoother.optimize(_INNER)
-        last = i + 1 - len(kernel_px)
+        last = i + 1 - len(kernels_px)
         left = smoother.point.core().local(at.core())
         n = len(left)
         if (

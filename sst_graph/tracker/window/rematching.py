@@ -18,7 +18,7 @@ _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
 _IN_TURN = 1
-"""Scans matched anew with each frame besides the newest, the most outdated first: each costs as much as the
+"""Scans matched again with each frame besides the newest, the most outdated first: each costs as much as the
 newest."""
 _MOST_IN_TURN = 4
 """As many while the estimate moves."""

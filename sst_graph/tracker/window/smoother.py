@@ -1,4 +1,4 @@
-"""iSAM2 over a window of pairs that are matched anew; what leaves it stays as one linear factor."""
+"""iSAM2 over a window of pairs that are matched again; what leaves it stays as one linear factor."""
 
 from __future__ import annotations
 
@@ -243,7 +243,7 @@ class WindowSmoother:
     def _linearized(
         self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
     ) -> tuple[gtsam.ISAM2, list[int]]:
-        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
+        """A fresh iSAM2 of all factors (made again where None) at some values, and the factors' indices."""
         isam = gtsam.ISAM2(_parameters(self.graph.estimate))
         whole = self._whole() if graph is None else graph
         return isam, list(isam.update(whole, values).getNewFactorsIndices())

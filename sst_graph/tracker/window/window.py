@@ -1,4 +1,4 @@
-"""The last scans, images and motions: what the tracker can still match anew."""
+"""The last scans, images and motions: what the tracker can still match again."""
 
 from __future__ import annotations
 

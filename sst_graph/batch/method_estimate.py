@@ -58,7 +58,7 @@ class DriveCovariance:
 
 
 @dataclass(frozen=True)
-class Answer:
+class MethodEstimate:
     """What a method found.
 
     Attributes:
@@ -86,42 +86,43 @@ class Answer:
 
 
 def result_of(
-    answer: Answer, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+    estimate: MethodEstimate, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
-    """The result: unobservable where the covariance says so, not_converged where the answer may be wrong."""
+    """The result: not_converged where there is a reason, unobservable where a direction exceeds the
+    limits."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
-    weak = _weak_directions(answer, config.observability, advice)
-    wrong = (*answer.reasons, *(_jumps(drives) if config.check_stamps else ()))
+    weak = _weak_directions(estimate, config.observability, advice)
+    wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(
-        T_camera_lidar=answer.cTl,
-        time_offset_s=answer.offset_s,
-        covariance=answer.covariance,
+        T_camera_lidar=estimate.cTl,
+        time_offset_s=estimate.offset_s,
+        covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *answer.remarks, *sentences),
+        reasons=(*wrong, *estimate.remarks, *sentences),
         weak_directions=weak,
-        frames_used=answer.frames,
-        drive_offsets=answer.drive_offsets,
+        frames_used=estimate.frames,
+        drive_offsets=estimate.drive_offsets,
         method=config.method,
         config=to_dict(config),
         initial=guess.cTl,
         initial_offset_s=guess.offset_s,
-        diagnostics={**answer.diagnostics, **sweeps_of(drives)},
+        diagnostics={**estimate.diagnostics, **sweeps_of(drives)},
         versions=_versions(),
     )
 
 
 def _weak_directions(
-    answer: Answer, limits: ObservabilityConfig, advice: Advice
+    estimate: MethodEstimate, limits: ObservabilityConfig, advice: Advice
 ) -> tuple[WeakDirection, ...]:
     """What is not known; where drives have an offset each, of each drive's, named by the drive."""
-    if not answer.by_drive:
-        return open_directions(answer.covariance, answer.by_static_objects, answer.cTl, limits, advice)
+    if not estimate.by_drive:
+        return open_directions(estimate.covariance, estimate.by_static_objects, estimate.cTl, limits, advice)
     found: list[WeakDirection] = []
-    for number, known in enumerate(answer.by_drive):
-        for weak in open_directions(known.covariance, known.by_static_objects, answer.cTl, limits, advice):
+    for number, known in enumerate(estimate.by_drive):
+        for weak in open_directions(known.covariance, known.by_static_objects, estimate.cTl, limits, advice):
             if involves_offset(weak):
                 found.append(replace(weak, sentence=f"drive {known.drive!r}: {weak.sentence}"))
             elif number == 0:  # of the extrinsic alone, which all drives share
@@ -159,15 +160,16 @@ def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[Frame
 
 def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray) -> tuple[DriveOffset, ...]:
     """Each drive's time offset, where they have one each; covariance: (n, n) of extrinsic and offsets."""
-    if len(state.offsets_s) == 1:
+    if len(state.time_offsets_s) == 1:
         return ()
     sigmas = np.sqrt(np.diag(covariance))
     return tuple(
-        DriveOffset(drive.name, state.offset_s(i), float(sigmas[6 + i])) for i, drive in enumerate(drives)
+        DriveOffset(drive.name, state.time_offset_s(i), float(sigmas[6 + i]))
+        for i, drive in enumerate(drives)
     )
 
 
-def no_answer(
+def guess_as_result(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
 ) -> CalibrationResult:
     """What is known when no estimate could be made: the guess, with sigmas that say so."""
