@@ -15,8 +15,8 @@ from sst_graph.stepwise import run_to_end
 from sst_graph.types import SemanticClass
 
 _MIN_RATIO = 0.9
-"""Least score of a result as a fraction of the best one found around it: below 1, for the labels' own errors
-move the best score's place a little."""
+"""Least score of a result as a fraction of the best one found around it: below 1, because errors of the
+labels move the maximum a little."""
 
 
 @dataclass(frozen=True)

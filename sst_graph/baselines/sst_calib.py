@@ -1,6 +1,6 @@
 """SST-Calib as printed (Kodaira, Zhou, Zang, Zhan, Tomizuka, ITSC 2022): the static and the joint stage.
 
-Where the print is silent: frames are those of equal stamps, spread over the drive; the time offset starts
+Where the paper says nothing: frames are those of equal stamps, spread over the drive; the time offset starts
 at the guess; camera velocity comes from visual odometry with LiDAR depth, computed again every few
 steps because the depth depends on extrinsic and offset; one Levenberg-Marquardt step follows each match.
 """
@@ -235,7 +235,7 @@ def camera_motions(
     """Metric motions of each drive's camera, with LiDAR depth placed by a calibration.
 
     Args:
-        former: motions found earlier, which carry the depth to the image's instant; None: at rest.
+        former: motions found earlier, by which the points are moved to the image's instant; None: at rest.
     """
     return [
         metric_motions(drive.image_pairs, drive.camera, _Depth(drive, at, before))

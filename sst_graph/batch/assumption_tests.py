@@ -1,7 +1,7 @@
 """Do the data contradict what is assumed? The parameter of each assumption is estimated and tested.
 
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
-near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
+near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
 parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
 others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
 contradicted most is solved for once more, alone and from where that step leads, to state its estimate.
@@ -39,13 +39,13 @@ FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 _LEAST_FREEDOM = 8
-"""Degrees of freedom that few objects have: each has several sides, and the error model a floor."""
+"""Least degrees of freedom of Student's t: each object has several sides, and the error model has a floor."""
 _ALL_FREE_KERNELS_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
-"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. That it
-still moves after them does not matter: the linear step to one parameter's estimate goes the rest of the way.
+"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. It need
+not converge: the linear step to one parameter's estimate covers the rest.
 """
 _ONE_FREE_KERNELS_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
-"""... and of the solution with one of them free, which starts near its end [px]."""
+"""Kernel scales of the solution with one parameter free, which starts near its optimum [px]."""
 _MOST_AT_LAST_SCALE = 4
 """Most further outer iterations of the latter at the last scale."""
 
@@ -57,7 +57,7 @@ class ParameterTest:
     Attributes:
         assumption: which.
         value, sigma: estimate and its deviation, in the parameter's unit.
-        contradicted: whether the assumption is.
+        contradicted: whether the assumption is contradicted.
     """
 
     assumption: Assumption
@@ -66,7 +66,7 @@ class ParameterTest:
     contradicted: bool
 
     def __getstate__(self) -> dict[str, Any]:
-        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        """The assumption by its name: its effect is a function, which cannot be stored."""
         return {**vars(self), "assumption": self.assumption.name}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
@@ -191,7 +191,7 @@ class LinearProblem:
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
 
     def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
-        """JointEstimate of one parameter while the others of them are zero."""
+        """Estimate of one parameter while the others of them are zero."""
         step, kept, bread = self._step_to(name)
         moved = self.table.after(step)
         table = _centred(replace(moved, J=moved.J[:, kept]), bread)
@@ -204,7 +204,7 @@ class LinearProblem:
         return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
 
     def start_of(self, finding: ParameterTest) -> State:
-        """Where a solution with a finding's parameter alone is to be expected."""
+        """Predicted state of a solution with a finding's parameter alone."""
         step, _, _ = self._step_to(finding.assumption.name)
         offsets = step[6 : 6 + len(self.state.time_offsets_s)]
         return replace(
@@ -234,15 +234,15 @@ class LinearProblem:
 
 
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
-    """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
-    zero, and the jackknife over objects would take that for a disagreement among them."""
+    """Matches with the residuals of a linear fit. After a long step the sum of the scores is not zero, and
+    the jackknife over objects would count that as disagreement among the objects."""
     return table.after(-bread @ (table.J.T @ (table.root_weights * table.r)))
 
 
 def _solved_alone(
     problem: SolvedProblem, finding: ParameterTest, start: State, config: AssumptionConfig
 ) -> ParameterTest:
-    """The finding by a solution with its parameter alone; as it was where that ends somewhere else."""
+    """The finding from a solution with its parameter alone; unchanged where that solution disagrees."""
     name = finding.assumption.name
     try:
         solution = problem.solve_with(
@@ -263,18 +263,18 @@ def _solved_alone(
 
 
 def few_objects_factor(objects: int, threshold: float) -> float:
-    """By how much a deviation from few objects is to be larger for the same false alarms at a threshold.
+    """Factor on a standard deviation from few objects that keeps the rate of false alarms at a threshold.
 
-    Errors of one object go together for a whole drive, so that there are as many of them as objects, and the
-    estimate over its deviation follows Student's t rather than the normal distribution (Cameron and Miller, A
-    practitioner's guide to cluster-robust inference, 2015).
+    The errors of one object are correlated over a whole drive, so there are as many independent errors as
+    objects, and the estimate over its deviation follows Student's t rather than the normal distribution
+    (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015).
     """
     tail = float(norm.sf(threshold))
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
 
 
 def with_test_results(considered: Considered, findings: Sequence[ParameterTest]) -> Considered:
-    """What is considered, with the deviations of the parameters that the data leave open."""
+    """The considered assumptions, with larger deviations for parameters that the tests leave open."""
     evidence = {
         f.assumption.name: Evidence(
             f.value,
@@ -290,7 +290,7 @@ def with_test_results(considered: Considered, findings: Sequence[ParameterTest])
 
 
 def contradiction_sentence(findings: Sequence[ParameterTest]) -> tuple[str, ...]:
-    """The reason that the data contradict assumptions: the most likely one, and which others would do.
+    """The sentence about contradicted assumptions: the most likely one, then the others.
 
     Args:
         findings: the most contradicted first.
@@ -306,7 +306,7 @@ def assumption_report(considered: Considered, findings: Sequence[ParameterTest])
     """JSON-able: what each assumption adds to the covariance, and the test of it.
 
     By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the estimate
-    [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.
+    [rad, m, s per unit], and, where it was tested, ``estimate``, ``estimate_sigma``, ``contradicted``.
     """
     said = {finding.assumption.name: finding for finding in findings}
     report: dict[str, Any] = {}

@@ -80,7 +80,8 @@ def calibrate(
 def prepare_drives(
     sources: Sequence[Source], config: CalibrationConfig, progress: Progress | None = None
 ) -> list[Drive]:
-    """Of every frame what the method needs: image features are not tracked for one that does without."""
+    """Read each source once, and keep what the method needs; image features are tracked only where they are
+    needed."""
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
@@ -110,7 +111,7 @@ def calibrate_prepared(
         result = result_of(estimate, drives, guess, config)
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
-    # What is probably wrong with the data comes first.
+    # Likely faults of the data become the first reasons.
     result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
@@ -151,7 +152,7 @@ def joint_method(
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
     assumptions = examine_assumptions(problem, motion.estimate)
-    # 7. What no match shows: motion that nothing measures, sweeps that nothing decides.
+    # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, assumptions.considered)
     # 8. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
@@ -182,6 +183,6 @@ _METHODS: dict[Method, _Method] = {
     "motion": motion_method,
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion")
-"""Methods whose velocity comes from visual odometry."""
+"""Methods whose camera velocity comes from visual odometry."""
 _NEED_DEPTH = ("paper", "static")
-"""Methods that take its length from LiDAR points."""
+"""Methods that take the metric scale of that velocity from LiDAR points."""

@@ -1,4 +1,4 @@
-"""Which parts of the data contradict the rest: drives among each other, stretches of time within a drive.
+"""Contradictions between drives, and between stretches of time within a drive.
 
 A result assumes one extrinsic for all drives and one time offset (or one a drive), from the first frame to
 the last. Each drive, and each stretch of a drive, is solved by itself, and the estimates are compared
@@ -26,8 +26,8 @@ FALSE_ALARM = 1e-3
 """Probability that any part of a calibration seems to contradict the rest where none does, as far as the
 covariances hold: one false alarm in a thousand calibrations."""
 _SUSPICION = 1e-2
-"""The same for one drive by its stretches alone, before both sides are solved to be sure: a larger one costs
-time only."""
+"""The same for one drive by its stretches alone, before both sides are solved to confirm it: a larger value
+costs only time."""
 _MOST_STRETCHES = 8
 """Stretches that a drive is cut into: each costs a solution of its scans."""
 _LEAST_SCANS = 4
@@ -40,7 +40,7 @@ class Contradictions:
 
     Attributes:
         sentences: one for each contradiction.
-        stretches: what was solved by itself.
+        stretches: the stretches, each solved by itself.
         diagnostics: JSON-able numbers.
     """
 
@@ -112,7 +112,7 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
     run = min(runs, key=lambda run: differences[run].rank)
     if differences[run].p_value * len(runs) > _SUSPICION:
         return None
-    # 2. Where exactly it begins and ends, and both sides by themselves.
+    # 2. Locate where it begins and ends, and solve both sides by themselves.
     inside, outside = ([s.state for s in side] for side in _sides(stretches, run))
     number, last = stretches[0].part.drive, len(parts.drives[stretches[0].part.drive].scans)
     first, end = stretches[run[0]].part.scans[0], stretches[run[1] - 1].part.scans[-1] + 1
@@ -133,7 +133,7 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
         states, difference = [own.state, rest.state], Difference.of(rest.step, own.step)
         if _located(parts, number, states)[0] == bounds:
             break
-    # 3. Is it certain, with both sides solved?
+    # 3. Confirm it with both sides solved.
     return Step(number, bounds, difference) if difference.p_value * len(runs) < false_alarm else None
 
 

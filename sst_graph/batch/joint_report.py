@@ -1,4 +1,4 @@
-"""What is reported beside a joint estimate: why it may be wrong altogether, and numbers about the run."""
+"""Reasons why a joint estimate may be wrong, and diagnostics of the run."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def joint_reasons(
     covariance: FloatArray,
     labels: Mapping[str, float],
 ) -> tuple[str, ...]:
-    """Why the joint estimate may be wrong altogether; empty where nothing says so.
+    """Reasons why the joint estimate may be wrong altogether.
 
     Args:
         solution: the estimate.

@@ -1,4 +1,4 @@
-"""From what a method found to a result: status, reasons, versions; the same for every method."""
+"""From the estimate of any method to a calibration result: status, reasons, versions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
 
 @dataclass(frozen=True)
 class Guess:
-    """What is known at first: an extrinsic, or None, and a time offset [s]."""
+    """Initial guess: an extrinsic, or None, and a time offset [s]."""
 
     cTl: gtsam.Pose3 | None
     offset_s: float = 0.0
@@ -59,16 +59,16 @@ class DriveCovariance:
 
 @dataclass(frozen=True)
 class MethodEstimate:
-    """What a method found.
+    """The estimate of a method, and what it reports.
 
     Attributes:
         cTl, offset_s: the estimate.
         covariance: (7, 7), see :class:`~sst_graph.result.CalibrationResult`.
         frames: that took part.
         reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
-        remarks: what else was missing, for the reader.
+        remarks: notes for the reader that do not change the status.
         by_static_objects: (7, 7) covariance by static objects alone, and by motion where always used.
-        drive_offsets: an offset for each drive, where one each was asked for.
+        drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
     """
@@ -117,7 +117,8 @@ def result_of(
 def _weak_directions(
     estimate: MethodEstimate, limits: ObservabilityConfig, advice: Advice
 ) -> tuple[WeakDirection, ...]:
-    """What is not known; where drives have an offset each, of each drive's, named by the drive."""
+    """Directions beyond the limits; where drives have an offset each, those of each drive, named by the
+    drive."""
     if not estimate.by_drive:
         return open_directions(estimate.covariance, estimate.by_static_objects, estimate.cTl, limits, advice)
     found: list[WeakDirection] = []
@@ -131,7 +132,7 @@ def _weak_directions(
 
 
 def sweeps_of(drives: Sequence[Drive]) -> dict[str, Any]:
-    """What was decided of the sweeps, by name of the drive, as an entry of the diagnostics."""
+    """Decisions about the sweeps by name of the drive, as an entry of the diagnostics."""
     found = {drive.name: drive.sweep.to_dict() for drive in drives if drive.sweep is not None}
     return {SWEEP_KEY: found} if found else {}
 
@@ -172,7 +173,7 @@ def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray)
 def guess_as_result(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
 ) -> CalibrationResult:
-    """What is known when no estimate could be made: the guess, with sigmas that say so."""
+    """The result where no estimate could be made: the guess, with large sigmas."""
     sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
     return CalibrationResult(
         T_camera_lidar=guess.cTl or gtsam.Pose3(),

@@ -56,7 +56,7 @@ def may_use_motion(config: CalibrationConfig) -> bool:
 def with_motion(
     problem: CalibrationProblem, labels: JointEstimate, stretches: Sequence[SolvedPart]
 ) -> WithMotion:
-    """The estimate with the motion in its graph, where the settings ask for it and the two agree.
+    """The estimate with the motion in its graph, where the settings allow it and the two agree.
 
     With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
     points of a scan share one time: a rolling sweep is compensated by the very motion.
@@ -153,7 +153,7 @@ def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], s
 
 
 def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:
-    """A sentence about two solutions that lie apart; none where the motion did not converge by itself."""
+    """A sentence about two solutions that differ; none where the motion did not converge by itself."""
     if not converged:
         return ()
     degrees, metres = np.degrees(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))

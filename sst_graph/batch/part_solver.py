@@ -32,7 +32,7 @@ _MOST_AT_LAST_SCALE = 3
 
 @dataclass(frozen=True)
 class Part:
-    """Some scans of one drive, by position, rising."""
+    """Some scans of one drive, by ascending position."""
 
     drive: int
     scans: tuple[int, ...]
@@ -81,7 +81,7 @@ class PartSolver:
         return self._solved(part, start, self.kernels_px[len(self.kernels_px) // 2 :])
 
     def best_start(self, part: Part, starts: Sequence[State]) -> State:
-        """The one of the reference and other states that the part agrees with most."""
+        """The reference, or the one of other states, with the largest support of the part."""
         candidates = [self.reference_of(part), *starts]
         return max(candidates, key=lambda start: float(self.support(part, start).sum()))
 

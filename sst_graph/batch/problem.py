@@ -1,4 +1,4 @@
-"""What the joint method solves, and an estimate of it with its covariance."""
+"""The problem of the joint method, and an estimate with its covariance."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Drives that share one extrinsic, and how they are to be solved.
+    """Drives that share one extrinsic, and the settings to solve them with.
 
     Attributes:
         drives: what is kept of them.

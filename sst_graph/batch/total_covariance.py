@@ -1,7 +1,7 @@
-"""The covariance of a joint estimate: that of the matches, and what no match shows.
+"""The total covariance of a joint estimate.
 
-Beside the matches stand the assumptions, motion that nothing measures, and sweeps that the scans leave
-undecided: there the problem is solved again with the point times of each hypothesis that is left.
+It is the sum of the parts by matches, by assumptions, by unmeasured motion, and by sweeps that the scans
+leave undecided: for these the problem is solved again with the point times of each remaining hypothesis.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How an estimate follows the assumptions it rests on, and what that adds to its covariance.
+"""Sensitivity of an estimate to its assumptions, and what that adds to its covariance.
 
-A parameter theta that is held at 0 but has deviation sigma moves the estimate by (dx/dtheta) theta: Schmidt's
-considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
-the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the covariance that
-the solve itself claims,
+A parameter theta that is held at 0 but has deviation sigma shifts the estimate by (dx/dtheta) theta:
+Schmidt's considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch.
+8). With J the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the
+covariance that the solve itself claims,
 
     dx/dtheta = -P J'c,      P_considered = sum sigma^2 (dx/dtheta)(dx/dtheta)'.
 """
@@ -105,7 +105,8 @@ class Considered:
     """What the assumptions add to a covariance.
 
     Attributes:
-        sensitivities: how extrinsic and offsets (n,) follow each parameter, by name [rad, m, s per unit].
+        sensitivities: derivative (n,) of extrinsic and offsets by each parameter, by name [rad, m, s per
+            unit].
         sigmas: deviations of the parameters.
     """
 
@@ -153,7 +154,7 @@ def considered_by_matches(
     state: State,
     config: AssumptionConfig,
 ) -> Considered:
-    """How an estimate follows every assumption that is not estimated beside it.
+    """Sensitivity of an estimate to every assumption that is not estimated, from its matches.
 
     Args:
         robust: its covariance and matches.
@@ -167,7 +168,7 @@ def considered_by_matches(
 
 
 def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int) -> dict[str, FloatArray]:
-    """How the first ``size`` unknowns follow parameters that are held at 0: (size,) each, by name.
+    """Sensitivity dx/dtheta (size,) of the first ``size`` unknowns to each parameter held at 0, by name.
 
     Args:
         bread: (n, n) inverse of the information of the unknowns, motion marginalised out.
@@ -177,7 +178,7 @@ def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: 
 
 
 def considered_by_steps(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
-    """What parameters that are held at 0 add to a covariance.
+    """What parameters held at 0 add to a covariance, from the sensitivities.
 
     Args:
         steps: by :func:`steps_by`.
@@ -203,7 +204,8 @@ def motion_covariance(
 
 
 def budget(covariance: FloatArray, motion: FloatArray, considered: Considered) -> dict[str, list[float]]:
-    """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
+    """JSON-able: the contribution of each part to the covariance of extrinsic and first offset, as sigmas
+    (7).
 
     Args:
         covariance: (n, n) of matches and motion.

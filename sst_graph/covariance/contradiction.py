@@ -25,8 +25,8 @@ _LEAST_FREEDOM = 4.0
 """Least degrees of freedom of a covariance, however few clusters: part of it is the error model's."""
 _WORTH, _WORTH_SHARE = 6.0, 0.05
 """A kind of step (rotation, translation, time offset) must lower the squared length by so much a number, and
-by this share of all of it, to be named: three times Akaike's price, for names are meant to be few; and a
-large step disturbs a little whatever else is estimated (odometry, what moves)."""
+by this share of all of it, to be named: three times Akaike's penalty, so that few are named; and a large step
+disturbs all other estimates a little (odometry, dynamic objects)."""
 _ONE_AXIS = 0.9
 """A step along one axis to this share (cosine) is named by that axis alone."""
 _KINDS = {"rotation": slice(0, 3), "translation": slice(3, 6), "offset": slice(6, 7)}
@@ -36,7 +36,7 @@ _WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
 
 @dataclass(frozen=True)
 class PartEstimate:
-    """What a part of the data says by itself.
+    """The estimate of one part of the data.
 
     Attributes:
         step: (7,) from the common reference to the part's estimate, in the tangent space of the reference
@@ -52,7 +52,7 @@ class PartEstimate:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far two parts lie apart.
+    """The difference between the estimates of two parts.
 
     Attributes:
         step: (n,) from the first to the second; 7 numbers, 6 where each part has a time offset of its own.
@@ -125,7 +125,7 @@ class NamedStep:
 
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
-    """What the step between two parts is, for people.
+    """The step between two parts, in words.
 
     Where speed and direction are steady, a time offset and a translation look alike, and one number is
     preferred to three.

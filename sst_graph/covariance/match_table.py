@@ -129,11 +129,11 @@ _MOST_DRIVES = 64
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the optimum differs in from where the matches were made, beside the state.
+    """Twists and parameters at the optimum, relative to the point that the matches were made at.
 
     Attributes:
         values: with the twists at the optimum.
-        responses: (6, n) how each twist follows the other unknowns, by its key.
+        responses: (6, n) derivative of each twist by the other unknowns, by its key.
         nuisances: steps of the assumptions' parameters since the matches were made, by name.
     """
 
@@ -175,5 +175,5 @@ def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
 
 
 def curvatures_of(kernel: RobustKernel, roots: FloatArray, r: FloatArray) -> FloatArray:
-    """(m,) second derivatives of the robust loss, weighted as matches are beside the kernel."""
+    """(m,) second derivatives of the robust loss, multiplied by the matches' own weights."""
     return np.asarray(roots**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UnknownMotionConfig(Settings):
-    """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood."""
+    """Deviations of the motion of a vehicle of which there is a single scan; both 0 where it stood."""
 
     speed_mps: float = setting(
         10.0,
@@ -43,9 +43,9 @@ class UnknownMotionConfig(Settings):
 def unknown_motion_covariance(
     pairs: Sequence[PairMatches], state: State, variance_s2: float, config: UnknownMotionConfig
 ) -> FloatArray:
-    """(7, 7) covariance of extrinsic and offset by motion that nothing measures, to be added to the matches'.
+    """(7, 7) covariance of extrinsic and offset by unmeasured motion, to be added to that of the matches.
 
-    In the LiDAR's frame the scan lies ``twist * interval`` beside where it is taken to be: a step of the
+    In the LiDAR's frame the scan is displaced by ``twist * interval``: a step of the
     extrinsic's tangent (right perturbation: rotation [rad], translation [m]) of this variance.
 
     Args:

@@ -1,4 +1,4 @@
-"""Where the result lies against the start."""
+"""Findings from the difference between result and start."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def start_finding(guess: gtsam.Pose3, found: Fit, finding: Finding) -> Finding:
 
 
 def other_camera(guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: FloatArray) -> Finding | None:
-    """A result beside the start by a stereo baseline, and parallel to it: pictures of the other camera.
+    """A result that is parallel to the start and shifted sideways by a stereo baseline: pictures of the other
+    camera.
 
     Args:
         covariance: (7, 7) of the result.

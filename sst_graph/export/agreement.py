@@ -20,7 +20,7 @@ SIGNIFICANCE = 1e-3
 _ROUNDING = 1e-6
 """Information below zero by this share of the whole is rounding."""
 _FAR_SIGMA = 1e3
-"""A direction that a marginal does not tell has this sigma [rad, m, s]."""
+"""Sigma of a direction that a marginal does not determine [rad, m, s]."""
 
 
 def check_agreement(
@@ -80,6 +80,6 @@ def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> 
 
 
 def _estimate(information: FloatArray, vector: FloatArray) -> PartEstimate:
-    """A cost's own optimum; a direction that it does not tell has a large variance."""
+    """A cost's own optimum; a direction that it does not determine has a large variance."""
     covariance = np.asarray(np.linalg.inv(information + np.eye(7) / _FAR_SIGMA**2), np.float64)
     return PartEstimate(covariance @ vector, covariance)

@@ -55,7 +55,7 @@ PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M = 1.0, 0.5
 nothing."""
 UNKNOWN_TWIST_SIGMAS = np.repeat([0.05, 0.5], 3)
 """(6,) deviations of the camera's twist from 0 where no odometry measures it [rad/s, m/s]: a vehicle that
-stands, or moves so slowly that the scan's motion is small beside other errors."""
+stands, or moves so slowly that the scan's motion is smaller than other errors."""
 
 
 def joint_graph(
@@ -80,7 +80,7 @@ def prior_graph(
     config: GraphConfig,
     guess: State | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """What is known of all unknowns but the twists without any match, and their values at a state.
+    """Priors of all unknowns but the twists, and the values of these unknowns at a state.
 
     Args:
         classes: (drive, class) of every class that has matches.
@@ -164,7 +164,7 @@ def _add_calibration(
 def _add_nuisances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
 ) -> None:
-    """The parameters that are estimated, with what is known of them beforehand."""
+    """The assumptions' parameters that are estimated, with their priors."""
     for name, sigma in named_sigmas(config.estimate):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.PriorFactorVector(nuisance_key(name), np.zeros(1), noise))

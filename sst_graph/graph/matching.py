@@ -98,9 +98,8 @@ class GraphConfig(Settings):
 
 
 DYNAMIC_REACH_M = 0.003
-"""A dynamic object that moves so far by itself between its scan and its image, in a way that is not known,
-keeps half of its weight, one that moves a little farther none [m]: a quarter of a pixel at 10 m with KITTI's
-camera."""
+"""A dynamic object whose unknown motion between its scan and its image is this long keeps half of its weight;
+one that moves a little farther keeps none [m]: a quarter of a pixel at 10 m with KITTI's camera."""
 
 
 @dataclass(frozen=True)
@@ -550,8 +549,8 @@ class DriveMatches:
 def _own_motion(
     groups: Sequence[tuple[DynamicObjects, SemanticClass, Boundaries]],
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """How much of the motion of each point's object is not known (n,), and its velocity (n, 3); None where no
-    object moves."""
+    """Unknown speed of each point's object (n,) [m/s], and its velocity (n, 3) [m/s]; None where no object
+    moves."""
     unknown = [np.zeros(len(points)) for _, _, points in groups]
     velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
     for (dynamic, c, points), slow, known in zip(groups, unknown, velocities, strict=True):

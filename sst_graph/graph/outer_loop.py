@@ -107,7 +107,7 @@ class JointProblem:
 
 @dataclass(frozen=True)
 class JointSolution:
-    """Where the outer loop ended.
+    """Result of the outer loop.
 
     Attributes:
         state: the estimate.
@@ -115,7 +115,7 @@ class JointSolution:
         pairs: pair by pair.
         graph, values: the last frozen graph and its optimum.
         outer_iterations: outer iterations done.
-        converged: the last step was short beside the frozen problem's own uncertainty.
+        converged: the last step was short compared with the sigmas of the frozen problem.
         matched_at: the state that the matches were made at.
     """
 

@@ -1,7 +1,7 @@
 """Pairs of camera and LiDAR motion, and their factor graph on E and D; no label, no depth.
 
-The camera's motion enters by rotation and direction alone: its length would hang on LiDAR depth placed by
-the very extrinsic that is sought.
+The camera's motion enters by rotation and direction alone: its length would depend on LiDAR depth placed by
+the extrinsic that is to be estimated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sst_graph.odometry.standstill import zero_velocity_update
 FloatArray = NDArray[np.float64]
 
 MIN_LENGTH_M = 0.1
-"""Shorter motions of the camera have no direction worth the name [m]."""
+"""Shorter motions of the camera do not determine a direction [m]."""
 MAX_ROTATION_SIGMA_RAD = 0.02
 """Camera motions whose rotation is known worse are left out [rad]."""
 PRIOR_SIGMAS: FloatArray = np.array([1.0] * 3 + [0.5] * 3 + [0.3])

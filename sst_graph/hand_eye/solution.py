@@ -44,8 +44,8 @@ _MAX_OUTER = 20
 _FIRST_OUTER = 4
 """Outer iterations from every start, before the best of them go on."""
 _FULL_STEPS = 6
-"""Outer steps after which ever smaller parts of each are made: robust weights and the LiDAR's motion at the
-new offset may alternate for ever."""
+"""Full outer steps before the steps are shortened: robust weights and the LiDAR's motion at the new offset
+may oscillate."""
 _STEP_SIGMAS = 0.1
 """An outer step shorter than this many standard deviations ends the outer loop."""
 _INNER_ITERATIONS = 10
@@ -75,7 +75,7 @@ class MotionConfig(Settings):
 
 @dataclass(frozen=True)
 class MotionSolution:
-    """Where the outer loop ended.
+    """Result of the outer loop.
 
     Attributes:
         state: the estimate.
@@ -172,7 +172,7 @@ def _solve(
     config: MotionConfig,
     max_outer: int = _MAX_OUTER,
 ) -> MotionSolution | None:
-    """Look the LiDAR's motion up at the time offset, optimise, until nothing moves.
+    """Interpolate the LiDAR's motion at the time offset and optimise, until the step is small.
 
     None where the offset runs away to where too few pairs are left.
     """

@@ -1,4 +1,4 @@
-"""Do the data contradict what a tracker assumes? Score tests from its sums, at any time.
+"""Score tests of the assumptions in the tracker, from its sums.
 
 What leaves the window is kept as one Gaussian on the unknowns x and the parameters of all assumptions
 (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
@@ -10,7 +10,7 @@ matches add, and
 
 is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
 threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.batch.assumption_tests`).
-Objects are not left out in turn: where an assumption is wrong all of them show it.
+There is no jackknife over objects: where an assumption is wrong, the residuals of all objects show it.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
 
 
 class AssumptionTests:
-    """When a running tracker tests what it assumes, and what it has found.
+    """Tests of the assumptions in a running tracker, and their results.
 
     Attributes:
         found: findings of the last test, by name of the assumption: (value, sigma, contradicted).

@@ -1,4 +1,4 @@
-"""The running estimate: the window's smoother, its covariance, and what is derived from them."""
+"""The running estimate: the window's smoother, its covariance, and quantities derived from them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """What was matched with a scan, at the estimate before it.
+    """The matches made with a new scan, at the estimate before it.
 
     Attributes:
         scan: its number.
@@ -69,7 +69,7 @@ class OnlineEstimate:
     """Extrinsic and time offset over the window and all that has left it.
 
     Attributes:
-        guess: what holds while there is no estimate.
+        guess: the calibration while there is no estimate.
         smoother: the graph of the window; None while there is no estimate.
         uncertainty: covariance of the estimate.
         tests: whether the data contradict what is assumed.
@@ -107,7 +107,7 @@ class OnlineEstimate:
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: Guess) -> None:
-        """Give the estimate up."""
+        """Discard the estimate."""
         self.guess = guess
         self.stop_relinearization()
         self.smoother, self.uncertainty = None, Uncertainty.nothing()
@@ -157,16 +157,16 @@ class OnlineEstimate:
         }
 
     def reported_covariance(self) -> FloatArray:
-        """(7, 7) of the present estimate, with what assumptions that may be wrong add to it."""
+        """(7, 7) covariance of the present estimate, with the considered assumptions."""
         return self.covariance[:7, :7] + self.considered().covariance(7)
 
     def considered(self) -> Considered:
-        """How the present estimate depends on the assumptions that are not estimated beside it."""
-        extra = considered_by_steps(self.uncertainty.steps, self.config.calibration.assumptions)
-        return with_test_results(extra, self.tests.findings)
+        """The considered assumptions: those whose parameters are not estimated."""
+        considered = considered_by_steps(self.uncertainty.steps, self.config.calibration.assumptions)
+        return with_test_results(considered, self.tests.findings)
 
     def for_comparison(self) -> ComparedEstimate:
-        """The running estimate as frames are compared with it."""
+        """The running estimate, for the comparison of new frames with it."""
         assert self.smoother is not None
         return ComparedEstimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
 
@@ -205,13 +205,13 @@ class OnlineEstimate:
             smoother.update(matches.found, set(matches.missing), window.first_scan, window.objects.live)
             window.dynamics.changed_scans -= matches.chosen
         self.entered.extend(new)
-        # 2. Now and then the whole window is matched and linearized again, some scans with each frame.
+        # 2. At times the whole window is matched and linearized again, some scans with each frame.
         self._schedule_relinearization(matches.scan)
         # 3. Covariance, and what the scan contributed to it.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
             self.information_log.add(matches.scan, self.reported_covariance())
-        # 4. Do the data contradict what is assumed?
+        # 4. Test the assumptions.
         self.tests.update(matches.scan, smoother)
         self.past_epochs.take(smoother)
 
@@ -223,7 +223,7 @@ class OnlineEstimate:
         window.growing = window.first_scan == self.schedule.first
 
     def stop_relinearization(self) -> None:
-        """Leave a relinearization of the window, if there is one, as it is."""
+        """Stop a relinearization of the window, if one is under way."""
         self.relinearization, self.matcher.window.growing = None, False
 
     def _schedule_relinearization(self, scan: int) -> None:
@@ -238,7 +238,8 @@ class OnlineEstimate:
     def _share(self) -> float:
         """Factor on the weights of matches.
 
-        In drift mode matches count as little as their clusters allow, so that the walk has its share.
+        In drift mode the weights are divided by the inflation of the cluster-robust covariance, so that
+        matches and random walk are weighted consistently.
         """
         return 1.0 / self.uncertainty.inflation if self.config.drift.enabled else 1.0
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 def make_update(
     tracker: Tracker, stamp_ns: int, reason: str = "", *, chi2: float | None = None, alarm: bool = False
 ) -> TrackUpdate:
-    """The present estimate and what is known of it.
+    """The present estimate, its covariance and status, as an update.
 
     Args:
         stamp_ns: of the scan or image that was added.
@@ -61,7 +61,7 @@ def current_update(tracker: Tracker, last: TrackUpdate | None = None) -> TrackUp
     """The present estimate, without a frame.
 
     Args:
-        last: update of the last frame; what it holds of that frame stays.
+        last: update of the last frame; its fields about that frame are kept.
     """
     update = make_update(tracker, tracker.inputs.window.last_stamp_ns or 0)
     if last is None:

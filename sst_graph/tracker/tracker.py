@@ -107,21 +107,21 @@ class Tracker:
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
                 jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
-                # 3. Stamps that jumped: earlier frames have another time offset.
+                # 3. Restart where stamps jumped: earlier frames have another time offset.
                 if restart := self._restart_by_stamps(clock_step_ns, jump):
                     return self._restart(restart, checked.stamp_ns)
-                # 4. Without an estimate: some work on a start.
+                # 4. Without an estimate: some work on the initialization.
                 if not self.estimate.exists:
                     return self._initialize(checked.stamp_ns)
                 # 5. Match new scans, and some of the window again.
                 matches = self.estimate.match(self.inputs.window.next_scan - 1)
-                # 6. Compare new frames with the estimate before they are used: has the calibration changed?
+                # 6. Change detection: compare new frames with the estimate before they are used.
                 chi2, change = self.monitor.check(matches, self.estimate)
                 if change is not None:
                     return self._restart(change, checked.stamp_ns)
-                # 7. Put the matches into the graph, and estimate.
+                # 7. Add the matches to the graph, and estimate.
                 self.estimate.update(matches)
-                # 8. Do frames since the start agree with it, and may the estimate be adopted?
+                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
                 return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
             return self._not_added("scan", scan, error)
@@ -129,10 +129,10 @@ class Tracker:
     def optimize(self, last: TrackUpdate | None = None, max_iterations: int = 20) -> TrackUpdate:
         """Solve the whole window as the batch does, as at the end of a drive.
 
-        A start that is not done yet is brought to its end first.
+        A start that is under way is completed first.
 
         Args:
-            last: update of the last frame; what it holds of that frame stays.
+            last: update of the last frame; its fields about that frame are kept.
             max_iterations: under the narrowest kernel.
 
         Returns:
@@ -149,15 +149,15 @@ class Tracker:
         return tracker_result(self, drive, camera_name)
 
     def marginal(self, since: TrackedMarginal | None = None) -> TrackedMarginal:
-        """What is known of extrinsic and time offset, as a factor for a graph of one's own.
+        """The marginal on extrinsic and time offset, as a factor for a graph of your own.
 
         Linearized at the estimate, with the reported covariance: estimated parameters of assumptions are
         marginalized out, those that are not estimated are considered.
 
-        To add it as it grows: ``known = tracker.marginal()`` once; then, whenever wanted,
+        To add it incrementally: ``known = tracker.marginal()`` once; then, whenever wanted,
         ``more = tracker.marginal(since=known)`` into the graph and ``known = known.plus(more)``. All parts
         are linearized at the first one's point, and their sum is the tracker's information. A single part
-        may be negative in some direction: frames may also show that less is known than it seemed.
+        may be negative in some direction: frames may also show that the covariance was too small.
 
         Args:
             since: an earlier marginal of this tracker, with what was added since.
@@ -208,7 +208,7 @@ class Tracker:
     # ------------------------------------------------------------------ steps
 
     def _initialize(self, stamp_ns: int) -> TrackUpdate:
-        """Some work towards a first estimate."""
+        """Do the work of one frame towards a first estimate."""
         try:
             initialization = self.initializer.work(self.matcher)
         except NUMERICAL_ERRORS as error:
@@ -218,11 +218,11 @@ class Tracker:
             return self._begin(initialization, stamp_ns)
         under_way = self.initializer.under_way
         return make_update(
-            self, stamp_ns, "looking for a start" if under_way else "collecting frames for a start"
+            self, stamp_ns, "searching for a start" if under_way else "collecting frames for a start"
         )
 
     def _finish_start(self) -> bool:
-        """Do all that is left of a start, where one can be made; whether there is an estimate."""
+        """Complete a start, where one can be made; whether there is an estimate."""
         try:
             initialization = self.initializer.finish(self.matcher)
         except NUMERICAL_ERRORS as error:
@@ -244,7 +244,8 @@ class Tracker:
         return make_update(self, stamp_ns)
 
     def _restart_by_stamps(self, clock_step_ns: int, jump: Jump | None) -> Restart | None:
-        """The restart that stamps call for: a clock was set, or stamps jumped against their interval."""
+        """The restart after a jump of the stamps: a clock was set, or stamps jumped against their
+        interval."""
         window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"

@@ -109,7 +109,7 @@ def test_several_parameters_add_up() -> None:
 
 
 @pytest.mark.parametrize("name", ASSUMPTIONS)
-def test_every_assumption_says_what_it_is(name: str) -> None:
+def test_every_assumption_has_violation_remedy_and_source(name: str) -> None:
     assumption = ASSUMPTIONS[name]
     assert assumption.name == name and assumption.violation and assumption.remedy and assumption.source
     assert 0.0 < assumption.sigma < assumption.span

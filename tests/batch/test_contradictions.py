@@ -207,7 +207,7 @@ def test_the_offset_of_every_drive_counts() -> None:
         assert offsets["standing"] > 3.0 * CONFIG.observability.offset_s > offsets["moving"]
 
 
-def test_parts_carry_the_tracks_of_their_scans() -> None:
+def test_parts_have_the_tracks_of_their_scans() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     parts, scans = parts_of(drives, STREET.time_offset_s), (3, 4, 5, 6, 10, 11)
     tracks = parts.tracks.part(0, scans)
@@ -223,7 +223,7 @@ def test_parts_carry_the_tracks_of_their_scans() -> None:
     assert support.shape == (6,) and (support > 0.0).all()
 
 
-def test_a_part_without_labels_in_common_says_nothing() -> None:
+def test_a_part_without_common_labels_has_no_estimate() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))
     parts = parts_of([blank], STREET.time_offset_s)

@@ -141,7 +141,7 @@ def test_fitted_variances_are_those_drawn() -> None:
     assert np.mean([f.side for f in fitted]) == pytest.approx(model.side, rel=0.12)
 
 
-def test_what_the_fit_swallows() -> None:
+def test_the_fit_absorbs_part_of_the_variance_of_sides() -> None:
     assert freedom_of_sides(300, 100) == pytest.approx(194 / 300)
     assert freedom_of_sides(12, 7) == freedom_of_sides(0, 0) == 0.25
 

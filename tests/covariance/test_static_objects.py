@@ -73,7 +73,7 @@ def test_where_nothing_moves_it_is_the_whole_one() -> None:
     assert static_covariance(robust, pairs) is robust.matrix
 
 
-def test_what_only_moving_objects_tell_is_not_called_known() -> None:
+def test_what_only_dynamic_objects_determine_is_unobservable() -> None:
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     for by_static_objects, status in (

@@ -78,7 +78,7 @@ def test_images_sent_twice_are_no_jump() -> None:
     assert not jumps(np.sort(np.concatenate([steady(), steady()[20::7]])))
 
 
-def test_a_hiccup_that_is_caught_up_is_no_jump() -> None:
+def test_a_pause_that_is_caught_up_is_no_jump() -> None:
     stamps = steady(jitter_ms=0.2)
     stamps[40:44] += np.array([60, 45, 30, 15]) * 1_000_000
     assert not jumps(stamps)

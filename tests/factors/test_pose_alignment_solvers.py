@@ -1,6 +1,6 @@
 """The factors on poses beside odometry, IMU preintegration and GPS, under LM, iSAM2 and fixed-lag smoothers.
 
-One graph, in which nothing is told of the calibration but by the camera's factors: every solver comes to the
+One graph, in which only the camera's factors determine the calibration: every solver comes to the
 truth from a start that is off in everything.
 """
 

@@ -104,6 +104,6 @@ def test_a_guess_is_what_the_priors_hold() -> None:
     guess = State(state.cTl.retract(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])), (0.25,))
     at_guess, values = joint_graph(pairs, state, CONFIG, guess)
     at_state, _ = joint_graph(pairs, state, CONFIG)
-    surplus = at_guess.error(values) - at_state.error(values)
+    excess = at_guess.error(values) - at_state.error(values)
     off = np.array([0.5 / PRIOR_ROTATION_SIGMA_RAD, 0.25 / CONFIG.time_offset_sigma_s])
-    assert surplus == pytest.approx(0.5 * off @ off, rel=1e-6)
+    assert excess == pytest.approx(0.5 * off @ off, rel=1e-6)

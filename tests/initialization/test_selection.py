@@ -1,4 +1,4 @@
-"""Which start is right, and when no answer is believed, on a small standing drive."""
+"""Selection of a start, and its refusals, on a small drive at standstill."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_the_right_one_of_three_is_selected() -> None:
     assert len(selection.starts) <= 3
 
 
-def test_a_pose_far_from_the_guess_is_no_answer() -> None:
+def test_a_pose_far_from_the_guess_is_refused() -> None:
     candidates = [Candidate(turned(0.0, 1.0, 2.0), 0.0, 1.0)]
     far = gtsam.Pose3(truth().rotation(), truth().translation() + np.array([0.0, 0.9, 0.0]))
     with pytest.raises(EstimationError, match="near the guess"):

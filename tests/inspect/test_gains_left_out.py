@@ -72,8 +72,8 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     large = np.abs(found) > 0.1  # a change of all sigmas together by 1 % is 0.1 bit
     assert large.sum() > 5
     np.testing.assert_array_equal(np.sign(claimed[large]), np.sign(found[large]))
-    told, grown = np.array([frame.without for frame in frames]), np.array(ratios)
-    for one, other in zip(told.T, grown.T, strict=True):
+    predicted, grown = np.array([frame.without for frame in frames]), np.array(ratios)
+    for one, other in zip(predicted.T, grown.T, strict=True):
         assert spearmanr(one, other)[0] > 0.8
         large = np.abs(np.log(other)) > NOISE
         assert large.sum() > 20 and np.mean((one > 1.0)[large] == (other > 1.0)[large]) > 0.9

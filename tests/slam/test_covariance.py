@@ -129,7 +129,7 @@ def test_errors_of_sides_are_found_in_the_residuals() -> None:
     assert (quiet.side, quiet.match) == (1.5**2, 1.0)
 
 
-def test_a_marginal_that_is_too_sure_is_told() -> None:
+def test_a_marginal_that_is_too_sure_gives_a_warning() -> None:
     """One side of one object in a hundred images: its error does not average."""
     rng, shape = np.random.default_rng(5), random_rows(100, 4, 40, seed=5)
     seen = rng.normal(size=(4 * SIDES, COLUMNS))  # a side lies in every image alike
@@ -179,10 +179,12 @@ def solution(steady: Street) -> RematchSolution:
     return solve_with_terms(*steady.whole(steady.start(1)), terms)
 
 
-def test_forward_against_later_is_told_as_weak(steady: Street, solution: RematchSolution) -> None:
+def test_forward_against_time_offset_is_weak(steady: Street, solution: RematchSolution) -> None:
     weak = [w for w in solution.warnings if w.kind is WarningKind.WEAK_DIRECTION]
     assert len(weak) == 1 and weak[0].value > 2.0 and weak[0].limit == 1.0
-    assert "cannot be told from the image taken later" in weak[0].detail and "record a stop" in str(weak[0])
+    assert "cannot be distinguished from the image taken later" in weak[0].detail and "record a stop" in str(
+        weak[0]
+    )
     assert steady.nees(solution.values, solution.covariance) < 18.5  # 99 % of 7
 
 
@@ -200,7 +202,7 @@ def test_matches_that_count_in_full_are_too_sure(steady: Street, solution: Remat
     assert by_hand.times_too_sure > 2.0
     P = gtsam.Marginals(graph, solution.values).jointMarginalCovariance([E, D]).fullMatrix()
     np.testing.assert_allclose(by_hand.marginal, P, rtol=1e-6)
-    # the scaled graph of the solution tells the same covariance
+    # the scaled graph of the solution has the same covariance
     scaled = calibration_covariance(solution.graph, solution.values, solution.matches)
     ratios = np.diag(scaled.covariance) / np.diag(by_hand.covariance)
     assert ratios.min() > 0.8 and ratios.max() < 1.25

@@ -36,7 +36,7 @@ def _warmed_up(tracker: Tracker) -> Tracker:
 
 
 @pytest.mark.parametrize("kind", ["knock", "clock"])
-def test_a_step_raises_the_alarm_and_is_learnt(
+def test_a_step_raises_the_alarm_and_is_estimated(
     street: SimulatedDrive, frames: list[Frame], kind: str
 ) -> None:
     """The camera is knocked, or its clock jumps: noticed within ten frames, though little is known yet."""
@@ -92,11 +92,11 @@ def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
 ) -> None:
     """With one object left out the others may show too little for an alarm so early: it is suspected then."""
     tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
-    told = [
+    alarm = [
         update.alarm or bool(update.suspected_change)
         for update in jumped(tracker, frames[: STEP + 10], jump_ms)
     ]
-    assert any(told)
+    assert any(alarm)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,9 @@ def test_stamps_that_jump_against_their_interval_are_an_alarm(
         updates.append(tracker.add(dataclasses.replace(frame, image=image, scan=scan)))
     alarms = [i for i, update in enumerate(updates) if update.alarm]
     assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 6
-    told = updates[alarms[0]]
-    assert f"{sensor} stamps jumped" in told.reason and told.status == "alarm"
-    assert told.chi2 is not None and told.chi2 > tracker.setup.config.alarm.chi2
+    alarm = updates[alarms[0]]
+    assert f"{sensor} stamps jumped" in alarm.reason and alarm.status == "alarm"
+    assert alarm.chi2 is not None and alarm.chi2 > tracker.setup.config.alarm.chi2
     offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
     assert (
         tracker.estimate.exists
@@ -216,7 +216,7 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
 
-def test_a_knock_that_nothing_can_show_is_not_called_ok(
+def test_a_knock_that_no_frame_can_show_is_not_ok(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All that is in view moves from then on: no alarm can be raised, and the status says so."""

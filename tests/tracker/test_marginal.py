@@ -30,7 +30,7 @@ def _far(seed: int, start: int = 1) -> TrackedMarginal:
 
 
 @pytest.fixture(scope="module")
-def told(
+def marginals(
     street: SimulatedDrive, frames: list[Frame]
 ) -> tuple[TrackedMarginal, list[TrackedMarginal], Tracker]:
     """The first marginal of a tracker, what it added every four frames since, and the tracker."""
@@ -51,9 +51,9 @@ def told(
 
 
 def test_the_parts_together_are_the_whole(
-    told: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
+    marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
 ) -> None:
-    first, parts, tracker = told
+    first, parts, tracker = marginals
     # Parts are no answers of their own: they are added, not compared.
     whole, fused = tracker.marginal(), fuse_marginals([first, *parts], significance=0.0)
     scale = np.sqrt(np.outer(np.diag(whole.information), np.diag(whole.information)))
@@ -65,9 +65,9 @@ def test_the_parts_together_are_the_whole(
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
 
 
-def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMarginal], Tracker]) -> None:
+def test_in_a_graph_of_one_s_own(marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker]) -> None:
     """As factors of gtsam, added one after the other: the answer and its covariance are the tracker's."""
-    first, parts, tracker = told
+    first, parts, tracker = marginals
     graph = gtsam.NonlinearFactorGraph()
     for part in (first, *parts):
         graph.add(part.factor())
@@ -78,7 +78,7 @@ def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMargin
     step = gtsam.Pose3.Logmap(update.T_camera_lidar.between(values.atPose3(EXTRINSIC)))
     step = np.append(step, values.atVector(TIME_OFFSET)[0] - update.time_offset_s)
     assert np.abs(step / sigmas).max() < 1e-3
-    # Told twice it would be too sure; told in parts it is not.
+    # Counted twice, the information would be too large; in parts it is not.
     variance = gtsam.Marginals(graph, values).marginalCovariance(TIME_OFFSET)[0, 0]
     assert variance == pytest.approx(sigmas[6] ** 2, rel=1e-3)
 

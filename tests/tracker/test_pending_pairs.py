@@ -25,8 +25,8 @@ def _gaussian(seed: int, point: Point) -> Gaussian:
 
 
 def _tied(seed: int, point: Point) -> Gaussian:
-    belief = _gaussian(seed, point)
-    return Gaussian(point, belief.information + 100.0 * np.eye(point.size), belief.vector)
+    gaussian = _gaussian(seed, point)
+    return Gaussian(point, gaussian.information + 100.0 * np.eye(point.size), gaussian.vector)
 
 
 def _same(a: Gaussian, b: Gaussian) -> None:
@@ -35,7 +35,7 @@ def _same(a: Gaussian, b: Gaussian) -> None:
     np.testing.assert_allclose(a.vector, b.vector, rtol=1e-9, atol=1e-9)
 
 
-def test_the_past_pairs_anew_when_the_offset_passes_the_middle() -> None:
+def test_the_past_pairs_again_when_the_offset_passes_the_middle() -> None:
     prior, rest = _tied(0, POINT), _gaussian(1, POINT)
     used, other = _gaussian(2, POINT.seen({4: 0})), _gaussian(3, POINT.seen({7: 0}))
     past = prior.plus(rest).plus(used)

@@ -99,7 +99,7 @@ def test_the_graph_of_a_start_is_made_some_scans_a_frame(street: SimulatedDrive,
     assert tracker.estimate.exists and seen == {False, True} and most <= 6
 
 
-def test_the_answer_comes_when_its_work_was_asked_for() -> None:
+def test_the_estimate_is_returned_when_its_work_is_requested() -> None:
     def counting() -> Stepwise[int]:
         for _ in range(5):
             yield 2

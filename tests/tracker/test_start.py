@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import gtsam
@@ -32,14 +33,16 @@ def _solved(turn_deg: float, cost: float) -> tracker_start._Solved:
 def test_a_better_pose_that_has_not_converged_prevents_a_start(
     monkeypatch: pytest.MonkeyPatch, turn_deg: float, cost: float, refused: bool
 ) -> None:
-    """It must be clearly better, and of another basin: else it is the same answer on its way."""
+    """It must be clearly better, and of another basin: else it is the same solution before convergence."""
     drive = Drive("none", None, (), (), (), ())  # type: ignore[arg-type]
 
-    def starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
+    def starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -> Stepwise[list[State]]:
         yield 1
-        return [State(gtsam.Pose3(), (delay_s,))]
+        return [State(gtsam.Pose3(), (reach_s,))]
 
-    def solution(drive: Drive, start: State, config: TrackerConfig) -> Stepwise[tracker_start._Solved]:
+    def solution(
+        drive: Drive, start: State, kernels_px: Sequence[float], config: TrackerConfig
+    ) -> Stepwise[tracker_start._Solved]:
         yield 1
         if start.time_offset_s(0) > 0.0:
             raise tracker_start._NotConverged("still moved", _solved(turn_deg, cost))

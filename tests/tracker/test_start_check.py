@@ -19,10 +19,11 @@ from sst_graph.types import Frame
 KNOCK_DEG = 1.5
 
 
-def answers(
+def updates_of(
     street: SimulatedDrive, frames: list[Frame], step: int | None
 ) -> tuple[Tracker, list[TrackUpdate]]:
-    """A tracker, which starts with the eighth frame, and its answers where the camera is knocked at one."""
+    """A tracker, which starts with the eighth frame, and its updates_of where the camera is knocked at
+    one."""
     tracker, updates = tracker_from_truth(street), []
     for frame in frames:
         assert frame.image is not None
@@ -37,7 +38,7 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
     street: SimulatedDrive, frames: list[Frame], step: int
 ) -> None:
     """The start is given up within some frames, not ok before; the next one is of the frames since."""
-    tracker, updates = answers(street, frames, step)
+    tracker, updates = updates_of(street, frames, step)
     given_up = [i for i, update in enumerate(updates) if "estimated again" in update.reason]
     assert given_up and step <= given_up[0] < step + 12 and len(given_up) <= 2
     assert not any(update.status == "ok" for update in updates[: given_up[0]])
@@ -50,12 +51,12 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
 
 
 def test_quiet_frames_contradict_no_start(street: SimulatedDrive, frames: list[Frame]) -> None:
-    _, updates = answers(street, frames[:26], None)
+    _, updates = updates_of(street, frames[:26], None)
     assert not any("estimated again" in update.reason for update in updates)
     assert updates[7].accepted
 
 
-def test_labels_that_always_contradict_are_no_way_without_end(
+def test_labels_that_always_contradict_do_not_restart_for_ever(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
     """A limit that any frames are past: two starts are refused, the third stays."""
@@ -68,7 +69,7 @@ def test_labels_that_always_contradict_are_no_way_without_end(
 
 def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, frames: list[Frame]) -> None:
     """One object of each pair counts half as static: static ones alone determine less, and decide."""
-    tracker, _ = answers(street, frames[:20], None)
+    tracker, _ = updates_of(street, frames[:20], None)
     assert tracker.estimate.smoother is not None
     assert (
         tracker.estimate.smoother.static_information() is None

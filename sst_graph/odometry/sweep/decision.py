@@ -1,4 +1,4 @@
-"""Whether the points of a drive were moved to one instant, or which way its scanner turned."""
+"""Whether the points of a drive were compensated to one instant, or in which sense its scanner turned."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ _MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 3.0, 0.25
 """Least motion from the first scan of a window to its last: with less, surfaces are seen from one side only,
 with the same errors in every scan [m, rad]."""
 _ERROR_RATE = 0.001
-"""A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: as much speaks against the true
-one in this share of drives at most, where the error model holds."""
+"""A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: such evidence against the true
+one occurs in this fraction of drives at most, where the error model holds."""
 _TOLERANCE = 0.2
 """The estimated share may differ so much from 0 or 1 beside three of its sigmas."""
 _LONG_SWEEP_M = 1.0
@@ -70,7 +70,7 @@ class SweepConfig(Settings):
 
 @dataclass(frozen=True)
 class SweepDecision:
-    """What was decided of the sweep, and why.
+    """The decision about the sweep, and its evidence.
 
     Attributes:
         kind: the hypothesis, or why there is none.
@@ -160,7 +160,7 @@ class _PairMotion:
 def decide_sweep(
     scan_at: Callable[[int], Scan | None], count: int, stamp: SweepStamp = "forward"
 ) -> SweepDecision:
-    """Decide it from the scans of a drive that have no times of their points.
+    """Decide the sweep from the scans of a drive that have no times of their points.
 
     Args:
         scan_at: scan at a position, or None where the frame has none.

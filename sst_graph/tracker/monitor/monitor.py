@@ -1,4 +1,4 @@
-"""What watches a running estimate."""
+"""Monitoring of a running estimate."""
 
 from __future__ import annotations
 
@@ -59,11 +59,11 @@ class Monitor:
         return chi2, None
 
     def recheck_start(self, scan: int, estimate: OnlineEstimate) -> None:
-        """Now and then: do the frames since the start agree with it?"""
+        """At times: check the start against the frames since."""
         assert estimate.smoother is not None
         self.changes.recheck_start(scan, list(estimate.smoother.entries), estimate.for_comparison())
 
     def check_start_at_end(self, estimate: OnlineEstimate) -> None:
-        """At the end of a drive: do the frames of a start that no frame came after agree with it?"""
+        """At the end of a drive: check a start without later frames against its own frames."""
         assert estimate.smoother is not None
         self.changes.check_start_at_end(list(estimate.smoother.entries), estimate.for_comparison())

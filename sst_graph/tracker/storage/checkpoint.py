@@ -1,7 +1,7 @@
 """A tracker on disk: one npz file, written whole or not at all, arrays and JSON only.
 
-What is read is compared with its checksum, with the classes of the estimators, and with what a tracker can
-answer; a file that fails any of it is refused as a whole.
+On reading, the checksum and the classes of the objects are checked, and the tracker must give its estimate; a
+file that fails any check is refused as a whole.
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
 
 
 def _lasting(tracker: Tracker) -> Iterator[object]:
-    """What never changes of what a tracker holds, most of it; the rest of that is small."""
+    """The immutable parts of a tracker, which are most of it."""
     yield from (features for _, features in tracker.inputs.window.scans)
     yield from tracker.inputs.window.images
     if tracker.estimate.smoother is not None:
@@ -278,7 +278,8 @@ def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tr
 
 
 def _check_tracker(tracker: Tracker, path: str | Path) -> None:
-    """Require a tracker that answers and accepts its last frame once more: its parts are consistent.
+    """Require a tracker that gives its estimate and accepts its last frame once more: its parts are
+    consistent.
 
     Raises:
         CheckpointError: it does not, whatever it raises; a file may hold any contradiction.

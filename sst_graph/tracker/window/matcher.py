@@ -47,7 +47,7 @@ class WindowMatcher:
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what it keeps for the present frame."""
+        """All but the cache for the present frame."""
         return {**vars(self), "_twists": None, "_last": None}
 
     def check_lower_edges(self, point: Point) -> None:
@@ -103,7 +103,8 @@ class WindowMatcher:
     def _other(
         self, point: Point, found: MatchedPair, number: int, kernel: RobustKernel, offset_sigma_s: float
     ) -> OtherPairing | None:
-        """The scan with the image on its other side, if the offset may still move it there."""
+        """The scan paired with its other neighbouring image, if the uncertainty of the offset allows that
+        pairing."""
         images = {image.index: k for k, image in enumerate(self.window.images)}
         used = images[found.image]
         stamps = [image.stamp_ns for image in self.window.images]
@@ -148,7 +149,7 @@ class WindowMatcher:
     def in_view(
         self, point: Point, chosen: Collection[int], without: Collection[int]
     ) -> dict[int, dict[int, int]]:
-        """How many boundary points of each object of scans that have an image ought to be seen in it.
+        """How many boundary points of each object of scans that have an image should be visible in it.
 
         Args:
             without: tracks of objects that do not count.
@@ -197,7 +198,7 @@ class WindowMatcher:
         return replace(pair, matches=matches, tracks=own, terms=terms)
 
     def cost(self, point: Point, chosen: Collection[int]) -> float | None:
-        """Mean cost of the boundary points of some scans at a point; None where none can be seen."""
+        """Mean cost of the boundary points of some scans at a point; None where none is in view."""
         if self._last is not None and self._last[0] is point:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:

@@ -1,8 +1,8 @@
-"""Scans that left the window when it was not certain which image they belong to.
+"""Scans that left the window while their pairing with an image was not certain.
 
 A scan half way between two images is paired with the one or the other as the time offset moves by its own
-sigma. The batch pairs by its estimate. So of a scan that leaves, its information with the other image is kept
-too, and the past changes from the one to the other when the offset passes the middle.
+sigma. The batch pairs by its estimate. So for a scan that leaves, its information with the other image is
+kept too, and the marginal of the past is switched to it when the offset passes the middle.
 """
 
 from __future__ import annotations

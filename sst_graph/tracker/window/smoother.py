@@ -1,4 +1,4 @@
-"""iSAM2 over a window of pairs that are matched again; what leaves it stays as one linear factor."""
+"""iSAM2 over a window of pairs; pairs that leave it are kept as one linear factor."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ class WindowSmoother:
 
         Args:
             found: new matches by scan.
-            dropped: scans that no longer have a match: they leave, and nothing of them stays.
+            dropped: scans that no longer have a match: they are removed, and not added to ``past``.
             first_scan: the window's first scan.
             alive: tracks of objects that may be seen again; the biases of all others are marginalized out
                 as soon as no pair of the window sees them.
@@ -348,7 +348,7 @@ class WindowSmoother:
         """(n, n) variance of the score of past and window beyond that of independent matches.
 
         Args:
-            with_held: over what ``past`` holds, too.
+            with_held: over the held parameters of ``past``, too.
         """
         window, point = [entry.linear for entry in self.entries.values()], self.past.point
         held = self.past.held if with_held else 0
