@@ -17,9 +17,9 @@ import gtsam
 import numpy as np
 
 from sst_graph import CalibrationConfig
-from sst_graph.batch.answer import Guess
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.contradictions import Contradictions, find_contradictions
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.part_solver import PartSolver
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.errors import EstimationError
@@ -101,7 +101,7 @@ def contradictions_of(source: Source, start: State) -> Contradictions:
     config = CalibrationConfig()
     noise = replace(config.noise, lower_edges=tuple(config.classes))
     drives = prepare_drives([source], config)
-    guess = Guess(start.cTl, start.offsets_s[0])
+    guess = Guess(start.cTl, start.time_offsets_s[0])
     problem = CalibrationProblem.of(drives, guess, replace(config, noise=noise))
     solution = solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
     return find_contradictions(PartSolver(problem, solution.state))

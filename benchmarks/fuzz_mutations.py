@@ -410,7 +410,7 @@ def _jpeg(rng: Rng, data: bytes) -> bytes:
 
 
 def checkpoint(rng: Rng, data: bytes) -> bytes:
-    """A tracker's npz file: its bytes; or its JSON or its arrays, and the checksum made anew."""
+    """A tracker's npz file: its bytes; or its JSON or its arrays, and the checksum made again."""
     if rng.random() < 0.15:
         return bytewise(rng, data)
     with np.load(io.BytesIO(data)) as file:

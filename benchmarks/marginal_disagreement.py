@@ -1,4 +1,4 @@
-"""How far fused marginals lie from the joint answer, by how much two drives disagree.
+"""How far fused marginals lie from the joint estimate, by how much two drives disagree.
 
 Two synthetic drives of six frames (80 silhouette matches each, sigma 3 px, Geman-McClure kernel, twists and
 a mask bias free), the second's calibration set apart from the first's by so many sigmas. Prints medians over
@@ -29,7 +29,7 @@ CAMERA = PinholeCamera(718.0, 700.0, 607.0, 185.0, 1242, 375)
 FORWARD = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
 RIG = gtsam.Pose3(FORWARD, np.array([0.06, -0.08, -0.27]))
 ROUNDS = 3
-"""How often marginals are taken anew at the fused estimate."""
+"""How often marginals are taken again at the fused estimate."""
 
 
 def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
@@ -61,8 +61,8 @@ def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.Nonlinear
 
 
 def pair(seed: int, apart: float) -> tuple[float, list[float]]:
-    """How far the two drives' answers lie apart [sigmas of their difference], and by how many sigmas of the
-    joint answer the fused marginals miss it: each taken at its own answer, then anew, round by round."""
+    """How far the two drives' estimates lie apart [sigmas of their difference], and by how many sigmas of the
+    joint estimate the fused marginals miss it: each taken at its own estimate, then again, round by round."""
     rng = np.random.default_rng(100 + seed)
     graph_1, values_1 = drive(2 * seed + 1, RIG, 0.1)
     C_1 = _covariance(graph_1, values_1)
@@ -81,8 +81,8 @@ def pair(seed: int, apart: float) -> tuple[float, list[float]]:
     misses = [_miss(joint, fused)]
     for _ in range(ROUNDS):
         at = fused.cTl, fused.offset_s
-        anew = [marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs]
-        fused = fuse_marginals(anew, significance=0.0)
+        again = [marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs]
+        fused = fuse_marginals(again, significance=0.0)
         misses.append(_miss(joint, fused))
     return distance, misses
 
@@ -106,7 +106,7 @@ def _miss(joint: CalibrationMarginal, fused: CalibrationMarginal) -> float:
 
 
 def main() -> None:
-    print("apart   own answers" + "".join(f"   round {k + 1}" for k in range(ROUNDS)))
+    print("apart   own estimates" + "".join(f"   round {k + 1}" for k in range(ROUNDS)))
     for apart in (0.0, 2.0, 4.0, 8.0, 16.0):
         found = [pair(seed, apart) for seed in range(6)]
         misses = np.median([misses for _, misses in found], axis=0)

@@ -173,7 +173,7 @@ def _work(pipe: Connection, memory_gb: float) -> None:
 
 
 class Worker:
-    """A process that runs cases, begun anew after one that killed it."""
+    """A process that runs cases, begun again after one that killed it."""
 
     def __init__(self, seconds: float, memory_gb: float) -> None:
         self._seconds, self._memory_gb = seconds, memory_gb

@@ -1,4 +1,4 @@
-"""What is known of extrinsic and time offset, as one quadratic cost on (E, D).
+"""The marginal of a calibration on extrinsic and time offset, as one quadratic cost on (E, D).
 
 The cost of a calibration (cTl, offset), in the tangent space of the linearization point:
 
@@ -181,7 +181,8 @@ def _information(table: JsonTable) -> FloatArray:
 
 
 def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> CalibrationMarginal:
-    """The same cost about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T Exp(d))."""
+    """The same cost, expanded about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T
+    Exp(d))."""
     J = np.eye(7)
     step, J[:6, :6] = _log(marginal.cTl.between(cTl))
     shift = np.append(step, offset_s - marginal.offset_s)

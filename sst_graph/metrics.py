@@ -24,7 +24,7 @@ FORWARD_R_OPTICAL = gtsam.Rot3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0
 class Nees:
     """Normalised estimation error squared: e' P^-1 e, of the whole and of its parts.
 
-    A believable covariance gives, on average over runs, 7, 3, 3 and 1.
+    Where the covariance holds, the means over runs are 7, 3, 3 and 1.
 
     Attributes:
         joint: over all seven unknowns, or the six of the pose where the true offset is not known.

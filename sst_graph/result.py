@@ -103,7 +103,7 @@ class CalibrationResult:
         reasons: one sentence for each cause of a status that is not ``ok``.
         weak_directions: what the data hardly determine, weakest first.
         frames_used: the frames that took part.
-        drive_offsets: an offset for each drive, where one each was asked for.
+        drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         method: name of the method.
         config: its settings, as a JSON-able dictionary.
         initial: where the estimation started, or None without a guess.

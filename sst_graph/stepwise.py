@@ -1,8 +1,8 @@
 """Long computations in steps of bounded cost.
 
 Such a computation is a generator: it yields after each step what the step has cost, in units of about 4 ms
-on one core of 2020, and returns its answer. The cost is a count of what was done, never a time that was
-taken, so that whoever does some of it with each frame does the same with the same frames.
+on one core of 2020, and returns its result. The cost is counted, not timed, so that work that is spread over
+frames is the same for the same frames.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ _T = TypeVar("_T")
 Stepwise = Generator[int, None, _T]
 
 
-def whole(steps: Stepwise[_T]) -> _T:
-    """The answer, all steps at once."""
+def run_to_end(steps: Stepwise[_T]) -> _T:
+    """Do all steps; the result of the computation."""
     while True:
         try:
             next(steps)
         except StopIteration as stop:
-            answer: _T = stop.value
-            return answer
+            result: _T = stop.value
+            return result

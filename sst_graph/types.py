@@ -1,4 +1,4 @@
-"""Data that flows through sst_graph: scans, images, frames, sources, motions.
+"""Data types of sst_graph: scans, images, frames, sources, motions.
 
 Conventions (frames, signs, units) are stated in :mod:`factors`.
 """
@@ -88,7 +88,7 @@ class Scan(ByValue):
         offsets_s: (n,) float32, time of each point minus ``stamp_ns`` [s], or None where all
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
-        left_out: number of points that the data held beside these, and that were NaN or inf.
+        left_out: number of further points in the data, which were NaN or inf.
     """
 
     stamp_ns: int
@@ -158,7 +158,7 @@ class GroundTruth(ByValue):
 
 
 class Source(Protocol):
-    """A drive: frames in the order of their index, read when asked for."""
+    """A drive: frames in the order of their index, each read when it is accessed."""
 
     @property
     def name(self) -> str: ...

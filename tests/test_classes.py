@@ -87,7 +87,7 @@ def test_id_read_as_train_id_is_refused() -> None:
         ([mask_of(13, 255)], MaskEncoding.TRAIN_IDS),  # cars only
     ],
 )
-def test_encoding_is_told_from_the_masks(masks: list[np.ndarray], encoding: MaskEncoding) -> None:
+def test_encoding_is_guessed_from_the_masks(masks: list[np.ndarray], encoding: MaskEncoding) -> None:
     assert guess_mask_encoding(masks) == encoding
 
 

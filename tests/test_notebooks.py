@@ -47,7 +47,7 @@ def test_slam_and_calibration_are_better_together(monkeypatch: pytest.MonkeyPatc
     assert both["rotation_deg"] < 0.25 and both["offset_ms"] < 3.0
 
 
-def test_two_drives_know_more_than_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_two_drives_determine_more_than_one(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     found = run("03_covariance_and_fusion_of_drives.py", monkeypatch, tmp_path)
     fused, both = found["fused"], found["both"]
     for result in found["alone"]:

@@ -18,7 +18,7 @@ MADE_BY_THE_PACKAGE = {"CalibrationResult", "TrackUpdate"}
 
 
 @pytest.mark.parametrize("name", sst_graph.__all__)
-def test_every_public_name_says_what_it_is(name: str) -> None:
+def test_every_public_name_has_a_docstring(name: str) -> None:
     assert getattr(sst_graph, name).__doc__
     assert name in dir(sst_graph)
 

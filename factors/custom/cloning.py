@@ -2,7 +2,7 @@
 
 gtsam 4.3 has no ``clone()`` for a ``CustomFactor``: ``graph.clone()``, ``copy.deepcopy``, ``rekey``, pickling
 and ``gtsam.GncLMOptimizer`` fail on it, and on any graph that holds one. A factor of this package gives its
-recipe (:func:`sst_graph.factors.recipe_of`), from which it is built anew.
+recipe (:func:`sst_graph.factors.recipe_of`), from which it is built again.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .variables import checked_key
 
 
 def clone_factor(factor: gtsam.NonlinearFactor) -> gtsam.NonlinearFactor:
-    """A factor that shares nothing with this one: gtsam's own clone, or one built anew from its recipe.
+    """A factor that shares nothing with this one: gtsam's own clone, or one built again from its recipe.
 
     Raises:
         FactorError: a ``CustomFactor`` that another made.

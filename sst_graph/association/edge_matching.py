@@ -2,8 +2,9 @@
 
 :func:`match_edges` matches the points of many scans under one pose, as the graph needs them: exact motion,
 objects that move, deviations from assumptions. :mod:`~sst_graph.initialization.pose_batch` matches a few
-points of the same scans under hundreds of poses. The two project differently, for there the projection is
-what costs; what makes a match, its sigma and its weight are the functions at the end of this file for both.
+points of the same scans under hundreds of poses. The two project differently, because in the search the
+projection takes most of the time. Both use the functions at the end of this file, which define a match, its
+sigma and its weight.
 """
 
 from __future__ import annotations
@@ -33,12 +34,13 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 _OUTWARD, _LEAST_STRETCH = 0.01, 0.1
-"""A pixel this share farther from the principal point must come to lie farther out by this part of it."""
+"""A pixel that is farther from the principal point by the first fraction must be imaged farther out by at
+least the second fraction of that step: else the distortion folds the picture over."""
 
 SIDES = 4
 """An object has a left, a right, a top and a bottom side."""
 SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
-"""Side by kind of edge and whether the way out of the object runs to the right."""
+"""Side by kind of edge and whether the outward direction points to the right."""
 BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 """The side towards the ground."""
 LOWER_EDGE_SIGMA_PX = 1.2
@@ -67,11 +69,11 @@ class MatchConfig(Settings):
 GATE = 3.0
 """Farthest match, in units of the kernel's scale: there the Geman-McClure weight is 1 %."""
 _MIN_COSINE = 0.5
-"""Least cosine between the contour's normal and the way out of the object: 60 degrees apart, an edge is
-another one."""
+"""Least cosine between the contour's normal and the outward direction of the object: contours at more than 60
+degrees are other edges."""
 MIN_OBJECT_SHARE = 0.1
-"""An object of whose boundary in view less than this share finds a match is left out: one that the image's
-labels miss crosses the contours of others here and there."""
+"""Least fraction of an object's boundary points in view that must have a match. An object that the image's
+labels miss crosses contours of others in a few places only."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Motion:
 
 
 class PointDeviation(Protocol):
-    """What points and pixels differ by from what is assumed of them (:mod:`sst_graph.assumptions`)."""
+    """Deviation of points and pixels from the assumptions (:mod:`sst_graph.assumptions`)."""
 
     @property
     def scene(self) -> Scene: ...
@@ -128,7 +130,7 @@ class PairedEdges:
     Attributes:
         camera: of all images.
         points: of all groups, one group after the other.
-        owners: (n,) number of the object of each point, through all groups.
+        owners: (n,) number of the object of each point, counted over all groups.
         bounds: (g + 1,) where each group begins, and the end.
         contours: of each group's class in its image.
         motions: the camera's around each group's image.
@@ -298,7 +300,7 @@ def match_silhouettes(
 
 
 def numbered_through(objects: Sequence[IntArray]) -> IntArray:
-    """(n,) numbers of objects through several lists, each of which numbers its own from 0."""
+    """(n,) consecutive numbers of the objects in several lists, each of which counts from 0."""
     firsts = np.cumsum([0, *(int(own.max(initial=-1)) + 1 for own in objects)])
     return np.concatenate(
         [np.zeros(0, np.intp), *(own + first for own, first in zip(objects, firsts[:-1], strict=True))]
@@ -313,14 +315,14 @@ def match_edges(
     config: MatchConfig,
     deviation: PointDeviation | None = None,
 ) -> EdgeMatches:
-    """Each boundary point's nearest contour at the current estimate, where the two face the same way.
+    """Each boundary point's nearest contour at the current estimate, where both face the same direction.
 
     Args:
         kernel: its scale is in pixels here; matches farther than :data:`GATE` times it are left out.
-        deviation: of the points and pixels from what is assumed of them; the matched pixels are then those
-            of the ideal camera.
+        deviation: of points and pixels from the assumptions; the matched pixels are then those of the ideal
+            camera.
     """
-    # 1. The points in their images.
+    # 1. Project the points into their images.
     uvs, shift = paired.projected(paired.points.lPs, cTl, offset_s), None
     if deviation is not None:
         paired = _deviated(paired, deviation, uvs)
@@ -330,27 +332,27 @@ def match_edges(
     index = np.flatnonzero(paired.camera.in_image(uvs))
     paired, uvs = paired.take(index), uvs[index]
     seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
-    # 2. The nearest contours that are near.
+    # 2. Find the nearest contours within the gate.
     feet = nearest_contours(paired.contours, paired.spans, uvs)
     residuals = feet.distances + paired.repeated(paired.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
     paired, uvs, index = paired.take(near), uvs[near], index[near]
     normals, pixels = feet.normals[near], feet.feet[near]
-    # 3. Those that face the way out of the object.
-    beyond = paired.projected(paired.points.outward, cTl, offset_s)
+    # 3. Keep contours that face the outward direction of the object.
+    tips = paired.projected(paired.points.outward, cTl, offset_s)
     if shift is not None and deviation is not None:
         shift = shift[index]
-        beyond = beyond + _pixel_shift(deviation.take(index), paired, beyond)
+        tips = tips + _pixel_shift(deviation.take(index), paired, tips)
         pixels = pixels - shift
-    way = beyond - uvs
-    length = np.linalg.norm(way, axis=1)
-    way = way / np.maximum(length, 1e-9)[:, None]
-    cosine = (way * normals).sum(axis=1)
-    # 4. Of objects of which enough meets a contour.
+    outward = tips - uvs
+    length = np.linalg.norm(outward, axis=1)
+    outward = outward / np.maximum(length, 1e-9)[:, None]
+    cosine = (outward * normals).sum(axis=1)
+    # 4. Keep objects of which enough points have a match.
     on = np.flatnonzero(of_matched_objects(faces(cosine), paired.owners, objects_seen, MIN_OBJECT_SHARE))
     paired, index = paired.take(on), index[on]
     sigmas = match_sigmas(length[on], cosine[on], config)
-    sides = sides_of(paired.points.edges, way[on, 0])
+    sides = sides_of(paired.points.edges, outward[on, 0])
     alignment = Alignment(
         camera=paired.camera,
         lPs=paired.points.lPs,
@@ -367,7 +369,7 @@ def match_edges(
 
 
 def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -> PairedEdges:
-    """The points where they are, and their intervals."""
+    """The points moved, and their intervals changed, by the deviation."""
     points, base_taus_s = paired.points, paired.base_taus_s
     effect = deviation.effect(points.lPs, points.offsets_s, uvs)
     if effect.l_shift is not None:
@@ -378,7 +380,7 @@ def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -
 
 
 def _pixel_shift(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray) -> FloatArray:
-    """(n, 2) by how much the pixels of points lie beside the ideal ones ``uvs`` [px].
+    """(n, 2) distortion: pixels minus the ideal ones ``uvs`` [px].
 
     NaN where the picture would fold over: beyond the radius at which a polynomial lens turns back, points
     far outside the view come to lie inside the image.
@@ -396,7 +398,7 @@ def _pixel_shift(deviation: PointDeviation, paired: PairedEdges, uvs: FloatArray
 
 
 def faces(cosines: FloatArray) -> BoolArray:
-    """Whether contours face the way out of the objects, from the cosines of the angles between the two."""
+    """Whether contours face outward, from the cosines between their normals and the outward directions."""
     return cosines > _MIN_COSINE
 
 
@@ -421,7 +423,7 @@ def match_sigmas(lengths_px: FloatArray, cosines: FloatArray, config: MatchConfi
 
 
 def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:
-    """(n,) 0 left, 1 right, 2 top, 3 bottom, by kind of edge and horizontal part of the way out."""
+    """(n,) 0 left, 1 right, 2 top, 3 bottom, by kind of edge and horizontal part of the outward direction."""
     return np.asarray(SIDE_OF[edges, (to_the_right > 0.0).astype(np.intp)])
 
 

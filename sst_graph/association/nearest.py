@@ -1,6 +1,6 @@
 """Nearest pixel of a class for each point, nearest point for each pixel: the matches of SST-Calib.
 
-Both ways are exact: pixels by an index map of the mask, points by a KD-tree of their projections.
+Both directions are exact: pixels by an index map of the mask, points by a KD-tree of their projections.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ class ClassView:
 
 @dataclass(frozen=True)
 class NearestMatches:
-    """Frozen matches of a class, both ways.
+    """Frozen matches of a class, in both directions.
 
     Attributes:
         point_to_pixel: each projected point on the image with its nearest pixel.

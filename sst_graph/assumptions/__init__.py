@@ -1,6 +1,7 @@
 """What a calibration assumes: tested against the data, considered in the covariance, or estimated.
 
-One more assumption is one more small file here, and its name in :data:`ASSUMPTIONS`.
+To add an assumption, define an :class:`Assumption` in a file here and append it to :data:`ASSUMPTIONS`; its
+place in that order is its key in the graph and in checkpoints.
 """
 
 import math

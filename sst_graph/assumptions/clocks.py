@@ -25,7 +25,7 @@ SKEW = Assumption(
     sigma=1e-6,
     source="synchronised clocks (PTP, GPS) drift less; free quartz clocks 2e-5",
     span=0.05,
-    finding="one clock runs faster than the other: the time offset grows",
+    violation="one clock runs faster than the other: the time offset grows",
     remedy="synchronise the clocks, or estimate the skew with --estimate skew",
 )
 LINE_DELAY = Assumption(
@@ -36,6 +36,6 @@ LINE_DELAY = Assumption(
     source="global shutter; rolling shutters take 1e-5 to 5e-5 s a row",
     span=1e-4,
     prevalence=0.1,  # of the cameras on vehicles most have a global shutter
-    finding="rows of the pictures are exposed one after the other (rolling shutter)",
+    violation="rows of the pictures are exposed one after the other (rolling shutter)",
     remedy="use a camera with a global shutter, or estimate it with --estimate line_delay",
 )

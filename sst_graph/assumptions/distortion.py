@@ -28,7 +28,7 @@ def _k2(view: View) -> Effect:
 
 
 _SOURCE = "what target calibrations leave in rectified pictures"
-_FINDING = "the pictures look distorted"
+_VIOLATION = "the pictures look distorted"
 _REMEDY = "undistort the pictures and masks, or give the camera's distortion"
 
 K1 = Assumption(
@@ -39,7 +39,7 @@ K1 = Assumption(
     source=_SOURCE,
     span=0.3,
     prevalence=0.5,  # pictures come as they were taken about as often as undistorted
-    finding=_FINDING,
+    violation=_VIOLATION,
     remedy=_REMEDY,
 )
 K2 = Assumption(
@@ -49,6 +49,6 @@ K2 = Assumption(
     sigma=1e-3,
     source=_SOURCE,
     span=0.3,
-    finding=_FINDING,
+    violation=_VIOLATION,
     remedy=_REMEDY,
 )

@@ -20,6 +20,6 @@ FOCAL = Assumption(
     sigma=5e-4,
     source="spread of repeated target calibrations: 0.3 px of 700 px",
     span=0.05,
-    finding="the focal length does not fit the pictures (share by which it is too short)",
+    violation="the focal length does not fit the pictures (share by which it is too short)",
     remedy="check that the camera matrix belongs to this camera, lens setting and image size",
 )

@@ -2,7 +2,7 @@
 
 A nuisance parameter theta acts on a match in at most four ways: it moves the point (a range that is too
 long), changes the interval from the point to its image (a sweep that is not compensated), moves the pixel
-(a lens that bends), or changes the LiDAR's measured motion. Each is linear in theta, so a match's residual
+(lens distortion), or changes the LiDAR's measured motion. Each is linear in theta, so a match's residual
 has the closed-form column
 
     dr/dtheta = r_H_lP . l_shift + r_H_tau time_s + n . pixel_shift + r_H_twist . Ad(cTl) twist_shift
@@ -76,7 +76,7 @@ class Assumption:
     """One parameter that is held at zero.
 
     Attributes:
-        name: as it stands in settings and results.
+        name: in settings and results.
         unit: of the parameter; empty where it has none.
         effect: what one unit of it does.
         sigma: deviation that a careful set-up leaves: considered in the covariance.
@@ -84,10 +84,10 @@ class Assumption:
         span: deviation when nothing is known of it: the prior of a test, or where it is estimated.
         prevalence: probability beforehand that a set-up breaks the assumption; a judgement: about one camera
             matrix in fifty belongs to another lens, crop or image size.
-        finding: what it means that the data contradict it, for people.
+        violation: what it means that the data contradict it; begins the sentence that reports it.
         remedy: what to do about it.
-        by_matches: whether the matches test it. They do not test the sweep: at constant speed it looks like a
-            shift.
+        by_matches: whether the matches can test it. They cannot test the sweep: at constant speed it looks
+            like a shift.
     """
 
     name: str
@@ -96,20 +96,20 @@ class Assumption:
     sigma: float
     source: str
     span: float
-    finding: str
+    violation: str
     remedy: str
     prevalence: float = 0.02
     by_matches: bool = True
 
     def figure(self, value: float, sigma: float) -> str:
-        """The parameter's estimate as people read it."""
+        """The parameter's estimate with deviation and unit, as text."""
         unit = f" {self.unit}" if self.unit else ""
         return f"{self.name} = {value:.3g} ± {sigma:.2g}{unit}"
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What the effects of assumptions depend on beside the points: of one scan and one image, or of several.
+    """All that the effects of assumptions depend on but the points: of one scan and one image, or of several.
 
     Attributes:
         camera, l_twist, image_s, period_s: as in :class:`View`.
@@ -131,7 +131,7 @@ class Scene:
 
 
 def combined(effects: Sequence[tuple[float, Effect]]) -> Effect:
-    """The effect of several parameters at their values: their sum."""
+    """The sum of effects, each multiplied by its parameter: (value, effect)."""
 
     def total(name: str) -> FloatArray | None:
         parts = [theta * part for theta, effect in effects if (part := getattr(effect, name)) is not None]

@@ -25,7 +25,7 @@ CX = Assumption(
     sigma=0.3,
     source=_SOURCE,
     span=30.0,
-    finding="the pictures lie beside the principal point cx",
+    violation="the pictures lie beside the principal point cx",
     remedy=_REMEDY,
 )
 CY = Assumption(
@@ -35,6 +35,6 @@ CY = Assumption(
     sigma=0.3,
     source=_SOURCE,
     span=30.0,
-    finding="the pictures lie beside the principal point cy",
+    violation="the pictures lie beside the principal point cy",
     remedy=_REMEDY,
 )

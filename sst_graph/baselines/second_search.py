@@ -1,4 +1,4 @@
-"""A second search around an answer: is there a pose nearby that explains the labels better?"""
+"""A second search around a result: is there a pose nearby that explains the labels better?"""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from sst_graph.initialization.global_search import (
     search_steps,
 )
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 from sst_graph.types import SemanticClass
 
 _MIN_RATIO = 0.9
-"""Least score of an answer as a fraction of the best one found around it: below 1, for the labels' own errors
-move the best score's place a little."""
+"""Least score of a result as a fraction of the best one found around it: below 1, because errors of the
+labels move the maximum a little."""
 
 
 @dataclass(frozen=True)
 class SecondSearch:
-    """Scores of a start, of an answer, and of the best pose that a search finds around the answer.
+    """Scores of a start, of a result, and of the best pose that a search finds around the result.
 
     All in the units of :class:`~sst_graph.initialization.global_search.Candidate`: 0 is chance.
     """
 
     start: float
-    answer: float
+    result: float
     best: float
 
     @property
     def reasons(self) -> list[str]:
-        """Why the answer may be wrong, in sentences; none for one that scores best."""
+        """Why the result may be wrong, in sentences; none for one that scores best."""
         found = []
-        if self.answer < self.start:
+        if self.result < self.start:
             found.append(
-                f"the labels agree less than at the start (score {self.answer:.3f} against {self.start:.3f})"
+                f"the labels agree less than at the start (score {self.result:.3f} against {self.start:.3f})"
             )
-        if self.answer < _MIN_RATIO * self.best or self.best <= 0.0:
+        if self.result < _MIN_RATIO * self.best or self.best <= 0.0:
             found.append(
                 f"another pose nearby explains the labels better (score {self.best:.3f} against "
-                f"{self.answer:.3f}): give a closer start, or use method joint"
+                f"{self.result:.3f}): give a closer start, or use method joint"
             )
         return found
 
@@ -58,10 +58,10 @@ def search_again(
     drives: Sequence[Drive],
     classes: Sequence[SemanticClass],
     start: Calibration,
-    answer: Calibration,
+    result: Calibration,
     config: SearchConfig,
 ) -> SecondSearch:
-    """Search the surroundings of an answer, on the frames of the drive that has most.
+    """Search the surroundings of a result, on the frames of the drive that has most.
 
     Points of all classes vote on the masks: a score that no nearest-pixel method maximises.
 
@@ -71,14 +71,14 @@ def search_again(
     numbers = [frame.pair.drive for frame in frames]
     richest = max(set(numbers), key=numbers.count)
     own = spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
-    chosen = [_search_frame(frame, answer) for frame in own]
+    chosen = [_search_frame(frame, result) for frame in own]
     camera = drives[richest].camera
-    problem = SearchProblem(chosen, camera, classes, answer.cTl, answer.offset_s, config)
-    best = whole(search_steps(problem, FINE))[0]
+    problem = SearchProblem(chosen, camera, classes, result.cTl, result.offset_s, config)
+    best = run_to_end(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
     points = LabelledPoints.sampled(chosen, camera, classes, POINTS_PER_CLASS, rng)
     agreement = points.agreement_map(FINE[-1].blur_px, FINE[-1].share)
-    scores = whole(agreement.score_steps(_states([start, answer])))
+    scores = run_to_end(agreement.score_steps(_states([start, result])))
     cells = len(chosen) * CELLS[0] * CELLS[1]
     return SecondSearch(float(scores[0]) / cells, float(scores[1]) / cells, best.score)
 

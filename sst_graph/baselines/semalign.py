@@ -1,7 +1,7 @@
 """SemAlign (Liu et al., IROS 2021) as a baseline: many sampled starts, then points to nearest pixels.
 
 Spatial only. Each start is scored by the mean truncated distance of its class points to the mask; the best
-one is refined by least squares on point-to-pixel matches, found anew at every step.
+one is refined by least squares on point-to-pixel matches, found again at every step.
 """
 
 from __future__ import annotations

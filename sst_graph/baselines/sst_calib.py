@@ -1,7 +1,7 @@
 """SST-Calib as printed (Kodaira, Zhou, Zang, Zhan, Tomizuka, ITSC 2022): the static and the joint stage.
 
-Where the print is silent: frames are those of equal stamps, spread over the drive; the time offset starts
-at the guess; camera velocity comes from visual odometry with LiDAR depth, computed anew every few
+Where the paper says nothing: frames are those of equal stamps, spread over the drive; the time offset starts
+at the guess; camera velocity comes from visual odometry with LiDAR depth, computed again every few
 steps because the depth depends on extrinsic and offset; one Levenberg-Marquardt step follows each match.
 """
 
@@ -201,10 +201,10 @@ def solve_static(problem: PaperProblem, guess: Calibration) -> NearestSolution:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
     still = still_frames(problem, guess)
-    answer, remaining = _static_stage(still.frames, guess, problem.progress)
-    covariance = frozen_covariance(still.frames, answer, _STATIC_PHASES[-1][0])
+    result, remaining = _static_stage(still.frames, guess, problem.progress)
+    covariance = frozen_covariance(still.frames, result, _STATIC_PHASES[-1][0])
     counts: dict[str, object] = {"frames": len(still.frames)}
-    return NearestSolution(answer, covariance, remaining, still.frames, still.reasons, counts)
+    return NearestSolution(result, covariance, remaining, still.frames, still.reasons, counts)
 
 
 def still_frames(problem: PaperProblem, guess: Calibration) -> StillFrames:
@@ -234,7 +234,7 @@ def camera_motions(
     """Metric motions of each drive's camera, with LiDAR depth placed by a calibration.
 
     Args:
-        former: motions found earlier, which carry the depth to the image's instant; None: at rest.
+        former: motions found earlier, by which the points are moved to the image's instant; None: at rest.
     """
     return [
         metric_motions(drive.image_pairs, drive.camera, _Depth(drive, at, before))

@@ -1,7 +1,7 @@
 """Do the data contradict what is assumed? The parameter of each assumption is estimated and tested.
 
 The problem is solved again with the parameters of all assumptions as variables, from matches far away to
-near ones: a wrong assumption has pushed matches beyond the last kernel, and they come back where its
+near ones: a wrong assumption moves matches beyond the last kernel, and they are found again where its
 parameter is free. With those matches frozen one linear step leads to the estimate of one parameter while all
 others hold, with its cluster-robust covariance. The estimate over its deviation decides (Wald). What is
 contradicted most is solved for once more, alone and from where that step leads, to state its estimate.
@@ -21,10 +21,10 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
-from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.broken_assumptions import Evidence, considered_sigmas
 from sst_graph.covariance.cluster_robust import RobustCovariance, covariance_of, robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, Considered, consider
+from sst_graph.covariance.considered import AssumptionConfig, Considered, considered_by_matches
 from sst_graph.covariance.error_model import fit_error_model
 from sst_graph.covariance.match_table import MatchTable, match_table
 from sst_graph.errors import EstimationError
@@ -39,25 +39,25 @@ FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 _LEAST_FREEDOM = 8
-"""Degrees of freedom that few objects have: each has several sides, and the error model a floor."""
-_ALL_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
-"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. That it
-still moves after them does not matter: the linear step to one parameter's estimate goes the rest of the way.
+"""Least degrees of freedom of Student's t: each object has several sides, and the error model has a floor."""
+_ALL_FREE_KERNELS_PX = (20.0, 10.0, 5.0, 3.0, 3.0, 3.0)
+"""Kernel scales of the solution with all parameters free, outer iteration by outer iteration [px]. It need
+not converge: the linear step to one parameter's estimate covers the rest.
 """
-_ALONE_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
-"""... and of the solution with one of them free, which starts near its end [px]."""
+_ONE_FREE_KERNELS_PX = (10.0, 7.0, 5.0, 4.0, 3.0)
+"""Kernel scales of the solution with one parameter free, which starts near its optimum [px]."""
 _MOST_AT_LAST_SCALE = 4
 """Most further outer iterations of the latter at the last scale."""
 
 
 @dataclass(frozen=True)
-class Finding:
+class ParameterTest:
     """The estimate of one assumption's parameter while all other assumptions hold.
 
     Attributes:
         assumption: which.
         value, sigma: estimate and its deviation, in the parameter's unit.
-        contradicted: whether the assumption is.
+        contradicted: whether the assumption is contradicted.
     """
 
     assumption: Assumption
@@ -66,7 +66,7 @@ class Finding:
     contradicted: bool
 
     def __getstate__(self) -> dict[str, Any]:
-        """The assumption by its name: what it does to a match is a function, which no file holds."""
+        """The assumption by its name: its effect is a function, which cannot be stored."""
         return {**vars(self), "assumption": self.assumption.name}
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
@@ -82,7 +82,7 @@ class Finding:
     def sentence(self) -> str:
         """What it means, and what to do about it."""
         figure = self.assumption.figure(self.value, self.sigma)
-        return f"{self.assumption.finding}: {figure}; {self.assumption.remedy}"
+        return f"{self.assumption.violation}: {figure}; {self.assumption.remedy}"
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class SolvedProblem:
         return self.problem.objects
 
     def solve_with(
-        self, names: Sequence[str], start: State, kernel_px: tuple[float, ...], most_outer: int
+        self, names: Sequence[str], start: State, kernels_px: tuple[float, ...], most_outer: int
     ) -> JointSolution:
         """The problem with the parameters of some assumptions as variables, their spans as priors.
 
@@ -107,7 +107,7 @@ class SolvedProblem:
         joint, centre = self.problem.config.joint, self.problem.prior_centre(self.solution.state)
         graph = replace(joint.graph, estimate=(*joint.graph.estimate, *names))
         free = replace(joint, max_outer=most_outer, graph=graph)
-        return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernel_px)
+        return solve_joint(replace(self.problem.joint(), config=free, centre=centre), start, kernels_px)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class ExaminedAssumptions:
         considered: what the assumptions add to the covariance, the tests' results included.
     """
 
-    findings: tuple[Finding, ...]
+    findings: tuple[ParameterTest, ...]
     considered: Considered
 
     @property
@@ -132,15 +132,17 @@ class ExaminedAssumptions:
         return assumption_report(self.considered, self.findings)
 
 
-def examine_assumptions(problem: CalibrationProblem, estimate: Estimate) -> ExaminedAssumptions:
+def examine_assumptions(problem: CalibrationProblem, estimate: JointEstimate) -> ExaminedAssumptions:
     """Test the assumptions against the data, and consider in the covariance what the data leave open."""
     config, solution = problem.config.assumptions, estimate.solution
     findings = check_assumptions(SolvedProblem(problem, solution), config)
-    considered = consider(estimate.robust, solution.pairs, solution.values, solution.state, config)
+    considered = considered_by_matches(
+        estimate.robust, solution.pairs, solution.values, solution.state, config
+    )
     return ExaminedAssumptions(findings, with_test_results(considered, findings))
 
 
-def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[Finding, ...]:
+def check_assumptions(problem: SolvedProblem, config: AssumptionConfig) -> tuple[ParameterTest, ...]:
     """Test every assumption that the matches can test; the most contradicted first."""
     if not config.test:
         return ()
@@ -180,7 +182,7 @@ class LinearProblem:
         """The problem with these parameters free."""
         before = problem.solution.state
         start = replace(before, nuisances={**before.nuisances, **dict.fromkeys(names, 0.0)})
-        solution = problem.solve_with(names, start, _ALL_PX, len(_ALL_PX))
+        solution = problem.solve_with(names, start, _ALL_FREE_KERNELS_PX, len(_ALL_FREE_KERNELS_PX))
         graph, at, pairs = solution.graph, solution.values, solution.pairs
         unknowns = Unknowns.of(solution.state, pairs)
         table = match_table(graph, at, pairs, solution.matched_at, problem.objects, unknowns)
@@ -188,7 +190,7 @@ class LinearProblem:
         state = state_from(at, solution.state, pairs)
         return cls(table, unknowns, information, {name: state.nuisances[name] for name in names}, state)
 
-    def alone(self, name: str, config: AssumptionConfig) -> Finding:
+    def alone(self, name: str, config: AssumptionConfig) -> ParameterTest:
         """Estimate of one parameter while the others of them are zero."""
         step, kept, bread = self._step_to(name)
         moved = self.table.after(step)
@@ -197,18 +199,20 @@ class LinearProblem:
         column = self.unknowns.column(nuisance_key(name))
         place = int(np.searchsorted(kept, column))
         sigma = float(np.sqrt(covariance[place, place]))
-        sigma *= few_objects(int(table.objects.max()) + 1, config.threshold)
+        sigma *= few_objects_factor(int(table.objects.max()) + 1, config.threshold)
         value = self.values[name] + float(step[column])
-        return Finding(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
+        return ParameterTest(ASSUMPTIONS[name], value, sigma, abs(value) > config.threshold * sigma)
 
-    def start_of(self, finding: Finding) -> State:
-        """Where a solution with a finding's parameter alone is to be expected."""
+    def start_of(self, finding: ParameterTest) -> State:
+        """Predicted state of a solution with a finding's parameter alone."""
         step, _, _ = self._step_to(finding.assumption.name)
-        offsets = step[6 : 6 + len(self.state.offsets_s)]
+        offsets = step[6 : 6 + len(self.state.time_offsets_s)]
         return replace(
             self.state,
             cTl=self.state.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
-            offsets_s=tuple(float(a + b) for a, b in zip(self.state.offsets_s, offsets, strict=True)),
+            time_offsets_s=tuple(
+                float(a + b) for a, b in zip(self.state.time_offsets_s, offsets, strict=True)
+            ),
             nuisances={name: value for name, value in self.state.nuisances.items() if name not in self.values}
             | {finding.assumption.name: finding.value},
         )
@@ -230,18 +234,20 @@ class LinearProblem:
 
 
 def _centred(table: MatchTable, bread: FloatArray) -> MatchTable:
-    """Matches with the residuals that a linear fit leaves: after a long step the sum of their scores is not
-    zero, and the jackknife over objects would take that for a disagreement among them."""
+    """Matches with the residuals of a linear fit. After a long step the sum of the scores is not zero, and
+    the jackknife over objects would count that as disagreement among the objects."""
     return table.after(-bread @ (table.J.T @ (table.root_weights * table.r)))
 
 
 def _solved_alone(
-    problem: SolvedProblem, finding: Finding, start: State, config: AssumptionConfig
-) -> Finding:
-    """The finding by a solution with its parameter alone; as it was where that ends somewhere else."""
+    problem: SolvedProblem, finding: ParameterTest, start: State, config: AssumptionConfig
+) -> ParameterTest:
+    """The finding from a solution with its parameter alone; unchanged where that solution disagrees."""
     name = finding.assumption.name
     try:
-        solution = problem.solve_with((name,), start, _ALONE_PX, len(_ALONE_PX) + _MOST_AT_LAST_SCALE)
+        solution = problem.solve_with(
+            (name,), start, _ONE_FREE_KERNELS_PX, len(_ONE_FREE_KERNELS_PX) + _MOST_AT_LAST_SCALE
+        )
     except EstimationError as error:
         _LOG.info("assumption %s: %s", name, error)
         return finding
@@ -250,25 +256,25 @@ def _solved_alone(
     )
     column = robust.unknowns.column(nuisance_key(name))
     value, sigma = solution.state.nuisances[name], float(np.sqrt(robust.matrix[column, column]))
-    sigma *= few_objects(int(robust.table.objects.max()) + 1, config.threshold)
+    sigma *= few_objects_factor(int(robust.table.objects.max()) + 1, config.threshold)
     alike = abs(value - finding.value) < config.threshold * max(sigma, finding.sigma)
     same = alike and abs(value) > config.threshold * sigma
     return replace(finding, value=value, sigma=sigma) if same else finding
 
 
-def few_objects(objects: int, threshold: float) -> float:
-    """By how much a deviation from few objects is to be larger for the same false alarms at a threshold.
+def few_objects_factor(objects: int, threshold: float) -> float:
+    """Factor on a standard deviation from few objects that keeps the rate of false alarms at a threshold.
 
-    Errors of one object go together for a whole drive, so that there are as many of them as objects, and the
-    estimate over its deviation follows Student's t rather than the normal distribution (Cameron and Miller, A
-    practitioner's guide to cluster-robust inference, 2015).
+    The errors of one object are correlated over a whole drive, so there are as many independent errors as
+    objects, and the estimate over its deviation follows Student's t rather than the normal distribution
+    (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015).
     """
     tail = float(norm.sf(threshold))
     return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
 
 
-def with_test_results(considered: Considered, findings: Sequence[Finding]) -> Considered:
-    """What is considered, with the deviations of the parameters that the data leave open."""
+def with_test_results(considered: Considered, findings: Sequence[ParameterTest]) -> Considered:
+    """The considered assumptions, with larger deviations for parameters that the tests leave open."""
     evidence = {
         f.assumption.name: Evidence(
             f.value,
@@ -283,8 +289,8 @@ def with_test_results(considered: Considered, findings: Sequence[Finding]) -> Co
     return replace(considered, sigmas={**considered.sigmas, **considered_sigmas(evidence)})
 
 
-def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
-    """The reason that the data contradict assumptions: the most likely one, and which others would do.
+def contradiction_sentence(findings: Sequence[ParameterTest]) -> tuple[str, ...]:
+    """The sentence about contradicted assumptions: the most likely one, then the others.
 
     Args:
         findings: the most contradicted first.
@@ -296,11 +302,11 @@ def contradiction_sentence(findings: Sequence[Finding]) -> tuple[str, ...]:
     return (against[0].sentence + (f" (or, less likely: {others})" if others else ""),)
 
 
-def assumption_report(considered: Considered, findings: Sequence[Finding]) -> dict[str, Any]:
+def assumption_report(considered: Considered, findings: Sequence[ParameterTest]) -> dict[str, Any]:
     """JSON-able: what each assumption adds to the covariance, and the test of it.
 
-    By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the answer
-    [rad, m, s per unit], and where the data were asked ``estimate``, ``estimate_sigma``, ``contradicted``.
+    By name: ``sigma``, the deviation of its parameter that is considered, ``sensitivity`` (7) of the estimate
+    [rad, m, s per unit], and, where it was tested, ``estimate``, ``estimate_sigma``, ``contradicted``.
     """
     said = {finding.assumption.name: finding for finding in findings}
     report: dict[str, Any] = {}
@@ -316,7 +322,7 @@ def assumption_report(considered: Considered, findings: Sequence[Finding]) -> di
 
 
 def estimated_report(robust: RobustCovariance, state: State) -> dict[str, Any]:
-    """JSON-able: value and deviation of the parameters that are unknowns of an answer, by name."""
+    """JSON-able: value and deviation of the parameters that are unknowns of an estimate, by name."""
     report = {}
     for name, value in state.nuisances.items():
         column = robust.unknowns.column(nuisance_key(name))

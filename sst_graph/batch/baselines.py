@@ -10,29 +10,29 @@ from sst_graph.baselines.nearest_pixel_frames import Calibration
 from sst_graph.baselines.second_search import search_again
 from sst_graph.baselines.semalign import solve_semalign
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, solve_paper, solve_static
-from sst_graph.batch.answer import Answer, Guess
 from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 
 
-def answer_paper(
+def paper_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> Answer:
+) -> MethodEstimate:
     """SST-Calib, static and joint stage."""
     return _checked(solve_paper, _problem(drives, config, progress), guess, config)
 
 
-def answer_static(
+def static_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> Answer:
+) -> MethodEstimate:
     """SST-Calib's static stage alone."""
     return _checked(solve_static, _problem(drives, config, progress), guess, config)
 
 
-def answer_semalign(
+def semalign_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> Answer:
+) -> MethodEstimate:
     """SemAlign."""
     return _checked(solve_semalign, _problem(drives, config, progress), guess, config)
 
@@ -46,7 +46,7 @@ def _checked(
     problem: PaperProblem,
     guess: Guess,
     config: CalibrationConfig,
-) -> Answer:
+) -> MethodEstimate:
     """The solution, with reasons against it where a second search finds a better pose.
 
     Raises:
@@ -58,7 +58,7 @@ def _checked(
     solution = solve(problem, start)
     at, step = solution.calibration, solution.remaining_step
     second = search_again(solution.frames, problem.drives, config.classes, start, at, config.search)
-    return Answer(
+    return MethodEstimate(
         at.cTl,
         at.offset_s,
         solution.covariance + np.outer(step, step),
@@ -67,7 +67,7 @@ def _checked(
         remarks=solution.reasons,
         diagnostics={
             "covariance": "of the frozen matches, too small, and of the remaining step",
-            "scores": {"start": second.start, "answer": second.answer, "best_nearby": second.best},
+            "scores": {"start": second.start, "result": second.result, "best_nearby": second.best},
             **solution.diagnostics,
         },
     )

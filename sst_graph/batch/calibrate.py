@@ -1,4 +1,4 @@
-"""Calibration of whole drives: ``calibrate`` runs a method and says how far to trust its answer."""
+"""Calibration of whole drives: ``calibrate`` runs a method and says how far to trust its result."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from dataclasses import replace
 
 import gtsam
 
-from sst_graph.batch.answer import Answer, Guess, drive_offsets, frames_used, no_answer, result_of
 from sst_graph.batch.assumption_tests import examine_assumptions
-from sst_graph.batch.baselines import answer_paper, answer_semalign, answer_static
+from sst_graph.batch.baselines import paper_method, semalign_method, static_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
@@ -20,10 +19,18 @@ from sst_graph.batch.joint_report import (
     label_agreement,
     unknown_motion_remarks,
 )
-from sst_graph.batch.motion_answer import answer_motion
+from sst_graph.batch.method_estimate import (
+    Guess,
+    MethodEstimate,
+    drive_offsets,
+    frames_used,
+    guess_as_result,
+    result_of,
+)
 from sst_graph.batch.motion_factor import may_use_motion, with_motion
+from sst_graph.batch.motion_method import motion_method
 from sst_graph.batch.part_solver import PartSolver
-from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
@@ -73,7 +80,8 @@ def calibrate(
 def prepare_drives(
     sources: Sequence[Source], config: CalibrationConfig, progress: Progress | None = None
 ) -> list[Drive]:
-    """Of every frame what the method needs: image features are not tracked for one that does without."""
+    """Read each source once, and keep what the method needs; image features are tracked only where they are
+    needed."""
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
@@ -99,11 +107,11 @@ def calibrate_prepared(
     guess = Guess(initial, initial_offset_s)
     began = time.perf_counter()
     try:
-        answer = _METHODS[config.method](drives, guess, config, progress)
-        result = result_of(answer, drives, guess, config)
+        estimate = _METHODS[config.method](drives, guess, config, progress)
+        result = result_of(estimate, drives, guess, config)
     except EstimationError as error:
-        result = no_answer(drives, guess, config, str(error))
-    # What is probably wrong with the data comes first.
+        result = guess_as_result(drives, guess, config, str(error))
+    # Likely faults of the data become the first reasons.
     result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
@@ -124,9 +132,9 @@ def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
         raise ConfigError("use_motion=always has one time offset only: leave out time_offset_per_drive")
 
 
-def answer_joint(
+def joint_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> Answer:
+) -> MethodEstimate:
     """The default: a global search, then object outlines over the whole drive in one factor graph."""
     problem = CalibrationProblem.of(drives, guess, config, progress)
     # 1. Start: a global search, whose candidates are compared on a few scans.
@@ -140,18 +148,18 @@ def answer_joint(
     # 4. Consistency: drives against each other, stretches of a drive against its rest.
     contradictions = find_contradictions(PartSolver(problem, solutions[0].state))
     # 5. Cluster-robust covariance; motion as a factor where the labels determine all unknowns.
-    labels_alone = Estimate.of(solutions[0], problem.objects)
+    labels_alone = JointEstimate.of(solutions[0], problem.objects)
     motion = with_motion(problem, labels_alone, contradictions.stretches)
     # 6. Assumptions: tested against the data, considered in the covariance.
     assumptions = examine_assumptions(problem, motion.estimate)
-    # 7. What no match shows: motion that nothing measures, sweeps that nothing decides.
+    # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, assumptions.considered)
-    # 8. The answer, and why it may be wrong.
+    # 8. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
-    return Answer(
+    return MethodEstimate(
         solution.state.cTl,
-        solution.state.offsets_s[0],
+        solution.state.time_offsets_s[0],
         total.covariance,
         frames_used(drives, solution),
         (*assumptions.reasons, *wrong, *contradictions.sentences, *motion.reasons, *total.reasons),
@@ -166,15 +174,15 @@ def answer_joint(
     )
 
 
-_Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], Answer]
+_Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 _METHODS: dict[Method, _Method] = {
-    "joint": answer_joint,
-    "paper": answer_paper,
-    "static": answer_static,
-    "semalign": answer_semalign,
-    "motion": answer_motion,
+    "joint": joint_method,
+    "paper": paper_method,
+    "static": static_method,
+    "semalign": semalign_method,
+    "motion": motion_method,
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion")
-"""Methods whose velocity comes from visual odometry."""
+"""Methods whose camera velocity comes from visual odometry."""
 _NEED_DEPTH = ("paper", "static")
-"""Methods that take its length from LiDAR points."""
+"""Methods that take the metric scale of that velocity from LiDAR points."""

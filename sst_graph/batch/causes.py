@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import gtsam
 
-from sst_graph.batch.answer import Guess
 from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.diagnosis import Finding, Fit, Fitter, likely_causes, mirror, other_camera, preflight
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
@@ -24,7 +24,7 @@ from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import select_start_steps
 from sst_graph.result import CalibrationResult
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 
 _AGREED = 0.3
 """Share of the outlines that meet, times that of close matches, above which no mirror is looked for: mirrored
@@ -39,8 +39,8 @@ def with_causes(
     """The result with what is probably wrong with the data as its first reasons; with any, it is not ok."""
     by_labels = config.method != "motion"
     found = preflight(drives, guess.cTl, config.classes if by_labels else ())
-    answered = bool(result.frames_used)
-    if not found and answered:
+    estimated = bool(result.frames_used)
+    if not found and estimated:
         camera = other_camera(guess.cTl, result.T_camera_lidar, result.covariance)
         found = () if camera is None else (camera,)
     if not found and config.find_causes and config.method == "joint":
@@ -48,7 +48,7 @@ def with_causes(
     if not found:
         return result
     reasons = (*(finding.sentence for finding in found), *result.reasons)
-    return replace(result, status="not_converged" if answered else result.status, reasons=reasons)
+    return replace(result, status="not_converged" if estimated else result.status, reasons=reasons)
 
 
 def _suspected(
@@ -60,8 +60,8 @@ def _suspected(
         return likely_causes(drives, guess.cTl, guess.offset_s, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
     if explained * concentration < _AGREED:
-        answer = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
-        return mirror(drives, guess.cTl, guess.offset_s, fit, answer)
+        solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
+        return mirror(drives, guess.cTl, guess.offset_s, fit, solved)
     return ()
 
 
@@ -75,7 +75,9 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
         search = StartProblem(few, tracks, config.classes, guess, offset_s)
         try:
-            selection = whole(select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES))
+            selection = run_to_end(
+                select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)
+            )
             cTl, found_s = selection.starts[0]
             start = State(cTl, (found_s,))
             problem = JointProblem(few, tracks, joint, search.centre(start))
@@ -84,7 +86,7 @@ def fit_labels(config: CalibrationConfig) -> Fitter:
             return None
         return Fit(
             solution.state.cTl,
-            solution.state.offsets_s[0],
+            solution.state.time_offsets_s[0],
             explained(solution),
             concentration(solution, problem),
         )

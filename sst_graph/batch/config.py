@@ -51,8 +51,8 @@ class CalibrationConfig(Settings):
     )
     time_offset_per_drive: bool = setting(
         False,
-        doc="One time offset for each drive instead of one for all. Set where the clocks were started"
-        " anew between drives.",
+        doc="One time offset for each drive instead of one for all. Set where the clocks were restarted "
+        "between drives.",
     )
     use_motion: UseMotion = setting(
         "auto",

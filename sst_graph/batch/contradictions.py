@@ -1,8 +1,8 @@
-"""Which parts of the data contradict the rest: drives among each other, stretches of time within a drive.
+"""Contradictions between drives, and between stretches of time within a drive.
 
 A result assumes one extrinsic for all drives and one time offset (or one a drive), from the first frame to
-the last. Each drive, and each stretch of a drive, is solved by itself, and the answers are compared
-(:mod:`sst_graph.covariance.contradiction`). Matches frozen at the joint answer would not show a large
+the last. Each drive, and each stretch of a drive, is solved by itself, and the estimates are compared
+(:mod:`sst_graph.covariance.contradiction`). Matches frozen at the joint estimate would not show a large
 step: those beyond the kernel are gone.
 """
 
@@ -26,12 +26,12 @@ FALSE_ALARM = 1e-3
 """Probability that any part of a calibration seems to contradict the rest where none does, as far as the
 covariances hold: one false alarm in a thousand calibrations."""
 _SUSPICION = 1e-2
-"""The same for one drive by its stretches alone, before both sides are solved to be sure: a larger one costs
-time only."""
+"""The same for one drive by its stretches alone, before both sides are solved to confirm it: a larger value
+costs only time."""
 _MOST_STRETCHES = 8
 """Stretches that a drive is cut into: each costs a solution of its scans."""
 _LEAST_SCANS = 4
-"""Fewest scans of a stretch: fewer seldom determine an answer."""
+"""Fewest scans of a stretch: fewer seldom determine an estimate."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Contradictions:
 
     Attributes:
         sentences: one for each contradiction.
-        stretches: what was solved by itself.
+        stretches: the stretches, each solved by itself.
         diagnostics: JSON-able numbers.
     """
 
@@ -112,7 +112,7 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
     run = min(runs, key=lambda run: differences[run].rank)
     if differences[run].p_value * len(runs) > _SUSPICION:
         return None
-    # 2. Where exactly it begins and ends, and both sides by themselves.
+    # 2. Locate where it begins and ends, and solve both sides by themselves.
     inside, outside = ([s.state for s in side] for side in _sides(stretches, run))
     number, last = stretches[0].part.drive, len(parts.drives[stretches[0].part.drive].scans)
     first, end = stretches[run[0]].part.scans[0], stretches[run[1] - 1].part.scans[-1] + 1
@@ -130,10 +130,10 @@ def _within(parts: PartSolver, stretches: Sequence[SolvedPart], false_alarm: flo
         )
         if own is None or rest is None:
             return None
-        states, difference = [own.state, rest.state], Difference.of(rest.answer, own.answer)
+        states, difference = [own.state, rest.state], Difference.of(rest.step, own.step)
         if _located(parts, number, states)[0] == bounds:
             break
-    # 3. Is it certain, with both sides solved?
+    # 3. Confirm it with both sides solved.
     return Step(number, bounds, difference) if difference.p_value * len(runs) < false_alarm else None
 
 
@@ -159,7 +159,7 @@ def _sides(
 
 def _of_run(stretches: Sequence[SolvedPart], run: tuple[int, int]) -> Difference:
     inside, outside = _sides(stretches, run)
-    return Difference.of(combined([s.answer for s in outside]), combined([s.answer for s in inside]))
+    return Difference.of(combined([s.step for s in outside]), combined([s.step for s in inside]))
 
 
 def _parts_of(drive: int, bounds: tuple[int, int], scans: int) -> tuple[Part, Part]:
@@ -194,20 +194,20 @@ def _located(parts: PartSolver, drive: int, states: Sequence[State]) -> tuple[tu
 _LEAST_SIDE = 2
 """Fewest scans on either side of a step."""
 _SECOND_STEP = 0.1
-"""A second step back must raise what agrees with the two answers by this share."""
+"""A second step back must raise what agrees with the two estimates by this share."""
 
 
 def _between(parts: PartSolver, stretches: Sequence[Sequence[SolvedPart]]) -> dict[int, Difference]:
-    """Each drive against the others together, by the drive's number; those without an answer are left out."""
+    """Each drive against the others together, by the drive's number; drives without estimate are left out."""
     if len(parts.drives) < 2:
         return {}
     solved = {}
     for number, (drive, own) in enumerate(zip(parts.drives, stretches, strict=True)):
         whole = Part(number, tuple(range(len(drive.scans))))
-        answer = parts.solve_from(whole, parts.best_start(whole, [s.state for s in own]))
-        if answer is not None:
-            solved[number] = answer.answer
-    own_offsets = len(parts.reference.offsets_s) > 1
+        part = parts.solve_from(whole, parts.best_start(whole, [s.state for s in own]))
+        if part is not None:
+            solved[number] = part.step
+    own_offsets = len(parts.reference.time_offsets_s) > 1
     judged = {2: [*solved][1:]}.get(len(solved), [*solved])  # of two, either contradicts the other
     return {
         number: Difference.of(

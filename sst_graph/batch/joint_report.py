@@ -1,4 +1,4 @@
-"""What is reported beside a joint estimate: why it may be wrong altogether, and numbers about the run."""
+"""Reasons why a joint estimate may be wrong, and diagnostics of the run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
-from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
 from sst_graph.hand_eye.solution import difference
@@ -22,7 +22,7 @@ from sst_graph.inspect.frame_information import to_document
 FloatArray = NDArray[np.float64]
 
 _FAR_SIGMAS = 6.0
-"""Two answers farther apart than this [standard deviations] contradict each other: no sampling error of a
+"""Two estimates farther apart than this [standard deviations] contradict each other: no sampling error of a
 calibrated covariance reaches so far, and a covariance that is half of what it should be still allows 3."""
 
 
@@ -39,7 +39,7 @@ def joint_reasons(
     covariance: FloatArray,
     labels: Mapping[str, float],
 ) -> tuple[str, ...]:
-    """Why the joint estimate may be wrong altogether; empty where nothing says so.
+    """Reasons why the joint estimate may be wrong altogether.
 
     Args:
         solution: the estimate.
@@ -68,7 +68,7 @@ def unknown_motion_remarks(drives: Sequence[Drive]) -> tuple[str, ...]:
 
 
 def joint_diagnostics(
-    problem: CalibrationProblem, estimate: Estimate, lower: WithLowerEdges
+    problem: CalibrationProblem, estimate: JointEstimate, lower: WithLowerEdges
 ) -> dict[str, Any]:
     """JSON-able numbers about a joint estimate."""
     solution, model, drives = estimate.solution, estimate.robust.model, problem.drives
@@ -108,7 +108,7 @@ def _outside_search(problem: CalibrationProblem, solution: JointSolution) -> Ite
     far = float(np.linalg.norm(solution.state.cTl.translation() - around))
     if far > (REACH * search.free_translation_m if guess is None else 1.5 * search.translation_m):
         what = "the guess" if guess is not None else "the LiDAR"
-        yield f"the answer lies {far:.2f} m from {what}, farther than was searched"
+        yield f"the estimate lies {far:.2f} m from {what}, farther than was searched"
 
 
 def _alternatives(
@@ -125,7 +125,7 @@ def _alternatives(
         as_good = agreement(other) > ALTERNATIVE_RATIO * agreement(best)
         if sigmas > _FAR_SIGMAS and as_good:
             yield (
-                f"another start led to an answer {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
+                f"another start led to an estimate {np.degrees(np.linalg.norm(step[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(step[3:6]):.1f} cm and {1e3 * abs(step[6]):.0f} ms away "
                 "that explains the labels almost as well: record more varied scenes or give a closer guess"
             )

@@ -1,4 +1,4 @@
-"""Edges towards the ground: matched only where image and LiDAR labels mean the same by them.
+"""Edges towards the ground, which are matched only where image and LiDAR labels agree about them.
 
 They determine roll and height better than any other edge. But some labels end an object at its body, others
 at its shadow, or cut straight across the gap between the wheels, and a LiDAR sees below it. Only the

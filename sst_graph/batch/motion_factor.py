@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.batch.part_solver import SolvedPart
-from sst_graph.batch.problem import CalibrationProblem, Estimate
-from sst_graph.covariance.contradiction import Difference, PartAnswer, name_step
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.covariance.observability import weak_directions
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
@@ -42,7 +42,7 @@ class WithMotion:
         remarks: a sentence where the motion was left out for a stretch of a drive that contradicts it.
     """
 
-    estimate: Estimate
+    estimate: JointEstimate
     reasons: tuple[str, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
@@ -53,8 +53,10 @@ def may_use_motion(config: CalibrationConfig) -> bool:
     return config.method == "joint" and config.use_motion != "never" and not config.time_offset_per_drive
 
 
-def with_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequence[SolvedPart]) -> WithMotion:
-    """The estimate with the motion in its graph, where the settings ask for it and the two agree.
+def with_motion(
+    problem: CalibrationProblem, labels: JointEstimate, stretches: Sequence[SolvedPart]
+) -> WithMotion:
+    """The estimate with the motion in its graph, where the settings allow it and the two agree.
 
     With ``use_motion=auto`` the motion is used where the labels determine all unknowns by themselves and the
     points of a scan share one time: a rolling sweep is compensated by the very motion.
@@ -75,7 +77,9 @@ def with_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequen
     return fuse_motion(problem, labels, stretches)
 
 
-def fuse_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequence[SolvedPart]) -> WithMotion:
+def fuse_motion(
+    problem: CalibrationProblem, labels: JointEstimate, stretches: Sequence[SolvedPart]
+) -> WithMotion:
     """The estimate with the hand-eye solution as a factor, where labels and motion agree.
 
     The labels determine translation, and the time offset by speed alone; the motion determines the time
@@ -86,17 +90,23 @@ def fuse_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequen
     config, state, covariance = problem.config, labels.solution.state, labels.covariance[:7, :7]
     try:
         reach_s = config.search.time_offset_s
-        motion = solve_motion(problem.drives, state.cTl, state.offsets_s[0], reach_s, problem.progress)[0]
+        motion = solve_motion(problem.drives, state.cTl, state.time_offsets_s[0], reach_s, problem.progress)[
+            0
+        ]
     except EstimationError as error:
         return WithMotion(labels, diagnostics={"left_out": str(error)})
     # 2. Do they agree?
     step = difference(state, motion.state)
     chi2 = float(step @ np.linalg.solve(covariance + motion.covariance, step))
     sigmas = np.sqrt(np.diag(motion.covariance))
-    facts = {"chi2_of_7": chi2, "offset_s": motion.state.offsets_s[0], "sigma_offset_s": float(sigmas[6])}
+    facts = {
+        "chi2_of_7": chi2,
+        "offset_s": motion.state.time_offsets_s[0],
+        "sigma_offset_s": float(sigmas[6]),
+    }
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
         return WithMotion(labels, _contradiction(step, chi2, motion.converged), facts)
-    worst = _worst_stretch(stretches, PartAnswer(step, motion.covariance))
+    worst = _worst_stretch(stretches, PartEstimate(step, motion.covariance))
     if worst is not None:
         facts["stretch_p_value"] = worst[1].p_value * len(stretches)
         if facts["stretch_p_value"] < FALSE_ALARM:
@@ -108,7 +118,7 @@ def fuse_motion(problem: CalibrationProblem, labels: Estimate, stretches: Sequen
     solution = solve_joint(joint, state, KERNELS_PX[-1:], problem.progress)
     # 4. The covariance; Birge's ratio, squared, where labels and motion differ by more than theirs allow.
     inflation = chi2 / len(step) if chi2 > _UNLIKELY_CHI2 else 1.0
-    fused = Estimate.of(solution, problem.objects)
+    fused = JointEstimate.of(solution, problem.objects)
     static = fused.by_static_objects if config.use_motion == "always" else labels.by_static_objects
     fused = replace(fused, covariance=inflation * fused.covariance, by_static_objects=static)
     return WithMotion(fused, diagnostics={"fused": True, **facts})
@@ -121,15 +131,15 @@ def gaussian_factor(state: State, covariance: FloatArray) -> gtsam.LinearContain
     linear = gtsam.JacobianFactor(EXTRINSIC, root[:, :6], time_offset_key(), root[:, 6:], np.zeros(7), unit)
     point = gtsam.Values()
     point.insert(EXTRINSIC, state.cTl)
-    point.insert(time_offset_key(), np.array(state.offsets_s[:1]))
+    point.insert(time_offset_key(), np.array(state.time_offsets_s[:1]))
     return gtsam.LinearContainerFactor(linear, point)
 
 
 def _worst_stretch(
-    stretches: Sequence[SolvedPart], motion: PartAnswer
+    stretches: Sequence[SolvedPart], motion: PartEstimate
 ) -> tuple[SolvedPart, Difference] | None:
     """The stretch whose labels contradict the motion most; None without stretches."""
-    compared = [(stretch, Difference.of(stretch.answer, motion)) for stretch in stretches]
+    compared = [(stretch, Difference.of(stretch.step, motion)) for stretch in stretches]
     return min(compared, key=lambda pair: pair[1].rank, default=None)
 
 
@@ -144,7 +154,7 @@ def _of_stretch(drives: Sequence[Drive], worst: tuple[SolvedPart, Difference], s
 
 
 def _contradiction(step: FloatArray, chi2: float, converged: bool) -> tuple[str, ...]:
-    """A sentence about two solutions that lie apart; none where the motion did not converge by itself."""
+    """A sentence about two solutions that differ; none where the motion did not converge by itself."""
     if not converged:
         return ()
     degrees, metres = np.degrees(np.linalg.norm(step[:3])), float(np.linalg.norm(step[3:6]))

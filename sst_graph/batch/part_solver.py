@@ -1,4 +1,4 @@
-"""Answers of parts of the data by themselves: each solved anew from the answer of all, under wide kernels."""
+"""Estimates of parts of the data by themselves: each solved again from the estimate of all data."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import consider
-from sst_graph.covariance.contradiction import PartAnswer
+from sst_graph.covariance.considered import considered_by_matches
+from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
@@ -32,7 +32,7 @@ _MOST_AT_LAST_SCALE = 3
 
 @dataclass(frozen=True)
 class Part:
-    """Some scans of one drive, by position, rising."""
+    """Some scans of one drive, by ascending position."""
 
     drive: int
     scans: tuple[int, ...]
@@ -40,17 +40,17 @@ class Part:
 
 @dataclass(frozen=True)
 class SolvedPart:
-    """A part and its own answer.
+    """A part and its own estimate.
 
     Attributes:
         part: which.
-        state: its own answer, on one clock.
-        answer: the same as a step from the reference, with its covariance.
+        state: its own estimate, on one clock.
+        step: the same as a step from the reference, with its covariance.
     """
 
     part: Part
     state: State
-    answer: PartAnswer
+    step: PartEstimate
 
 
 @dataclass(frozen=True)
@@ -59,57 +59,59 @@ class PartSolver:
 
     Attributes:
         problem: the drives, and how all of them were solved together.
-        reference: the answer of all drives together, where the parts start and what their weak priors are
+        reference: the estimate of all drives together, where the parts start and what their weak priors are
             centred on.
-        kernel_px: scales of the robust kernel of a part's solution, outer iteration by outer iteration [px].
+        kernels_px: scales of the robust kernel of a part's solution, outer iteration by outer iteration [px].
     """
 
     problem: CalibrationProblem
     reference: State
-    kernel_px: tuple[float, ...] = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
+    kernels_px: tuple[float, ...] = (20.0, 12.0, 8.0, 5.0, 4.0, 3.0)
 
     @property
     def drives(self) -> Sequence[Drive]:
         return self.problem.drives
 
     def solve(self, part: Part) -> SolvedPart | None:
-        """A part's own answer, from the reference; None where it has none."""
-        return self._solved(part, self.reference_of(part), self.kernel_px)
+        """A part's own estimate, from the reference; None where it has none."""
+        return self._solved(part, self.reference_of(part), self.kernels_px)
 
     def solve_from(self, part: Part, start: State) -> SolvedPart | None:
         """The same from a start that is nearly right."""
-        return self._solved(part, start, self.kernel_px[len(self.kernel_px) // 2 :])
+        return self._solved(part, start, self.kernels_px[len(self.kernels_px) // 2 :])
 
     def best_start(self, part: Part, starts: Sequence[State]) -> State:
-        """The one of the reference and other states that the part agrees with most."""
+        """The reference, or the one of other states, with the largest support of the part."""
         candidates = [self.reference_of(part), *starts]
         return max(candidates, key=lambda start: float(self.support(part, start).sum()))
 
-    def _solved(self, part: Part, start: State, kernel_px: tuple[float, ...]) -> SolvedPart | None:
-        joint = replace(self.problem.config.joint, max_outer=len(kernel_px) + _MOST_AT_LAST_SCALE)
+    def _solved(self, part: Part, start: State, kernels_px: tuple[float, ...]) -> SolvedPart | None:
+        joint = replace(self.problem.config.joint, max_outer=len(kernels_px) + _MOST_AT_LAST_SCALE)
         drive, tracks = self._data(part)
         try:
             problem = JointProblem([drive], tracks, joint, self.reference_of(part))
-            solution = solve_joint(problem, start, kernel_px)
-            return SolvedPart(part, solution.state, self._answer(part, solution))
+            solution = solve_joint(problem, start, kernels_px)
+            return SolvedPart(part, solution.state, self._step(part, solution))
         except (EstimationError, np.linalg.LinAlgError):
             return None
 
     def reference_of(self, part: Part) -> State:
         """The reference on the part's clock alone."""
-        return State(self.reference.cTl, (self.reference.offset_s(part.drive),))
+        return State(self.reference.cTl, (self.reference.time_offset_s(part.drive),))
 
-    def _answer(self, part: Part, solution: JointSolution) -> PartAnswer:
+    def _step(self, part: Part, solution: JointSolution) -> PartEstimate:
         state = solution.state
         objects = [tracks_of_scans(self.problem.objects[part.drive], part.scans)]
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, state, objects)
         assumptions = self.problem.config.assumptions
-        beside = consider(robust, solution.pairs, solution.values, state, assumptions).covariance(7)
+        extra = considered_by_matches(robust, solution.pairs, solution.values, state, assumptions).covariance(
+            7
+        )
         # By static objects alone: a vehicle that brakes looks like another time offset.
-        covariance = static_covariance(robust, solution.pairs)[:7, :7] + beside
+        covariance = static_covariance(robust, solution.pairs)[:7, :7] + extra
         weights = np.bincount(robust.table.sides, robust.table.root_weights**2)
         clusters = float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
-        return PartAnswer(difference(self.reference_of(part), state), covariance, clusters)
+        return PartEstimate(difference(self.reference_of(part), state), covariance, clusters)
 
     def _data(self, part: Part) -> tuple[Drive, Tracks]:
         """The drive and its tracks, of the part's scans alone."""
@@ -119,7 +121,7 @@ class PartSolver:
     def support(self, part: Part, state: State) -> FloatArray:
         """(scans,) how much each scan of a part agrees with a state: matches, counted by robust weight."""
         drive, tracks = self._data(part)
-        kernel = RobustKernel("geman_mcclure", self.kernel_px[-1])
+        kernel = RobustKernel("geman_mcclure", self.kernels_px[-1])
         found = np.zeros(len(part.scans))
         for own in match_all(edges_of([drive], tracks, self.problem.config.noise), state, kernel):
             scans = np.array([pair.scan for pair in own.pairs])[own.pair_of]

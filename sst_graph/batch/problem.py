@@ -1,4 +1,4 @@
-"""What the joint method solves, and an estimate of it with its covariance."""
+"""The problem of the joint method, and an estimate with its covariance."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.answer import Guess
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
@@ -26,14 +26,14 @@ from sst_graph.graph.state import State
 from sst_graph.initialization.candidates import StartProblem
 from sst_graph.initialization.selection import Selection, alternatives, select_start_steps
 from sst_graph.objects.tracks import ObjectId, object_tracks
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 
 FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class CalibrationProblem:
-    """Drives that share one extrinsic, and how they are to be solved.
+    """Drives that share one extrinsic, and the settings to solve them with.
 
     Attributes:
         drives: what is kept of them.
@@ -80,7 +80,7 @@ class CalibrationProblem:
         Raises:
             EstimationError: no candidate leads anywhere.
         """
-        return whole(select_start_steps(self._start_problem(), self.config.noise, self.config.search))
+        return run_to_end(select_start_steps(self._start_problem(), self.config.noise, self.config.search))
 
     def with_noise(self, noise: GraphConfig) -> CalibrationProblem:
         """The problem with another noise of the joint graph."""
@@ -114,7 +114,7 @@ class CalibrationProblem:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class JointEstimate:
     """A solution and its covariance by the matches.
 
     Attributes:
@@ -130,7 +130,7 @@ class Estimate:
     by_static_objects: FloatArray
 
     @classmethod
-    def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> Estimate:
+    def of(cls, solution: JointSolution, objects: Sequence[dict[ObjectId, int]]) -> JointEstimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))

@@ -1,7 +1,7 @@
-"""The covariance of a joint estimate: that of the matches, and what no match shows.
+"""The total covariance of a joint estimate.
 
-Beside the matches stand the assumptions, motion that nothing measures, and sweeps that the scans leave
-undecided: there the problem is solved again with the point times of each hypothesis that is left.
+It is the sum of the parts by matches, by assumptions, by unmeasured motion, and by sweeps that the scans
+leave undecided: for these the problem is solved again with the point times of each remaining hypothesis.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.answer import DriveCovariance
-from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.batch.method_estimate import DriveCovariance
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.considered import Considered, budget, motion_covariance, remainder
 from sst_graph.covariance.unknown_motion import unknown_motion_covariance
 from sst_graph.graph.frozen_problem import FrozenProblem
@@ -48,7 +48,7 @@ class TotalCovariance:
 
 
 def total_covariance(
-    problem: CalibrationProblem, estimate: Estimate, considered: Considered
+    problem: CalibrationProblem, estimate: JointEstimate, considered: Considered
 ) -> TotalCovariance:
     """The covariance by matches, assumptions, unknown motion and undecided sweeps.
 
@@ -56,7 +56,7 @@ def total_covariance(
         considered: what the assumptions add.
     """
     solution, joint = estimate.solution, problem.config.joint
-    size = 6 + len(solution.state.offsets_s)
+    size = 6 + len(solution.state.time_offsets_s)
     # 1. Matches and assumptions.
     motion = motion_covariance(estimate.robust, solution.pairs, solution.state, joint.graph)
     parts = budget(estimate.covariance, motion, considered)
@@ -77,10 +77,10 @@ def _unknown_motion(problem: CalibrationProblem, solution: JointSolution, varian
 
 
 def _by_drive(
-    problem: CalibrationProblem, estimate: Estimate, unknowns: FloatArray
+    problem: CalibrationProblem, estimate: JointEstimate, unknowns: FloatArray
 ) -> tuple[DriveCovariance, ...]:
     """Of the extrinsic and each drive's own offset, where drives have one each."""
-    drives = problem.drives if len(estimate.solution.state.offsets_s) > 1 else ()
+    drives = problem.drives if len(estimate.solution.state.time_offsets_s) > 1 else ()
     found = []
     for number, drive in enumerate(drives):
         own = [*range(6), 6 + number]
@@ -107,7 +107,7 @@ def sweep_effects(
     The covariance is the mean square of the changes under the hypotheses, by their probability.
 
     Args:
-        covariance: (7, 7) of the answer, without it.
+        covariance: (7, 7) of the estimate, without it.
     """
     reasons, added = [], np.zeros((7, 7))
     for number, drive in enumerate(problem.drives):

@@ -35,7 +35,7 @@ def say(text: str, end: str = "\n") -> None:
 
 
 def mention(text: str) -> None:
-    """Print what was done where the work itself stands in files: it is done, printed or not."""
+    """Print what was done, where the results are in files: a failure to print is no error."""
     try:
         say(text)
     except StreamError as error:

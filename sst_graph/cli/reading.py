@@ -1,7 +1,7 @@
 """How drives are read: as the command line says, and else as the result says that they were.
 
-A calibration holds for the pairs of scans and images that it was made of. How they were read stands in
-calibration.json (``read_as``), so that a later command reads the same drive the same way, or objects.
+A calibration holds for the pairs of scans and images that it was made of. How they were read is kept in
+calibration.json (``read_as``), so that a later command reads the same drive in the same way, or refuses it.
 """
 
 from __future__ import annotations

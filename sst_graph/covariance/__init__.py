@@ -1,1 +1,1 @@
-"""How sure an estimate is: cluster-robust, assumptions considered, weak directions named."""
+"""Covariance of an estimate: cluster-robust, with considered assumptions; weak directions."""

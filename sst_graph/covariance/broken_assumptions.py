@@ -1,4 +1,4 @@
-"""How far an assumption may be wrong, given the data: what is considered in the covariance.
+"""Deviation of an assumption's parameter, given the data, that is considered in the covariance.
 
 Beforehand either all assumptions hold, or one of them is broken, which has probability ``prevalence``. The
 parameter of one that holds is normal with its prior deviation s0. That of a broken one has a deviation tau of
@@ -7,12 +7,12 @@ its own, of which no more is known than its range, from s0 to the assumption's s
 
     B(tau) = N(t; 0, s^2 + tau^2) / N(t; 0, s^2 + s0^2),
 
-and the answer, which holds the parameter at zero, is to be covered for the mean square of it,
+and the estimate, which holds the parameter at zero, is to be covered for the mean square of it,
 
     E[theta^2 | t] = v (1 + v t^2 / s^4),   v = (s^-2 + tau^-2)^-1,
 
-averaged over all that may be. An assumption that holds keeps its prior s0. That one of them at most is broken
-shares an oddity of the data among those that would explain it.
+averaged over all that may be. An assumption that holds keeps its prior s0. At most one assumption is broken,
+so a deviation in the data is shared among the assumptions that would explain it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def _log_normal(value: float, variances: FloatArray) -> FloatArray:
 
 
 def considered_sigmas(evidence: Mapping[str, Evidence]) -> dict[str, float]:
-    """Deviation of each assumption's parameter from zero, by name, that the answer is to be covered for.
+    """Deviation of each assumption's parameter from zero, by name, that the estimate is to be covered for.
 
     Never below the prior one; that stays 0 where it is 0: the assumption holds exactly.
     """

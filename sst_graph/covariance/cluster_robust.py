@@ -1,16 +1,16 @@
-"""The covariance of the estimate: cluster-robust, for neighbouring matches err together.
+"""Cluster-robust covariance of the estimate: errors of neighbouring matches are correlated.
 
 Matches of one side of one object share the error of the mask there: within a frame, and in part over all
 frames that see the object (:mod:`sst_graph.covariance.error_model`). The inverse of the information of the
-frozen graph, which takes all matches for independent, becomes the bread of a sandwich whose filling is the
-variance of the score under this model (:mod:`sst_graph.covariance.sums`).
+frozen graph, which takes all matches for independent, is the outer factor (the "bread") of a sandwich whose
+inner factor is the variance of the score under this model (:mod:`sst_graph.covariance.sums`).
 
 Robust weights are frozen in the graph, as if the kernel stayed as steep as it is on average to the middle;
 under heavy tails it is flatter where it counts (Huber, Robust statistics, 1981, sec. 3.2), and the covariance
 grows with the square of that ratio.
 
-Some objects have errors that the model does not describe. Where such an object has a direction to itself, the
-residuals do not show it: see :mod:`sst_graph.covariance.jackknife`.
+Some objects have errors that the model does not describe. Where one such object alone determines a direction,
+the residuals do not show it: see :mod:`sst_graph.covariance.jackknife`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How an estimate follows the assumptions it rests on, and what that adds to its covariance.
+"""Sensitivity of an estimate to its assumptions, and what that adds to its covariance.
 
-A parameter theta that is held at 0 but has deviation sigma moves the answer by (dx/dtheta) theta: Schmidt's
-considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch. 8). With J
-the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the covariance that
-the solve itself claims,
+A parameter theta that is held at 0 but has deviation sigma shifts the estimate by (dx/dtheta) theta:
+Schmidt's considered parameter (Bierman, Factorization methods for discrete sequential estimation, 1977, ch.
+8). With J the matches' rows by the unknowns, motion marginalised out, c their column by theta and P the
+covariance that the solve itself claims,
 
     dx/dtheta = -P J'c,      P_considered = sum sigma^2 (dx/dtheta)(dx/dtheta)'.
 """
@@ -103,7 +103,8 @@ class Considered:
     """What the assumptions add to a covariance.
 
     Attributes:
-        sensitivities: how extrinsic and offsets (n,) follow each parameter, by name [rad, m, s per unit].
+        sensitivities: derivative (n,) of extrinsic and offsets by each parameter, by name [rad, m, s per
+            unit].
         sigmas: deviations of the parameters.
     """
 
@@ -131,7 +132,7 @@ def columns_of(
     for pair in pairs:
         assert pair.scene is not None
         c_twist = values.atVector(twist_key(pair.drive, pair.pair.image))
-        at = state.cTl, state.offset_s(pair.drive), c_twist
+        at = state.cTl, state.time_offset_s(pair.drive), c_twist
         for matches in pair.matches.values():
             found = residual_columns(matches.alignment, pair.scene, pair.pair.base_tau_s, at, names)
             blocks.append(np.stack([found[name] for name in names], axis=1))
@@ -144,14 +145,14 @@ def weighted_columns(table: MatchTable, pairs: Sequence[PairMatches], columns: F
     return np.asarray(columns * (table.root_weights / sigmas)[:, None])
 
 
-def consider(
+def considered_by_matches(
     robust: RobustCovariance,
     pairs: Sequence[PairMatches],
     values: gtsam.Values,
     state: State,
     config: AssumptionConfig,
 ) -> Considered:
-    """How an answer follows every assumption that is not estimated beside it.
+    """Sensitivity of an estimate to every assumption that is not estimated, from its matches.
 
     Args:
         robust: its covariance and matches.
@@ -159,13 +160,13 @@ def consider(
     """
     names = held_at_zero(config.estimate)
     columns = weighted_columns(robust.table, pairs, columns_of(pairs, values, state, names))
-    size = 6 + len(state.offsets_s)
+    size = 6 + len(state.time_offsets_s)
     steps = steps_by(names, robust.bread, robust.table.J.T @ columns, size)
-    return considered(steps, config)
+    return considered_by_steps(steps, config)
 
 
 def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: int) -> dict[str, FloatArray]:
-    """How the first ``size`` unknowns follow parameters that are held at 0: (size,) each, by name.
+    """Sensitivity dx/dtheta (size,) of the first ``size`` unknowns to each parameter held at 0, by name.
 
     Args:
         bread: (n, n) inverse of the information of the unknowns, motion marginalised out.
@@ -174,8 +175,8 @@ def steps_by(names: Sequence[str], bread: FloatArray, shared: FloatArray, size: 
     return dict(zip(names, -(bread @ shared)[:size].T, strict=True))
 
 
-def considered(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
-    """What parameters that are held at 0 add to a covariance.
+def considered_by_steps(steps: Mapping[str, FloatArray], config: AssumptionConfig) -> Considered:
+    """What parameters held at 0 add to a covariance, from the sensitivities.
 
     Args:
         steps: by :func:`steps_by`.
@@ -201,7 +202,8 @@ def motion_covariance(
 
 
 def budget(covariance: FloatArray, motion: FloatArray, considered: Considered) -> dict[str, list[float]]:
-    """JSON-able: what each part gives to the variances of extrinsic and first offset, as sigmas (7).
+    """JSON-able: the contribution of each part to the covariance of extrinsic and first offset, as sigmas
+    (7).
 
     Args:
         covariance: (n, n) of matches and motion.

@@ -1,11 +1,11 @@
-"""Whether parts of the data agree: the difference of their own answers against its covariance.
+"""Whether parts of the data agree: the difference of their own estimates against its covariance.
 
-Every part (a drive, a stretch of a drive) has an answer of its own, as a step from a common reference with a
-cluster-robust covariance. The squared Mahalanobis length of the difference of two answers would be
+Every part (a drive, a stretch of a drive) has an estimate of its own, as a step from a common reference with
+a cluster-robust covariance. The squared Mahalanobis length of the difference of two estimates would be
 chi-squared if the covariances were known. They are estimated from a limited number of clusters (sides of
 objects), which makes it Hotelling's T^2: an F with about as many degrees of freedom in the denominator as
 clusters (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI). A direction
-that a part does not know has a large variance in the difference and so does not count.
+that a part does not determine has a large variance in the difference and so does not count.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ _LEAST_FREEDOM = 4.0
 """Least degrees of freedom of a covariance, however few clusters: part of it is the error model's."""
 _WORTH, _WORTH_SHARE = 6.0, 0.05
 """A kind of step (rotation, translation, time offset) must lower the squared length by so much a number, and
-by this share of all of it, to be named: three times Akaike's price, for names are meant to be few; and a
-large step disturbs a little whatever else is estimated (odometry, what moves)."""
+by this share of all of it, to be named: three times Akaike's penalty, so that few are named; and a large step
+disturbs all other estimates a little (odometry, dynamic objects)."""
 _ONE_AXIS = 0.9
 """A step along one axis to this share (cosine) is named by that axis alone."""
 _KINDS = {"rotation": slice(0, 3), "translation": slice(3, 6), "offset": slice(6, 7)}
@@ -35,11 +35,11 @@ _WAYS = (("left", "right"), ("up", "down"), ("backward", "forward"))
 
 
 @dataclass(frozen=True)
-class PartAnswer:
-    """What a part of the data says by itself.
+class PartEstimate:
+    """The estimate of one part of the data.
 
     Attributes:
-        step: (7,) from the common reference to the part's answer, in the tangent space of the reference
+        step: (7,) from the common reference to the part's estimate, in the tangent space of the reference
             (right perturbation: rotation [rad], translation [m], offset [s]).
         covariance: (7, 7) of it, cluster-robust.
         clusters: effective number of independent clusters (sides of objects) that the covariance rests on.
@@ -52,7 +52,7 @@ class PartAnswer:
 
 @dataclass(frozen=True)
 class Difference:
-    """How far two parts lie apart.
+    """The difference between the estimates of two parts.
 
     Attributes:
         step: (n,) from the first to the second; 7 numbers, 6 where each part has a time offset of its own.
@@ -65,7 +65,7 @@ class Difference:
     freedom: float = np.inf
 
     @classmethod
-    def of(cls, one: PartAnswer, other: PartAnswer, own_offsets: bool = False) -> Difference:
+    def of(cls, one: PartEstimate, other: PartEstimate, own_offsets: bool = False) -> Difference:
         """From one part to another that is independent of it.
 
         The degrees of freedom are Welch's, along the step: those of the part that is known worse count most
@@ -103,12 +103,12 @@ class Difference:
         return self.p_value, -self.chi2
 
 
-def combined(parts: Sequence[PartAnswer]) -> PartAnswer:
-    """The answer of several independent parts together, weighted by their information."""
+def combined(parts: Sequence[PartEstimate]) -> PartEstimate:
+    """The estimate of several independent parts together, weighted by their information."""
     information = [np.linalg.inv(part.covariance) for part in parts]
     covariance = np.asarray(np.linalg.inv(np.sum(information, axis=0)))
     weighted = np.sum([H @ part.step for H, part in zip(information, parts, strict=True)], axis=0)
-    return PartAnswer(covariance @ weighted, covariance, sum(part.clusters for part in parts))
+    return PartEstimate(covariance @ weighted, covariance, sum(part.clusters for part in parts))
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class NamedStep:
 
 
 def name_step(difference: Difference, cTl: gtsam.Pose3) -> NamedStep:
-    """What the step between two parts is, for people.
+    """The step between two parts, in words.
 
     Where speed and direction are steady, a time offset and a translation look alike, and one number is
     preferred to three.

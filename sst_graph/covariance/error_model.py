@@ -1,4 +1,4 @@
-"""What errors of matches have in common, fitted to the residuals by the method of moments.
+"""Error model of the matches: variances of the errors that matches share, by the method of moments.
 
 Each whitened residual is modelled as
 
@@ -23,11 +23,11 @@ IntArray = NDArray[np.intp]
 _SIDE, _SIDE_FRAME = 0.17, 0.17
 """Least variances as shares of a match's own: of a side over all frames, of a side in one frame.
 
-The mask biases of the objects are fitted to the same residuals and swallow most of what a side has in
-common, so the residuals alone would make a short drive far too sure. Where contours are rough within a
-side, they are rough as a whole too: hence shares."""
+The mask biases of the objects are fitted to the same residuals and absorb most of the error that a side
+shares, so from the residuals alone the sigmas of a short drive would be far too small. Where a contour is
+rough within a side, it is also rough as a whole: hence fractions of a match's variance."""
 _LEAST_MATCH = 0.05
-"""Least variance of a match's own error: residuals that are all but zero are a simulation's."""
+"""Least variance of a match's own error: only simulations have residuals of almost zero."""
 
 
 @dataclass(frozen=True)

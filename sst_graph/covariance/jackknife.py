@@ -1,4 +1,4 @@
-"""Jackknife over objects: how the estimate varies with the objects that happen to be there.
+"""Jackknife over objects: the spread of the estimate over samples of objects.
 
 Some objects have errors that the error model of all does not describe: two that were merged, one half hidden.
 The estimate without each of them is computed. Where they are few, or few have most of the weight, the
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ObjectSpread:
-    """How the estimate varies with the objects that happen to be there.
+    """The spread of the estimate over samples of objects.
 
     Attributes:
         jackknife: (n, n) covariance from leaving out one object after the other.

@@ -126,11 +126,11 @@ _MOST_DRIVES = 64
 
 @dataclass(frozen=True)
 class _Motion:
-    """What the optimum differs in from where the matches were made, beside the state.
+    """Twists and parameters at the optimum, relative to the point that the matches were made at.
 
     Attributes:
         values: with the twists at the optimum.
-        responses: (6, n) how each twist follows the other unknowns, by its key.
+        responses: (6, n) derivative of each twist by the other unknowns, by its key.
         nuisances: steps of the assumptions' parameters since the matches were made, by name.
     """
 
@@ -154,7 +154,7 @@ def _rows(
         columns[own] = unknowns.column(key)
         if some is not None:
             biases_px[own] = state.object_bias_px(pair.drive, int(pair.tracks[c][some[0]]), c)
-    r, J, _ = weighted_residuals(alignment, state.cTl, state.offset_s(pair.drive), c_twist, biases_px)
+    r, J, _ = weighted_residuals(alignment, state.cTl, state.time_offset_s(pair.drive), c_twist, biases_px)
     roots = np.abs(J[:, 13]) * alignment.sigmas_px
     block = J[:, 7:13] @ response
     block[:, :6] += J[:, :6]
@@ -172,5 +172,5 @@ def unweighted(r: FloatArray, roots: FloatArray) -> FloatArray:
 
 
 def curvatures_of(kernel: RobustKernel, roots: FloatArray, r: FloatArray) -> FloatArray:
-    """(m,) second derivatives of the robust loss, weighted as matches are beside the kernel."""
+    """(m,) second derivatives of the robust loss, multiplied by the matches' own weights."""
     return np.asarray(roots**2 * kernel.curvature(r) / np.maximum(kernel.weight(r), 1e-12))

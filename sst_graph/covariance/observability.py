@@ -17,9 +17,9 @@ _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
 _PAIR_CORRELATION = 0.98
 """A translation and the time offset that are correlated as closely as this hardly separate, as at constant
-speed: what does separate them is small ..."""
+speed: they are separated by small differences only."""
 _PAIR_SHARE = 0.5
-"""... so that it must determine them to this share of the limits."""
+"""Two unknowns that hardly separate must be determined to this fraction of the limits."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ MOTION = Advice(
 
 @dataclass(frozen=True)
 class ObservabilityConfig(Settings):
-    """Largest standard deviations of an answer that may be called ok."""
+    """Largest standard deviations of an estimate that may be called ok."""
 
     rotation_deg: float = setting(
         0.5,
@@ -106,11 +106,11 @@ def open_directions(
     config: ObservabilityConfig,
     advice: Advice = SILHOUETTES,
 ) -> tuple[WeakDirection, ...]:
-    """Directions that are not known: by the covariance or, where that is within the limits, by static
+    """Directions beyond the limits: of the covariance or, where that is within them, of that by static
     objects alone.
 
     Args:
-        covariance: (7, 7) of the answer.
+        covariance: (7, 7) of the estimate.
         by_static_objects: (7, 7) by static objects alone, where dynamic ones are among the matches.
     """
     weak = weak_directions(covariance, cTl, config, advice)
@@ -189,7 +189,7 @@ def _words(
         rate_ms = abs(offset_s) * 1e3 / translation_m if translation_m else 0.0
         sign = "later" if offset_s > 0 else "earlier"
         return (
-            f"the LiDAR {words} cannot be told from the image taken {sign}: "
+            f"the LiDAR {words} cannot be distinguished from the image taken {sign}: "
             f"1 m equals {rate_ms:.0f} ms of time offset (one sigma: {100 * translation_m:.1f} cm, "
             f"{abs(offset_s) * 1e3:.1f} ms)",
             advice.together,
@@ -213,7 +213,7 @@ def _words(
 
 
 def _axis_words(c_translation: FloatArray) -> str:
-    """Which way a shift in the camera frame goes, in a word."""
+    """Direction of a shift in the camera frame, in a word."""
     names = (("right", "left"), ("down", "up"), ("forward", "backward"))
     axis = int(np.abs(c_translation).argmax())
     return "shifted " + names[axis][0 if c_translation[axis] > 0 else 1]

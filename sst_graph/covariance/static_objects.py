@@ -1,8 +1,8 @@
 """The covariance by static objects alone.
 
 An oncoming vehicle whose velocity is known may separate the time offset from the translation where static
-objects do not: on a straight road at one speed. Its velocity was estimated along the way, so what only such
-matches determine does not count as known.
+objects do not: on a straight road at one speed. Its velocity was itself estimated, so a direction that only
+such matches determine does not count as observable.
 """
 
 from __future__ import annotations

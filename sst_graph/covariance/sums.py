@@ -1,4 +1,4 @@
-"""The sums over matches that the cluster-robust covariance is made of: they grow, whoever fills them.
+"""Sums over matches for the cluster-robust covariance; batch, tracker and a user's graph fill the same sums.
 
 With a match's whitened Jacobian row J, robust weight w and a = sqrt(w) J, an error e of its residual changes
 the gradient by its score, sqrt(w) a e. Under the error model (:mod:`sst_graph.covariance.error_model`) the

@@ -1,8 +1,8 @@
-"""What a scan without neighbours leaves open: how the vehicle moved between it and its image.
+"""Covariance of the motion between a scan without neighbours and its image.
 
-The scan is taken as standing, and no residual shows that it was not: the answer takes up speed times interval
-whole. The interval is known as well as the time offset, so this is a product of two unknowns, which no
-linearization about standing sees.
+A single scan has no odometry, so the vehicle is assumed to stand at it, and no residual shows otherwise: the
+whole of speed times interval goes into the estimate. The interval is known as well as the time offset, so the
+error is a product of two unknowns, which does not show in a linearization about standstill.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class UnknownMotionConfig(Settings):
-    """How a vehicle may move of which a single scan is all that is known; 0 for both where it stood."""
+    """Deviations of the motion of a vehicle of which there is a single scan; both 0 where it stood."""
 
     speed_mps: float = setting(
         10.0,
@@ -43,14 +43,14 @@ class UnknownMotionConfig(Settings):
 def unknown_motion_covariance(
     pairs: Sequence[PairMatches], state: State, variance_s2: float, config: UnknownMotionConfig
 ) -> FloatArray:
-    """(7, 7) covariance of extrinsic and offset by motion that nothing measures, to be added to the matches'.
+    """(7, 7) covariance of extrinsic and offset by unmeasured motion, to be added to that of the matches.
 
-    In the LiDAR's frame the scan lies ``twist * interval`` beside where it is taken to be: a step of the
+    In the LiDAR's frame the scan is displaced by ``twist * interval``: a step of the
     extrinsic's tangent (right perturbation: rotation [rad], translation [m]) of this variance.
 
     Args:
-        pairs: matches of an answer.
-        state: the answer, for its time offsets.
+        pairs: matches of an estimate.
+        state: the estimate, for its time offsets.
         variance_s2: of the time offset [s^2].
     """
     covariance = np.zeros((7, 7))
@@ -58,7 +58,7 @@ def unknown_motion_covariance(
     if not alone:
         return covariance
     share = sum(len(pair) for pair in alone) / sum(len(pair) for pair in pairs)
-    intervals = [pair.pair.base_tau_s + state.offset_s(pair.drive) for pair in alone]
+    intervals = [pair.pair.base_tau_s + state.time_offset_s(pair.drive) for pair in alone]
     square_s2 = variance_s2 + float(np.square(intervals).max())
     rates = np.repeat([np.radians(config.turn_deg_per_s), config.speed_mps], 3)
     covariance[:6, :6] = np.diag((share * rates) ** 2 * square_s2)

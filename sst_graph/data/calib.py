@@ -94,7 +94,7 @@ class KittiCalibration:
         """Pose of the rectified camera 0 in ``camera``: [I | K^-1 P[:, 3]].
 
         Raises:
-            DataError: as :meth:`projection`, or cameras that do not stand on one vehicle.
+            DataError: as :meth:`projection`, or cameras too far apart for one vehicle.
         """
         P = self.projection(camera)
         shift = np.linalg.solve(P[:, :3], P[:, 3])

@@ -1,7 +1,7 @@
 """What image decoders print: libpng, libjpeg and OpenCV write to the process's stderr, not to Python.
 
-It tells of damage that they pass over (half a JPEG becomes a grey half), and it must not stand among our own
-messages. So it is caught while a picture is decoded.
+These lines report damage that the decoder itself ignores (half a JPEG becomes a grey half), and they must not
+appear among our own messages. So they are captured while a picture is decoded.
 """
 
 from __future__ import annotations

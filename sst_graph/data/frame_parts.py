@@ -1,4 +1,4 @@
-"""Scans and images of a drive, read apart where its source can do that: none is read for the other's sake."""
+"""Scans and images of a drive, read separately where its source supports it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from sst_graph.types import CameraImage, Frame, Scan, Source
 
 @runtime_checkable
 class SeparateReader(Protocol):
-    """What a source may offer beside whole frames. Positions, and errors, are those of its frames."""
+    """Optional methods of a source that read scans and images separately. Positions, and errors, are those of
+    its frames."""
 
     def frame_number(self, position: int) -> int:
         """Index of the frame; nothing is read."""
@@ -46,9 +47,8 @@ an HDL-64E's. A sweep is decided by 48 scans at most."""
 
 
 class AheadReader:
-    """A drive some of whose scans are looked at before the frames are read in turn; no file is read twice.
-
-    What was looked at is kept until its frame is read.
+    """A drive some of whose scans are read before the frames are read in turn. These are kept until their
+    frames are read, so no file is read twice.
     """
 
     def __init__(self, source: Source) -> None:

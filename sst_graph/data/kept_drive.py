@@ -18,7 +18,7 @@ class KeptDrive:
     Attributes:
         name, camera, nominal, truth: as in a source.
         frames: all of them.
-        sweep: what the data say of the sweep (:mod:`sst_graph.odometry.sweep`); ``auto`` says nothing.
+        sweep: what the data say of the sweep (:mod:`sst_graph.odometry.sweep`); ``auto``: nothing.
     """
 
     name: str

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 MAX_RINGS = 256
 MIN_POINTS_PER_RING = 8
-"""Mean number of points in a ring below which no ring is believed in."""
+"""Mean number of points in a ring below which rings are not accepted."""
 
 MIN_EXPLAINED = 0.9
-"""Share of the variance of the elevation that rings must explain to be believed."""
+"""Share of the variance of the elevation that rings must explain to be accepted."""
 
 _TURN_RAD = 2.0 * np.pi
 _SEAMS_RAD = (0.0, np.pi, 0.5 * np.pi, -0.5 * np.pi)

@@ -116,7 +116,7 @@ def open_source(
     frames: str | slice | None = None,
     **options: Unpack[ReadOptions],
 ) -> Source:
-    """Open a drive; frames are read when asked for.
+    """Open a drive; each frame is read when it is accessed.
 
     Args:
         path: root of the data set, or the folder of one sequence.

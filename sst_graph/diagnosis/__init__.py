@@ -1,4 +1,4 @@
-"""Likely causes of wrong results: what users give by mistake, and what in the data says so.
+"""Likely causes of wrong results: common mistakes in the input, and the evidence for them in the data.
 
 A check is a function of the prepared data that returns a :class:`Finding` or None. :func:`preflight` runs
 those that are certain by themselves, for every calibration; :func:`likely_causes` those that explain a result

@@ -67,16 +67,16 @@ def likely_causes(
 
 
 def mirror(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, answer: Fit
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, result: Fit
 ) -> tuple[Finding, ...]:
     """Whether mirrored data would agree better, for a result without any other reason against it.
 
     Args:
-        answer: how well the labels agree in the result.
+        result: how well the labels agree in the result.
     """
     drive = max(drives, key=lambda one: len(one.scans))
-    around = answer.cTl if guess is None else guess
-    cause = mirrored(drive, around, offset_s, fit, answer, sideways=guess is not None)
+    around = result.cTl if guess is None else guess
+    cause = mirrored(drive, around, offset_s, fit, result, sideways=guess is not None)
     return () if cause is None else (cause,)
 
 

@@ -1,4 +1,4 @@
-"""What is probably wrong with the data, in one sentence."""
+"""A likely fault in the data, as one sentence."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ class Finding:
     """A likely cause.
 
     Attributes:
-        cause: what is probably wrong.
-        evidence: what says so, with numbers.
-        check: what to look at or change.
+        cause: the likely fault.
+        evidence: for it, with numbers.
+        check: what to inspect or change.
     """
 
     cause: str

@@ -13,11 +13,12 @@ WELL = 0.4
 """Quality above which nothing else is tried: right data have 0.2 (hand-drawn labels, crowded street) to 0.6,
 wrong ones 0.03 to 0.14, seldom 0.3."""
 LEAST_QUALITY = 0.17
-"""Of a change that is accepted ..."""
+"""Least quality of a change that is accepted."""
 LEAST_CONCENTRATION = 0.62
-"""... if so much of its matches are close: right data have 0.69 to 0.87, overfitted ones up to 0.6 ..."""
+"""Least concentration of a change that is accepted: right data have 0.69 to 0.87, overfitted ones up to
+0.6."""
 LEAST_GAIN, LEAST_EXPLAINED_GAIN = 2.2, 1.4
-"""... and it has so many times the quality, and the share of outlines that meet, of the data as given: on
+"""Least ratios of its quality, and of its explained share, to those of the data as given: on
 foreign data the best of twenty searches gains something by chance."""
 
 

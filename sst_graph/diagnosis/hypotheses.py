@@ -1,4 +1,4 @@
-"""Which simple change of the data would make the labels agree: the change names the cause.
+"""Hypotheses about the cause: simple changes of the data under which the labels would agree.
 
 When a calibration fails or may be wrong, common mistakes are undone one by one, a start is searched each
 time, and the agreement of the labels is compared with that of the data as given.
@@ -119,11 +119,12 @@ def _shifts(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterato
 def mirrored(
     drive: Drive, guess: gtsam.Pose3, offset_s: float, fit: Fitter, given: Fit, sideways: bool
 ) -> Finding | None:
-    """Clouds or pictures that are mirrored: of all mistakes the one that an answer may survive.
+    """Clouds or pictures that are mirrored: the only mistake with which an estimate may still have the status
+    ``ok``.
 
     Args:
-        sideways: left and right only: around a start that was given, no answer survives what also turns the
-            cloud by 180 degrees.
+        sideways: left and right only: with a given start, no estimate is ``ok`` where the cloud is also
+            turned by 180 degrees.
     """
     tried = itertools.islice(_mirrorings(drive, guess, offset_s), 1 if sideways else None)
     best = _best(tried, offset_s, fit, given)
@@ -131,7 +132,7 @@ def mirrored(
 
 
 def hypotheses(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Iterator[Hypothesis]:
-    """What often goes wrong, undone."""
+    """The common mistakes, each undone."""
     for name, check, start in _starts(guess):
         yield Hypothesis(Finding(name, "", check), drive, start, offset_s, guess)
     yield from _mirrorings(drive, guess, offset_s)

@@ -1,4 +1,4 @@
-"""Where the answer lies against the start."""
+"""Findings from the difference between result and start."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 _SEQUENCES = ("xyz", "zyx", "XYZ", "ZYX", "yxz", "YXZ", "zxy", "ZXY")
 """Orders in which roll, pitch and yaw are applied."""
 _SEARCHED_DEG = 35.0
-"""A start nearer than this to the answer is good enough for the search [deg]."""
+"""A start nearer than this to the result is good enough for the search [deg]."""
 _FREE_QUALITY = 0.3
 """Of a pose found among all: more chances agree better than one (foreign images reach 0.2)."""
 _NEAR_DEG, _DESIGN_DEG = 5.0, 15.0
@@ -62,19 +62,20 @@ def start_finding(guess: gtsam.Pose3, found: Fit, finding: Finding) -> Finding:
     return finding
 
 
-def other_camera(guess: gtsam.Pose3 | None, answer: gtsam.Pose3, covariance: FloatArray) -> Finding | None:
-    """An answer beside the start by a stereo baseline, and parallel to it: pictures of the other camera.
+def other_camera(guess: gtsam.Pose3 | None, result: gtsam.Pose3, covariance: FloatArray) -> Finding | None:
+    """A result that is parallel to the start and shifted sideways by a stereo baseline: pictures of the other
+    camera.
 
     Args:
-        covariance: (7, 7) of the answer.
+        covariance: (7, 7) of the result.
     """
-    if guess is None or _angle_deg(guess.rotation(), answer.rotation()) > _ALIGNED_DEG:
+    if guess is None or _angle_deg(guess.rotation(), result.rotation()) > _ALIGNED_DEG:
         return None
-    way = answer.translation() - guess.translation()
+    way = result.translation() - guess.translation()
     length = float(np.linalg.norm(way))
     if not _BASELINE_M[0] < length < _BASELINE_M[1] or abs(way[0]) < _SIDEWAYS * length:
         return None
-    across = answer.rotation().matrix()[0]
+    across = result.rotation().matrix()[0]
     sigma = float(np.sqrt(across @ covariance[3:6, 3:6] @ across))
     if abs(way[0]) < _SIGMAS * sigma:
         return None

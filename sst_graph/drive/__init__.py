@@ -1,1 +1,1 @@
-"""What is kept of a drive: features, motion, and what its raw frames show."""
+"""Prepared drives: features, motion, and statistics of the raw frames."""

@@ -1,4 +1,4 @@
-"""What the estimators keep of a drive: boundary points, contours, a few points, motion; in one pass."""
+"""Preparation of a drive in one pass: boundary points, contours, a sample of points, motion."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class PrepareConfig(Settings):
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
 @dataclass(frozen=True)
 class ScanFeatures:
-    """What is kept of a scan.
+    """Features of a scan.
 
     Attributes:
         index: of its frame in the drive.
@@ -102,9 +102,9 @@ class ScanFeatures:
 @storable("mask")
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What is kept of an image: its mask and the signed distance to each class's contour.
+    """Features of an image: its mask and the signed distance to each class's contour.
 
-    Of the picture no more is kept than what it shows along the contours.
+    Of the picture, only its edges along the contours are kept.
     """
 
     stored_apart: ClassVar[bool] = True
@@ -141,7 +141,7 @@ class ImageFeatures:
 
 @dataclass
 class LeftOut:
-    """What a drive lacked, counted while it was read; the rest of it was used.
+    """Counts of what a drive lacked; the rest of it was used.
 
     Attributes:
         points: that were NaN or inf.
@@ -230,7 +230,7 @@ class Drive:
         """Twists of the LiDAR over time, smoothed, exactly zero at standstill; None for a single scan.
 
         Args:
-            growing: has most of the motions from a call before.
+            growing: cache that holds the motions of earlier calls.
         """
         return (growing or GrowingTrack()).of(self.lidar_motions)
 
@@ -336,7 +336,7 @@ def scan_features(
 def apart(
     found: dict[SemanticClass, Boundaries],
 ) -> tuple[dict[SemanticClass, Boundaries], dict[SemanticClass, Boundaries]]:
-    """Boundary points, and apart from them those towards the ground."""
+    """Boundary points without those towards the ground, and those towards the ground."""
     boundaries, lower_edges = {}, {}
     for c, points in found.items():
         down = points.edges == Edge.BOTTOM
@@ -349,14 +349,16 @@ def apart(
     )
 
 
-def outlines(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> dict[SemanticClass, Boundaries]:
+def boundaries_of(
+    scan: ScanFeatures, lower_edges: Collection[SemanticClass]
+) -> dict[SemanticClass, Boundaries]:
     """A scan's boundary points, of some classes with those towards the ground."""
     some = {c: scan.lower_edges[c] for c in lower_edges if c in scan.lower_edges}
     return {c: points.joined(some[c]) if c in some else points for c, points in scan.boundaries.items()}
 
 
-def outline_size(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> int:
-    """Number of the points of :func:`outlines`."""
+def boundary_count(scan: ScanFeatures, lower_edges: Collection[SemanticClass]) -> int:
+    """Number of the points of :func:`boundaries_of`."""
     below = sum(len(points) for c, points in scan.lower_edges.items() if c in lower_edges)
     return below + sum(map(len, scan.boundaries.values()))
 

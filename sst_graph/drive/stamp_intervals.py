@@ -2,9 +2,10 @@
 
 A camera and a LiDAR run at steady rates. Where stamps were regular, one interval is odd, and those after it
 are regular again, all later stamps are off by as much: the clock behind them has jumped, or the sensor has
-paused for part of a period. Labels show which, once they are seen under motion; until then the time offset is
-not known. A jump by whole periods forward looks like missing frames, one back by a single period like a
-doubled one: only labels show them. Where both sensors' stamps jump alike, their time offset is what it was.
+paused for part of a period. Labels show which of the two, once objects are seen under motion; until then the
+time offset is not known. A jump by whole periods forward looks like missing frames, one back by a single
+period like a doubled one: only labels show them. Where both sensors' stamps jump alike, their time offset is
+what it was.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ _LEAST_SIGMA_S = 5e-4
 _LEAST_JUMP_S = 0.01
 """Smaller jumps are not reported: labels show them [s]."""
 _ALIKE_S = 0.005
-"""Two sensors that jump by the same, but for this, share a clock [s] ..."""
+"""Two sensors whose jumps differ by less than this share a clock [s]."""
 _TOGETHER = 3
-"""... and for so many more scans the other may jump, too."""
+"""Scans within which the other sensor has to jump, too."""
 _GAP = 5.0
 """After a gap of more periods than this the sensor may have restarted, out of phase with itself."""
 

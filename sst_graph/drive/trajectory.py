@@ -85,7 +85,7 @@ class TwistTrack:
         spans = self._middles[i + 1] - self._middles[i]
         slopes = (after - before) / spans[:, None]
         fractions = np.minimum(np.maximum((t - self._middles[i]) / spans, -0.5), 1.5)
-        # As if both erred together, which smoothed motions nearly do.
+        # As if both errors were equal, as they nearly are for smoothed motions.
         weights = np.abs([1.0 - fractions, fractions])[:, :, None, None]
         covariances = np.array([_covariance(motion) for motion in known])[place]
         total = weights[0] * covariances[0] + weights[1] * covariances[1]

@@ -41,7 +41,7 @@ _TOLD_SIGMAS = 5.0
 _UNTOLD_SPANS = 0.5
 """A deviation above this share of its parameter's span, the prior of the test, is the prior's."""
 _SILENT_SIGMAS = 3.0
-"""An answer that is ``ok`` is to be off by no more than this on any of its seven axes."""
+"""A result that is ``ok`` is to be off by no more than this on any of its seven axes."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Run:
         case: what was done to it.
         size: by how much, with its sign; 0 where nothing was, or all.
         status: of the result.
-        error: (7,) how far the answer is off [rad, m, s].
+        error: (7,) how far the result is off [rad, m, s].
         covariance: (7, 7) that it claims.
         estimates: what the data say of each parameter: estimate and deviation, by name.
         contradicted: assumptions that the data contradict, the most contradicted first.

@@ -37,7 +37,7 @@ class ConsistencyConfig(Settings):
         drives: kinds of drives.
         seed: of the first street; the next ones follow.
         start_deg, start_m: half widths of the starts' error, uniform by axis [deg], [m].
-        lost_deg: a rotation error beyond this is a wrong answer, not a matter of covariance [deg].
+        lost_deg: a rotation error beyond this is a wrong result, not a matter of covariance [deg].
         label_noise: of the simulator.
         calibration: settings of the method.
     """

@@ -100,7 +100,7 @@ def _row(sources: Sequence[Source], drives: Sequence[Drive], shift: int, config:
 
 
 def _spread_deg(results: Sequence[CalibrationResult]) -> float:
-    """Largest angle between two of the answers [deg]."""
+    """Largest angle between two of the results [deg]."""
     angles = [
         np.linalg.norm(gtsam.Rot3.Logmap(a.T_camera_lidar.between(b.T_camera_lidar).rotation()))
         for a, b in itertools.combinations(results, 2)

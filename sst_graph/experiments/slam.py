@@ -70,7 +70,7 @@ class SlamConfig(Settings):
         loop_every, loop_min_s: one scan out of so many is tried as a loop closure, and with scans that are so
             much older [s].
         camera: what the camera adds to the pose graph.
-        calibration: of the calibration alone, from whose answer both together start.
+        calibration: of the calibration alone, from whose result both together start.
     """
 
     streets: int = setting(5, at_least=1, at_most=10_000)

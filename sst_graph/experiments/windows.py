@@ -98,7 +98,7 @@ def error_cell(errors: Sequence[CalibrationErrors]) -> str:
 
 
 def spread_cells(results: Sequence[CalibrationResult]) -> list[str]:
-    """Spread over claim of rotation, translation and offset, and the three in sigmas; doubted answers, which
+    """Spread over claim of rotation, translation and offset, and the three in sigmas; doubted results, which
     claim nothing, are left out."""
     claimed = [result for result in results if result.status != "not_converged"]
     if len(claimed) < 2:
@@ -114,7 +114,7 @@ def spread_cells(results: Sequence[CalibrationResult]) -> list[str]:
 
 
 def deviations_of(results: Sequence[CalibrationResult]) -> tuple[FloatArray, list[FloatArray]]:
-    """(n, 7) deviations of answers from their mean weighted by information, and their covariances."""
+    """(n, 7) deviations of results from their mean weighted by information, and their covariances."""
     first = results[0]
     steps = np.array(
         [

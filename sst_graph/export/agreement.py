@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc
 
-from sst_graph.covariance.contradiction import Difference, PartAnswer, combined, name_step
+from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 from sst_graph.errors import ContradictionError, EstimationError
 from sst_graph.graph.linear import unit_scale
 
@@ -20,7 +20,7 @@ SIGNIFICANCE = 1e-3
 _ROUNDING = 1e-6
 """Information below zero by this share of the whole is rounding."""
 _FAR_SIGMA = 1e3
-"""A direction that a marginal does not tell has this sigma [rad, m, s]."""
+"""Sigma of a direction that a marginal does not determine [rad, m, s]."""
 
 
 def check_agreement(
@@ -39,20 +39,21 @@ def check_agreement(
 
     Raises:
         ContradictionError: they do not.
-        EstimationError: one is no answer of its own: it takes information away.
+        EstimationError: one is no estimate of its own: it takes information away.
     """
     if len(parts) < 2 or significance <= 0.0:
         return
     _check_answers([information for information, _ in parts], names)
-    answers = [_answer(information, vector) for information, vector in parts]
+    estimates = [_estimate(information, vector) for information, vector in parts]
     # 1. All together: how much the costs are above their own minima, for 7 numbers a part more than needed.
-    common = combined(answers)
-    away = [part.step - common.step for part in answers]
+    common = combined(estimates)
+    away = [part.step - common.step for part in estimates]
     chi2 = float(sum(d @ information @ d for d, (information, _) in zip(away, parts, strict=True)))
     freedom = 7 * (len(parts) - 1)
     # 2. Each against the others.
     against = [
-        Difference.of(combined([*answers[:k], *answers[k + 1 :]]), part) for k, part in enumerate(answers)
+        Difference.of(combined([*estimates[:k], *estimates[k + 1 :]]), part)
+        for k, part in enumerate(estimates)
     ]
     worst = int(np.argmax([difference.chi2 for difference in against]))
     p_value = min(float(chdtrc(freedom, chi2)), len(parts) * against[worst].p_value)
@@ -66,7 +67,7 @@ def check_agreement(
 
 
 def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> None:
-    """That each is an answer of its own, and no difference of two as a growing marginal's parts are."""
+    """That each is an estimate of its own, and no difference of two as a growing marginal's parts are."""
     scale = unit_scale(np.sum(informations, axis=0))
     for k, information in enumerate(informations):
         least = float(np.linalg.eigvalsh(information * np.outer(scale, scale))[0])
@@ -78,7 +79,7 @@ def _check_answers(informations: Sequence[FloatArray], names: Sequence[str]) -> 
             )
 
 
-def _answer(information: FloatArray, vector: FloatArray) -> PartAnswer:
-    """A cost's own optimum; a direction that it does not tell has a large variance."""
+def _estimate(information: FloatArray, vector: FloatArray) -> PartEstimate:
+    """A cost's own optimum; a direction that it does not determine has a large variance."""
     covariance = np.asarray(np.linalg.inv(information + np.eye(7) / _FAR_SIGMA**2), np.float64)
-    return PartAnswer(covariance @ vector, covariance)
+    return PartEstimate(covariance @ vector, covariance)

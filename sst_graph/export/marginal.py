@@ -1,4 +1,4 @@
-"""What a calibration knows about extrinsic and time offset, as one factor on (E, D).
+"""The marginal of a calibration on extrinsic and time offset, as one factor on (E, D).
 
 The cost of a calibration (cTl, offset), in the tangent space of the linearization point:
 
@@ -133,13 +133,13 @@ def fuse_graphs(
 
     Marginals taken each at its own drive's optimum miss that by some thousandths to hundredths of a sigma,
     for no drive's cost is quadratic. So every drive's marginal is taken again at the fused estimate
-    (:func:`marginal_of_graph` with ``at``), and fused again, until the estimate stands still. Only
+    (:func:`marginal_of_graph` with ``at``), and fused again, until the estimate converges. Only
     seven-vectors travel between the drives' machines.
 
     Args:
         graphs: each drive's own graph and its values; they share nothing but E and D.
         E_key, D_key: keys of extrinsic and time offset, the same in all.
-        tolerance_sigmas: the fused estimate stands still when it moves by less [sigma].
+        tolerance_sigmas: the fused estimate has converged when it moves by less [sigma].
         max_rounds: most rounds.
         significance: as in :func:`fuse_marginals`. It holds for graphs whose noise models hold: one that
             takes matches which err together for independent contradicts others too easily.
@@ -149,7 +149,7 @@ def fuse_graphs(
 
     Raises:
         ContradictionError: the drives contradict one another.
-        EstimationError: a direction that no drive determines, or no standstill.
+        EstimationError: a direction that no drive determines, or no convergence.
     """
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
@@ -169,11 +169,11 @@ def fuse_marginals(
     names: Sequence[str] = (),
     significance: float = SIGNIFICANCE,
 ) -> CalibrationMarginal:
-    """What several calibrations of the same pair of sensors know together; linearized at the optimum.
+    """Several calibrations of the same pair of sensors, fused; linearized at the optimum.
 
-    Exact where all marginals share their linearization point. Otherwise each is carried to the common
-    point by its first derivative, which holds while the points differ by little (a degree, a decimetre).
-    By how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
+    Exact where all marginals share their linearization point. Otherwise each is expanded about the common
+    point by its first derivative, which holds while the points differ by little (a degree, a decimetre). By
+    how much the sum of the costs at their common optimum exceeds the sum of their own minima is a
     chi-squared, and so is what each differs from the others by: both are tested.
 
     Args:

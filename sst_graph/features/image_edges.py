@@ -1,10 +1,9 @@
-"""What the picture shows along a mask's contour: where the object's edge is, and where none can be seen.
+"""Edges of the picture along a mask's contour.
 
-Networks and people put a contour a pixel or three beside the edge, all along one side of an object, and
-where the picture is too dark to see an edge they interpolate. The picture shows both: colours change most
-across the edge. One pixel's profile is noise, so profiles are averaged along the contour. The contour moves
-to an edge that is unambiguous within reach; where hardly any change of colour goes with it, it is not
-matched.
+Networks and people draw a contour one to three pixels off the edge, along a whole side of an object, and
+interpolate where the picture is too dark to see an edge. The picture shows where the edge is: there colours
+change most. One pixel's profile is noise, so profiles are averaged along the contour. The contour moves to an
+edge that is unambiguous within reach; where hardly any change of colour goes with it, it is not matched.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ class PictureEdges:
 
     Attributes:
         shifts: (n,) how far outside of the mask's contour the edge is [px].
-        seen: (n,) False where there is none to be seen.
+        seen: (n,) False where no edge is visible.
     """
 
     shifts: FloatMap
@@ -75,7 +74,7 @@ class PictureEdges:
         seen."""
         u, v = np.concatenate(contour_pixels(inside)).T
         height, width = (side // 2 + side % 2 for side in inside.shape)
-        # Of half the size: shifts vary slowly along a contour, and this is what costs.
+        # At half the size: shifts vary slowly along a contour, and this takes most of the time.
         cells = (v // 2) * width + u // 2
         counts = np.bincount(cells, minlength=height * width).reshape(height, width)
         sums = np.bincount(cells, self.shifts, minlength=height * width).reshape(height, width)
@@ -161,7 +160,7 @@ def _strength(
 
 def _best_edges(strength: FloatMap, likely: FloatMap, ts: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """(n,) distances of the likeliest edges [px], and whether they are unambiguous."""
-    # Which edge it is, the likelihood decides; where it is, the picture alone.
+    # The likelihood selects the edge; its position is that in the picture.
     column = np.arange(strength.shape[1])
     likeliest = likely.argmax(axis=0)
     nearby = np.clip(likeliest + _NEARBY[:, None], 2, len(ts) - 3)

@@ -208,7 +208,7 @@ def _ring_edges(
 ) -> _Edges:
     """Edges towards the ring above: half way, at the object's range, to that ring's cone.
 
-    The one return of that ring that is nearest in azimuth decides. To ask two of them to miss the
+    The one return of that ring that is nearest in azimuth decides. To require that two of them miss the
     object would prefer edges far from that ring, and so shift the mean by a tenth of the gap.
 
     With the height (n,) [m] of the ground that each point's object stands on, edges towards the ring

@@ -130,7 +130,7 @@ def nearest_contours(
     n, counts = len(uvs), [b - a for a, b in spans]
     if n == 0:
         return ContourFeet(np.zeros(0), uvs, uvs, np.zeros(0, np.bool_))
-    # All at once: with few points a call costs more than what it does.
+    # All at once: with few points, a call for each would cost more than the work.
     sizes = {(contour.width, contour.height) for contour in contours}
     width, height = (
         next(iter(sizes))

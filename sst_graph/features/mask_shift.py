@@ -51,7 +51,7 @@ class ContourProfile:
 
 @dataclass(frozen=True)
 class MaskShift:
-    """By how much masks lie beside what the pictures show.
+    """Shift of the masks against the edges of the pictures.
 
     Attributes:
         right_px, down_px: where the masks lie, seen from the pictures' edges [px].

@@ -24,7 +24,7 @@ MAX_TRANSLATION_M = 1000.0
 MAX_OFFSET_S = 1e9
 """Between two clocks, also of different epochs (32 years)."""
 MIN_SIGMA, MAX_SIGMA = 1e-12, 1e12
-"""Standard deviations [rad, m, s]: no measurement is finer than the first, and the second tells nothing."""
+"""Standard deviations [rad, m, s]: no measurement is finer than the first, and the second means unknown."""
 MAX_IMAGE_SIDE_PX = 1 << 20
 FOCAL_LENGTHS = (0.02, 200.0)
 """Focal length over the longer side of the image: a field of view of 175 to 0.3 degrees."""

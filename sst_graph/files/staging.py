@@ -31,7 +31,7 @@ DONE = "done"
 """What is being written, what it replaces, and what was replaced, in a staging folder."""
 
 EXCHANGE = "exchange"
-"""Holds the inode number of the new folder from just before an exchange on: tells whether it took place."""
+"""Holds the inode number of the new folder from just before an exchange on: shows whether it took place."""
 
 _LONGEST_NAME = 180
 """Bytes of a name that are kept in the staging folder's; file systems allow 255 in all."""

@@ -1,1 +1,1 @@
-"""The factor graph: state, matching, building, and the outer loop that matches anew."""
+"""The factor graph: state, matching, building, and the outer loop that matches again."""

@@ -55,7 +55,7 @@ PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M = 1.0, 0.5
 nothing."""
 UNKNOWN_TWIST_SIGMAS = np.repeat([0.05, 0.5], 3)
 """(6,) deviations of the camera's twist from 0 where no odometry measures it [rad/s, m/s]: a vehicle that
-stands, or moves so slowly that the scan's motion is small beside other errors."""
+stands, or moves so slowly that the scan's motion is smaller than other errors."""
 
 
 def joint_graph(
@@ -68,7 +68,7 @@ def joint_graph(
         E, D, V = EXTRINSIC, time_offset_key(state.clock(pair.drive)), twist_key(pair.drive, pair.pair.image)
         if not values.exists(V):
             values.insert(V, pair.motion.c_twist)
-            graph.add(motion_factor(pair, E, D, V, state.cTl, state.offset_s(pair.drive)))
+            graph.add(motion_factor(pair, E, D, V, state.cTl, state.time_offset_s(pair.drive)))
         graph.add(silhouettes_factor(pair, E, D, V, partial(bias_key, pair.drive), state.nuisances))
     return graph, values
 
@@ -80,7 +80,7 @@ def prior_graph(
     config: GraphConfig,
     guess: State | None = None,
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """What is known of all unknowns but the twists without any match, and their values at a state.
+    """Priors of all unknowns but the twists, and the values of these unknowns at a state.
 
     Args:
         classes: (drive, class) of every class that has matches.
@@ -154,9 +154,9 @@ def _add_calibration(
     sigmas = np.repeat([PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M], 3)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, guess.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     values.insert(EXTRINSIC, state.cTl)
-    for clock, offset_s in enumerate(state.offsets_s):
+    for clock, offset_s in enumerate(state.time_offsets_s):
         graph.add(
-            time_offset_prior(time_offset_key(clock), guess.offset_s(clock), config.time_offset_sigma_s)
+            time_offset_prior(time_offset_key(clock), guess.time_offset_s(clock), config.time_offset_sigma_s)
         )
         values.insert(time_offset_key(clock), np.array([offset_s]))
 
@@ -164,7 +164,7 @@ def _add_calibration(
 def _add_nuisances(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, state: State, config: GraphConfig
 ) -> None:
-    """The parameters that are estimated, with what is known of them beforehand."""
+    """The assumptions' parameters that are estimated, with their priors."""
     for name, sigma in named_sigmas(config.estimate):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma)
         graph.add(gtsam.PriorFactorVector(nuisance_key(name), np.zeros(1), noise))
@@ -206,7 +206,7 @@ def state_from(values: gtsam.Values, state: State, pairs: Sequence[PairMatches])
     objects = dict(state.object_biases_px)
     for drive, _, track in tracked_objects(pairs):
         objects[drive, track] = float(values.atVector(object_bias_key(drive, track))[0])
-    offsets = tuple(float(values.atVector(time_offset_key(i))[0]) for i in range(len(state.offsets_s)))
+    offsets = tuple(float(values.atVector(time_offset_key(i))[0]) for i in range(len(state.time_offsets_s)))
     keys = {name: nuisance_key(name) for name in ASSUMPTIONS}
     estimated = {name: float(values.atVector(key)[0]) for name, key in keys.items() if values.exists(key)}
     return State(values.atPose3(EXTRINSIC), offsets, biases, objects, {**state.nuisances, **estimated})

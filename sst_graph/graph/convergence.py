@@ -1,7 +1,8 @@
 """When an outer loop of matching and solving ends.
 
-Each outer iteration matches anew. Where matches come and go in turn the estimate goes round in a circle, and
-the answer is its middle. So after some whole steps the steps are shortened, and a short step ends the loop.
+Each outer iteration matches again. Where some matches appear and disappear in turn, the estimate oscillates
+about a point, which is the estimate that is wanted. So after some full steps the steps are shortened, and a
+short step ends the loop.
 """
 
 from __future__ import annotations
@@ -9,12 +10,12 @@ from __future__ import annotations
 STEP_SIGMAS = 0.1
 """A step shorter than this many standard deviations of the frozen problem ends the loop: what is left is
 small beside the uncertainty."""
-CIRCLE_SIGMAS = 1.5
-"""It has converged if the whole step there is shorter than this many standard deviations: a circle that wide
-is covered by the uncertainty."""
+OSCILLATION_SIGMAS = 1.5
+"""The loop has converged if its last full step is shorter than this many standard deviations: an oscillation
+of that width is covered by the uncertainty."""
 FULL_STEPS = 6
-"""Steps at the last kernel scale before they are shortened; without a circle, fewer are enough to
-converge."""
+"""Full steps at the last kernel scale before steps are shortened; a solution that does not oscillate
+converges with fewer."""
 
 
 def step_share(steps: int) -> float:

@@ -28,11 +28,11 @@ class Unknowns:
 
     @classmethod
     def of(cls, state: State, pairs: Sequence[PairMatches]) -> Unknowns:
-        delays = [time_offset_key(clock) for clock in range(len(state.offsets_s))]
+        clocks = [time_offset_key(clock) for clock in range(len(state.time_offsets_s))]
         names = dict.fromkeys(name for pair in pairs for own in pair.terms.values() for name in own)
         biases = {bias_key(pair.drive, c) for pair in pairs for c in pair.matches}
         objects = {object_bias_key(drive, track) for drive, _, track in tracked_objects(pairs)}
-        return cls((EXTRINSIC, *delays, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
+        return cls((EXTRINSIC, *clocks, *map(nuisance_key, names), *sorted(biases), *sorted(objects)))
 
     @property
     def size(self) -> int:
@@ -57,8 +57,9 @@ def marginal_covariance(
 ) -> FloatArray:
     """(n, n) covariance of the unknowns with the motion marginalised out.
 
-    By a scaled Schur complement, for gtsam.Marginals gives up at condition numbers near 1e9, which metres
-    beside pixels reach without any direction being unobservable. Twists that no factor ties to one another
+    By a scaled Schur complement, for gtsam.Marginals gives up at condition numbers near 1e9, which metres and
+    pixels in one matrix reach although every direction is observable. Twists that no factor ties to one
+    another
     are eliminated one after the other: a dense Hessian of a long drive would take a gigabyte.
     """
     own, groups = _information(graph, values, unknowns)
@@ -80,7 +81,7 @@ def marginal_covariance(
 def twist_responses(
     graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, unknowns: Unknowns
 ) -> dict[int, FloatArray]:
-    """(6, n) how the optimum of each twist follows the unknowns, by the twist's key."""
+    """(6, n) derivative of the optimum of each twist by the unknowns, by the twist's key."""
     found = {}
     for group in _information(graph, values, unknowns)[1]:
         m = len(group.columns)

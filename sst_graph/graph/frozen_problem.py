@@ -1,11 +1,11 @@
 """The problem of :func:`~sst_graph.graph.building.joint_graph`, optimised without building its graph.
 
 The factors are the same, and so are their formulas (:func:`sst_graph.factors.reprojection.evaluate`,
-:func:`sst_graph.factors.velocity.transferred`), but those of all images are worked out at once: with
-the few hundred matches of one image a call costs more than what it does. Each twist meets the matches of its
-own image and one measurement, so it is eliminated there (Schur complement), and what is left is a small
-dense system in the extrinsic, the clocks, the parameters of assumptions and the mask biases. Their priors
-are a gtsam graph.
+:func:`sst_graph.factors.velocity.transferred`), but those of all images are evaluated at once: with
+the few hundred matches of one image, the calls would cost more than the work. Each twist occurs in the
+matches of its own image and one measurement, so it is eliminated there (Schur complement), and what remains
+is a small dense system in the extrinsic, the clocks, the parameters of assumptions and the mask biases. Their
+priors are a gtsam graph.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e5
-"""Of a Levenberg-Marquardt step: at first, and its bounds."""
+"""Damping of the Levenberg-Marquardt steps: of the first, least, most."""
 _SMALL = 1e-7
-"""A step that changes the cost by a smaller share is the last one."""
+"""A step that changes the cost by a smaller fraction is the last one."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class NormalEquations:
     Attributes:
         cost: at the point.
         H, g: (n, n), (n,) of all unknowns but the twists.
-        H_twists, g_twists: (f, 6, 6), (f, 6) of the twists; no two of them meet.
+        H_twists, g_twists: (f, 6, 6), (f, 6) of the twists; no factor has two of them.
         H_mixed: (f, 6, n) of each twist with the others.
     """
 
@@ -108,7 +108,7 @@ class _Images:
         l_twists, l_accelerations: (f, 6) of the LiDAR; 0 without odometry.
         information: (f, 6, 6) inverse covariance of the camera's.
         clocks: (f,) column of the time offset.
-        offsets_s: (f,) under which they were looked up [s].
+        offsets_s: (f,) time offset at which the twists were interpolated [s].
     """
 
     keys: tuple[int, ...]
@@ -170,10 +170,10 @@ class FrozenProblem:
             self._priors.add(prior)
         # 1. The unknowns: extrinsic, clocks, parameters of assumptions, mask biases of classes and objects.
         self._names = [name for name, _ in named_sigmas(config.estimate)]
-        delays = [time_offset_key(clock) for clock in range(len(state.offsets_s))]
+        clocks = [time_offset_key(clock) for clock in range(len(state.time_offsets_s))]
         biases = [bias_key(drive, c) for drive, c in self._classes]
         biases += [object_bias_key(drive, track) for drive, _, track in self._objects]
-        self._keys = (*delays, *map(nuisance_key, self._names), *biases)
+        self._keys = (*clocks, *map(nuisance_key, self._names), *biases)
         self._columns = {key: 6 + place for place, key in enumerate(self._keys)}
         self._terms = [self._columns[nuisance_key(name)] for name in self._names]
         self._shared = _ordered((EXTRINSIC, *self._keys))
@@ -219,7 +219,7 @@ class FrozenProblem:
         state = self.state
         return State(
             point.cTl,
-            tuple(value[time_offset_key(clock)] for clock in range(len(state.offsets_s))),
+            tuple(value[time_offset_key(clock)] for clock in range(len(state.time_offsets_s))),
             {**state.biases_px, **{(d, c): value[bias_key(d, c)] for d, c in self._classes}},
             {**state.object_biases_px, **{(d, t): value[object_bias_key(d, t)] for d, _, t in self._objects}},
             {**state.nuisances, **{name: value[nuisance_key(name)] for name in self._names}},
@@ -235,9 +235,9 @@ class FrozenProblem:
     def step_sigmas(self, point: FrozenPoint, system: NormalEquations) -> float:
         """Length of the step from the state to a point in extrinsic and offsets, in standard deviations of
         the problem linearized there."""
-        clocks = len(self.state.offsets_s)
+        clocks = len(self.state.time_offsets_s)
         turned = gtsam.Pose3.Logmap(self.state.cTl.between(point.cTl))
-        step = np.concatenate([turned, point.scalars[:clocks] - np.array(self.state.offsets_s)])
+        step = np.concatenate([turned, point.scalars[:clocks] - np.array(self.state.time_offsets_s)])
         covariance = system.covariance()[: 6 + clocks, : 6 + clocks]
         return float(np.sqrt(step @ np.linalg.solve(covariance, step)))
 

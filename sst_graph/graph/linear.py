@@ -1,7 +1,7 @@
 """Matrices of unknowns whose units differ by orders of magnitude: scaled to a unit diagonal, then inverted.
 
-Radians, metres, seconds and pixels meet in one information matrix; its condition number is near 1e9 although
-no direction is unobservable. Scaled, it is harmless.
+With radians, metres, seconds and pixels in one information matrix, its condition number is near 1e9 although
+no direction is unobservable; scaled, it is small.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 _LEAST_DIAGONAL = 1e-300
-"""Stands for a diagonal entry of 0: its square root can be divided by."""
+"""Replaces a diagonal entry of 0, so that its square root can be divided by."""
 _RIDGE = 1e-14
 """Added to a unit diagonal before it is factorized: above rounding, and so small that a sigma changes by more
 than one in a million only where it is ten thousand times that of the unknown by itself."""
@@ -57,7 +57,8 @@ def scaled_inverse(information: FloatArray) -> FloatArray:
 
 
 def covariance_root(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """R (n, k) with R R' = P, a column for each direction that P (n, n) knows, and R's pseudo-inverse."""
+    """R (n, k) with R R' = P, a column for each direction in which P (n, n) is not 0, and R's
+    pseudo-inverse."""
     scale = unit_scale(P)
     values, vectors = np.linalg.eigh(P * np.outer(scale, scale))
     known = values > 1e-12 * max(float(values[-1]), _LEAST_DIAGONAL)
@@ -69,7 +70,7 @@ def scattered(n: int, places: Sequence[IntArray], *blocks: Sequence[FloatArray])
     """(n, n) sums of blocks (m, m), each on its own rows and columns (m,); one sum for each sequence."""
     if not places:
         return [np.zeros((n, n)) for _ in blocks]
-    # Blocks of one size together: a call for each of them would cost more than what it does.
+    # Blocks of one size together: a call for each of them would cost more than the work.
     order: list[int] = sorted(range(len(places)), key=lambda i: len(places[i]))
     groups = [list(group) for _, group in groupby(order, key=lambda i: len(places[i]))]
     columns = [np.array([places[i] for i in group]) for group in groups]

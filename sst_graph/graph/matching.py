@@ -1,8 +1,9 @@
 """From a state to matches: a drive's scans and images paired in true time, and matched all at once.
 
 What a scan shows stays the same from one outer iteration to the next: :class:`DriveEdges` gathers it once for
-a whole solution. What a state changes (the pairs, the motion between them, the pixels) is worked out for all
-pairs in the same arrays, for with the few hundred points of one pair a call costs more than what it does.
+a whole solution. What depends on the state (the pairs, the motion between them, the pixels) is computed for
+all pairs in the same arrays: with the few hundred points of one pair, the calls would cost more than the
+work.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from sst_graph.association.time_pairing import Pair, pair_by_time
 from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
 from sst_graph.config import internal, setting
-from sst_graph.drive.preparation import Drive, outlines
+from sst_graph.drive.preparation import Drive, boundaries_of
 from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
 from sst_graph.errors import ConfigError
 from sst_graph.factors.matches import Alignment
@@ -58,7 +59,7 @@ class GraphConfig(MatchConfig):
 
     Attributes:
         lower_edges: classes whose edges towards the ground are matched too; chosen by
-            :mod:`sst_graph.batch.lower_edges`. They sharpen roll and height where both sides label them
+            :mod:`sst_graph.batch.lower_edges`. They determine roll and height where both sides label them
             alike; hand-drawn outlines often cover the gap above the ground.
         estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
             the settings of the assumptions.
@@ -95,9 +96,8 @@ class GraphConfig(MatchConfig):
 
 
 DYNAMIC_REACH_M = 0.003
-"""A dynamic object that moves so far by itself between its scan and its image, in a way that is not known,
-keeps half of its weight, one that moves a little farther none [m]: a quarter of a pixel at 10 m with KITTI's
-camera."""
+"""A dynamic object whose unknown motion between its scan and its image is this long keeps half of its weight;
+one that moves a little farther keeps none [m]: a quarter of a pixel at 10 m with KITTI's camera."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ class PairMatches:
 
 
 class Tracks:
-    """Twist tracks of all drives, and tracks of their objects where those are given; made once."""
+    """Twists of the LiDAR over time in all drives, and tracks of their objects where those are given."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class Tracks:
         return other
 
     def part(self, drive: int, scans: Sequence[int]) -> Tracks:
-        """Of :meth:`sst_graph.drive.preparation.Drive.part` of one drive, which becomes drive 0."""
+        """The tracks of some scans of one drive (:meth:`Drive.part`), which becomes drive 0."""
         other, place = Tracks([]), {position: k for k, position in enumerate(scans)}
         other._tracks = [self._tracks[drive]]
         if self.objects is not None:
@@ -221,7 +221,7 @@ class DriveEdges:
         groups = [
             (k, c, points)
             for k, scan in enumerate(drive.scans)
-            for c, points in outlines(scan, config.lower_edges).items()
+            for c, points in boundaries_of(scan, config.lower_edges).items()
             if len(points)
         ]
         if not groups:
@@ -277,7 +277,7 @@ class DriveEdges:
 
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
-        drive, offset_s = self.drive, state.offset_s(self.number)
+        drive, offset_s = self.drive, state.time_offset_s(self.number)
         pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, drive.image_period_s)
         # 1. The groups that have an image, and in it a contour of their class.
         numbers = {pair.scan: number for number, pair in enumerate(pairs)}
@@ -291,7 +291,7 @@ class DriveEdges:
         chosen = np.array([g for g, _ in groups])
         # 2. The motion around the images.
         motions = _Motions.of(self, pairs, state)
-        # 3. The points, without the objects that would keep nothing of their weight.
+        # 3. The points, without the objects whose weight is 0.
         paired, index = self._paired(groups, pairs, motions, state)
         shares = None
         if self.unknown_mps is not None:
@@ -300,7 +300,7 @@ class DriveEdges:
             if not shares.all():
                 kept = np.flatnonzero(shares)
                 paired, index, shares = paired.take(kept), index[kept], shares[kept]
-        # 4. Their matches.
+        # 4. Match them.
         scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
         deviation = deviation_of(state.nuisances, scene)
         found = match_edges(paired, state.cTl, offset_s, kernel, self.config, deviation)
@@ -369,14 +369,14 @@ class _Motions:
     since_s: FloatArray
 
     @classmethod
-    def of(cls, outlines: DriveEdges, pairs: Sequence[Pair], state: State) -> _Motions:
+    def of(cls, edges: DriveEdges, pairs: Sequence[Pair], state: State) -> _Motions:
         """Under a state."""
-        drive, number = outlines.drive, outlines.number
+        drive, number = edges.drive, edges.number
         stamps = [drive.images[pair.image].stamp_ns for pair in pairs]
-        shift_ns = round(state.offset_s(number) * 1e9)
+        shift_ns = round(state.time_offset_s(number) * 1e9)
         origin_ns = drive.images[0].stamp_ns if drive.origin_ns is None else drive.origin_ns
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
-        l_twists = outlines.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
+        l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
             rest = Motion(np.zeros(6), np.zeros(6))
             return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
@@ -399,17 +399,17 @@ class DriveMatches:
     """All matches of a drive, pair by pair and class by class.
 
     Attributes:
-        outlines: of the drive.
+        edges: of the drive.
         pairs: all pairs, also those without a match.
         motions: around their images.
         found: the matches, group by group.
         group_pairs, group_classes: pair and class of each group.
         points: (m,) which of the drive's points each match is, and
-        places: (m,) which of those that were looked at of its scan and class.
-        cTl, offset_s: where they were made.
+        places: (m,) which of the points of its scan and class each match is.
+        cTl, offset_s: extrinsic and time offset that the matches were made at.
     """
 
-    outlines: DriveEdges
+    edges: DriveEdges
     pairs: Sequence[Pair]
     motions: _Motions
     found: EdgeMatches
@@ -431,7 +431,7 @@ class DriveMatches:
     @property
     def number(self) -> int:
         """Of the drive."""
-        return self.outlines.number
+        return self.edges.number
 
     @cached_property
     def counts(self) -> IntArray:
@@ -459,7 +459,7 @@ class DriveMatches:
 
         None where objects share their class's.
         """
-        own = self.outlines.own_tracks
+        own = self.edges.own_tracks
         if own is None:
             return None
         below = np.repeat([lower_edge_track(c) for c in self.group_classes], self.counts)
@@ -486,13 +486,13 @@ class DriveMatches:
     @cached_property
     def terms(self) -> dict[str, FloatArray]:
         """(m,) derivative of each residual by the parameters that are estimated, by name."""
-        names = [name for name, _ in named_sigmas(self.outlines.config.estimate)]
+        names = [name for name, _ in named_sigmas(self.edges.config.estimate)]
         if not names:
             return {}
         pair = self.pair_of
         base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
         at = self.cTl, self.offset_s, self.c_twists[pair].T
-        scene = self.motions.scene(self.outlines.drive, pair)
+        scene = self.motions.scene(self.edges.drive, pair)
         return residual_columns(self.alignment, scene, base_taus_s, at, names)
 
     def by_pair(self) -> list[PairMatches]:
@@ -507,7 +507,7 @@ class DriveMatches:
         return [self._pair(p, own) for p, own in groups.items()]
 
     def _pair(self, p: int, groups: Mapping[SemanticClass, tuple[slice, int]]) -> PairMatches:
-        objects, motion = self.outlines.points.objects, self.motions.of_images[p]
+        objects, motion = self.edges.points.objects, self.motions.of_images[p]
         l_twists, tracks = self.motions.l_twists, self.tracks
         return PairMatches(
             self.number,
@@ -525,7 +525,7 @@ class DriveMatches:
                 for c, (own, seen) in groups.items()
             },
             {} if tracks is None else {c: tracks[own] for c, (own, _) in groups.items()},
-            replace(self.motions.scene(self.outlines.drive, p), image_s=float(self.motions.since_s[p])),
+            replace(self.motions.scene(self.edges.drive, p), image_s=float(self.motions.since_s[p])),
             {
                 c: {name: column[own] for name, column in self.terms.items()}
                 for c, (own, _) in groups.items()
@@ -542,8 +542,8 @@ class DriveMatches:
 def _own_motion(
     groups: Sequence[tuple[DynamicObjects, SemanticClass, Boundaries]],
 ) -> tuple[FloatArray | None, FloatArray | None]:
-    """How much of the motion of each point's object is not known (n,), and its velocity (n, 3); None where no
-    object moves."""
+    """Unknown speed of each point's object (n,) [m/s], and its velocity (n, 3) [m/s]; None where no object
+    moves."""
     unknown = [np.zeros(len(points)) for _, _, points in groups]
     velocities = [np.zeros((len(points), 3)) for _, _, points in groups]
     for (dynamic, c, points), slow, known in zip(groups, unknown, velocities, strict=True):
@@ -558,14 +558,14 @@ def _own_motion(
 
 
 def edges_of(drives: Sequence[Drive], tracks: Tracks, config: GraphConfig) -> list[DriveEdges]:
-    """The outlines of drives, to be matched again and again; drives without any are left out."""
+    """The boundary points of drives, to be matched again and again; drives without any are left out."""
     found = [DriveEdges.of(number, drive, tracks, config) for number, drive in enumerate(drives)]
-    return [outlines for outlines in found if outlines is not None]
+    return [edges for edges in found if edges is not None]
 
 
-def match_all(outlines: Sequence[DriveEdges], state: State, kernel: RobustKernel) -> list[DriveMatches]:
+def match_all(edges: Sequence[DriveEdges], state: State, kernel: RobustKernel) -> list[DriveMatches]:
     """The matches of each drive under a state; drives without any are left out."""
-    found = [own.match(state, kernel) for own in outlines]
+    found = [own.match(state, kernel) for own in edges]
     return [matches for matches in found if matches is not None]
 
 

@@ -21,11 +21,11 @@ IntArray = NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Deviation:
-    """What a scan and an image differ by from what is assumed of them.
+    """The assumptions' parameters that are not 0, applied to one scan and image.
 
     Attributes:
-        values: parameters that are not 0, by name.
-        scene: the scan and the image.
+        values: the parameters, by name.
+        scene: of the scan and the image.
     """
 
     values: Mapping[str, float]
@@ -83,11 +83,11 @@ def residual_columns(
     """
     names = list(names)
     _, J = residuals(alignment, *pose, 0.0)
-    columns = columns_beside(J, alignment, scene, base_tau_s, pose, names)
+    columns = columns_of_jacobian(J, alignment, scene, base_tau_s, pose, names)
     return dict(zip(names, columns.T, strict=True))
 
 
-def columns_beside(
+def columns_of_jacobian(
     J: FloatArray,
     alignment: Alignment,
     scene: Scene,
@@ -95,7 +95,8 @@ def columns_beside(
     pose: tuple[gtsam.Pose3, float, FloatArray],
     names: Sequence[str],
 ) -> FloatArray:
-    """Derivatives (n, k) of residuals by assumptions' parameters, each multiplied as its row of J is.
+    """Derivatives (n, k) of residuals by assumptions' parameters, from the Jacobian J; weighted as its rows
+    are.
 
     Args:
         J: (n, 14) by [rot, trans, offset, twist, bias], of residuals as they are or weighted.
@@ -111,7 +112,7 @@ def columns_beside(
 
 
 def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effect) -> FloatArray:
-    """Derivatives (n,) by one parameter, beside the rows J (n, 14) of residuals that may be weighted."""
+    """Derivatives (n,) of residuals by one parameter, from their rows J (n, 14)."""
     total = np.zeros(len(alignment))
     if effect.l_shift is not None:
         # A step of the extrinsic's translation (right perturbation) moves the point in the LiDAR frame.

@@ -1,8 +1,8 @@
 """The outer loop of the joint method: pair, match, optimise with the matches frozen, and again.
 
 :mod:`~sst_graph.graph.matching` matches, :mod:`~sst_graph.graph.frozen_problem` optimises. The robust kernel
-narrows from one outer iteration to the next. The functions at the end say how well a solution explains the
-labels: a solution may be precise and wrong.
+narrows from one outer iteration to the next. The functions at the end measure how well a solution explains
+the labels, which its covariance does not show.
 """
 
 from __future__ import annotations
@@ -22,37 +22,43 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, joint_graph
-from sst_graph.graph.convergence import CIRCLE_SIGMAS, STEP_SIGMAS, step_share
+from sst_graph.graph.convergence import OSCILLATION_SIGMAS, STEP_SIGMAS, step_share
 from sst_graph.graph.frozen_problem import FrozenProblem
 from sst_graph.graph.matching import DriveMatches, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 _LOG = logging.getLogger(__name__)
 
 KERNELS_PX = (20.0, 20.0, 15.0, 15.0, 10.0, 10.0, 7.0, 7.0, 5.0, 5.0, 4.0, 3.0)
-"""Scales of the robust kernel, outer iteration by outer iteration; the last one stays [px]. 20 px are 1.6
-degrees with KITTI's camera, what a start may be off; 3 px are beyond most of the masks' errors."""
+"""Schedule of the robust kernel: its scale in each outer iteration; the last one stays [px].
+
+20 px are 1.6 degrees with KITTI's camera, the error that a start may have; 3 px are more than most errors of
+masks. The other schedules end at the same 3 px: :data:`NARROW_KERNELS_PX` (the batch and the tracker after a
+search, the tracker's whole window), ``kernels_px`` of :class:`sst_graph.batch.part_solver.PartSolver`,
+``_ALL_FREE_KERNELS_PX`` and ``_ONE_FREE_KERNELS_PX`` of :mod:`sst_graph.batch.assumption_tests`,
+``_KERNELS_PX`` of :mod:`sst_graph.batch.lower_edges`. New frames in the tracker are matched at the last
+scale."""
 NARROW_KERNELS_PX = KERNELS_PX[6:]
-"""From a start that is nearly right: wide kernels would only lead away from it [px]."""
+"""Schedule from a start that is nearly right, which wide kernels would lead away from [px]."""
 INNER_ITERATIONS = 2
 """Most Levenberg-Marquardt iterations on frozen matches: the next matches are worth more than a third."""
 CONCENTRATION_SCALES = (1.0, 5.0)
-"""Kernels, in units of the last one, whose supports are compared to see how close matches are."""
+"""Kernel scales, in units of the last one, whose supports :func:`concentration` compares."""
 MIN_EXPLAINED = 0.2
-"""Least share of the boundary points in view that must meet a contour, :func:`explained` ..."""
+"""Least :func:`explained`, the share of the boundary points in view that meet a contour, of a result."""
 MIN_EXPLAINED_VAGUE = 0.45
-"""... and where the rotation is not observable: with so little in view, a pose that leaves more of it
-unexplained may be a wrong one."""
+"""Least :func:`explained` where the rotation is not observable: with so little in view, a lower share is also
+reached by wrong poses."""
 MAX_OUTER = 40
 """Most outer iterations: a bound on the time; what has not converged by then is reported."""
 MIN_MATCHES = 30
 """Fewest matches of a solution: single frames with few objects have more, and seven unknowns need them."""
 MIN_CONCENTRATION = 0.6
-"""Least :func:`concentration` of a solution that is not wrong altogether."""
+"""Least :func:`concentration` of a result: wrong poses stay below it."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,7 @@ class JointProblem:
 
 @dataclass(frozen=True)
 class JointSolution:
-    """Where the outer loop ended.
+    """Result of the outer loop.
 
     Attributes:
         state: the estimate.
@@ -105,7 +111,7 @@ class JointSolution:
         pairs: pair by pair.
         graph, values: the last frozen graph and its optimum.
         outer_iterations: outer iterations done.
-        converged: the last step was short beside the frozen problem's own uncertainty.
+        converged: the last step was short compared with the sigmas of the frozen problem.
         matched_at: the state that the matches were made at.
     """
 
@@ -127,7 +133,7 @@ def solve_joint(
     step_sigmas: float = STEP_SIGMAS,
 ) -> JointSolution:
     """All steps of :func:`solve_joint_steps`."""
-    return whole(solve_joint_steps(problem, start, kernels_px, progress, step_sigmas))
+    return run_to_end(solve_joint_steps(problem, start, kernels_px, progress, step_sigmas))
 
 
 def solve_joint_steps(
@@ -137,7 +143,7 @@ def solve_joint_steps(
     progress: Progress | None = None,
     step_sigmas: float = STEP_SIGMAS,
 ) -> Stepwise[JointSolution]:
-    """Re-pair, re-match, optimise, until nothing moves: an outer iteration a step.
+    """Pair, match and optimise until the step is small; each outer iteration is one step of the generator.
 
     Args:
         kernels_px: scales of the robust kernel, outer iteration by outer iteration; the last one stays [px].
@@ -158,7 +164,7 @@ def solve_joint_steps(
         # 2. Inner optimisation with the matches frozen.
         frozen = FrozenProblem(matches, state, config.graph, centre, problem.prior)
         optimum, system = frozen.optimum(INNER_ITERATIONS)
-        # 3. Move, by less and less of the step when matches come and go in turn.
+        # 3. Move; after some full steps by a part of the step, so that oscillations end.
         at_last = outer + 1 - len(kernels_px)
         share = step_share(at_last)
         state = state.towards(frozen.state_at(optimum), share)
@@ -169,7 +175,7 @@ def solve_joint_steps(
         if at_last >= 0:
             step = frozen.step_sigmas(optimum, system)
             if share * step < step_sigmas:
-                converged = step < CIRCLE_SIGMAS
+                converged = step < OSCILLATION_SIGMAS
                 break
     # 5. The last frozen problem as a graph.
     found = [pair for own in matches for pair in own.by_pair()]
@@ -204,7 +210,7 @@ def solve_all(
 
 
 def support(solution: JointSolution) -> float:
-    """How much agrees with a solution: its matches, each counted by its robust weight."""
+    """Sum of the robust weights of a solution's matches."""
     return _support(solution.matches, solution.state)
 
 
@@ -218,14 +224,14 @@ def robust_weights(matches: DriveMatches, state: State) -> FloatArray:
     biases = [state.biases_px.get((number, c), 0.0) for c in matches.group_classes]
     twists = matches.c_twists[matches.pair_of].T
     bias_px = np.repeat(biases, matches.counts)
-    r, _ = residuals(alignment, state.cTl, state.offset_s(number), twists, bias_px, jacobians=False)
+    r, _ = residuals(alignment, state.cTl, state.time_offset_s(number), twists, bias_px, jacobians=False)
     return alignment.kernel.weight(r / alignment.sigmas_px)
 
 
 def support_of(
     matches: Sequence[DriveMatches], state: State, side: int | None = None
 ) -> dict[SemanticClass, float]:
-    """How much agrees with a state, by class: matches, of all sides or one, counted by robust weight."""
+    """Sum of the robust weights of matches at a state, by class; of all sides of the objects or of one."""
     total: dict[SemanticClass, float] = {}
     for own in matches:
         weights = robust_weights(own, state)
@@ -240,8 +246,8 @@ def support_of(
 def concentration(solution: JointSolution, problem: JointProblem) -> float:
     """Support under the last kernel as a share of that under one five times as wide.
 
-    A true pose leaves the masks' own errors, whatever share of the points has a mask; a wrong pose that
-    was fitted to some contours leaves all distances.
+    The residuals of a true pose are the masks' errors, so most are below the last scale; those of a wrong
+    pose that was fitted to some contours are spread over all distances.
     """
     kernel = RobustKernel("geman_mcclure", CONCENTRATION_SCALES[1] * KERNELS_PX[-1])
     matches = match_all(
@@ -251,20 +257,20 @@ def concentration(solution: JointSolution, problem: JointProblem) -> float:
 
 
 def explained(solution: JointSolution) -> float:
-    """Share of the boundary points in the images that a solution's :func:`support` stands for."""
+    """:func:`support` of a solution as a share of the boundary points in the images."""
     return support(solution) / _seen(solution)
 
 
 def agreement(solution: JointSolution) -> float:
-    """How well a solution explains what it sees: :func:`support` times :func:`explained`.
+    """Score of a solution: :func:`support` times :func:`explained`.
 
-    The support alone prefers poses that bring many objects into view.
+    The support alone would prefer poses that bring many objects into view.
     """
     return support(solution) ** 2 / _seen(solution)
 
 
 def poor_fit(explained: float, concentration: float, rotation_observable: bool) -> list[str]:
-    """Why a solution may be wrong altogether, in sentences; none for one that explains the labels.
+    """Reasons why a solution may be wrong altogether; none for one that explains the labels.
 
     Args:
         explained, concentration: as the functions of these names give them.

@@ -1,4 +1,4 @@
-"""The estimate that travels through the outer loop, and its keys in the graph."""
+"""The unknowns that the outer loop estimates, and their keys in the graph."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def bias_key(drive: int, semantic_class: SemanticClass) -> int:
 
 
 def lower_edge_track(semantic_class: SemanticClass) -> int:
-    """Stands for the lower edges of a class among the tracks of its objects: they share a mask bias."""
+    """Track number of the lower edges of a class, which share one mask bias."""
     return _IMAGES_PER_DRIVE - 256 + int(semantic_class)
 
 
@@ -56,25 +56,25 @@ class State:
 
     Attributes:
         cTl: extrinsic.
-        offsets_s: time offset of each clock [s].
+        time_offsets_s: time offset of each clock [s].
         biases_px: mask bias by (drive, class) [px]; 0 where it is missing.
         object_biases_px: mask bias by (drive, track of an object) [px]; its class's where it is missing.
         nuisances: values of the assumptions' parameters, by name; 0 where it is missing.
     """
 
     cTl: gtsam.Pose3
-    offsets_s: tuple[float, ...] = (0.0,)
+    time_offsets_s: tuple[float, ...] = (0.0,)
     biases_px: Mapping[tuple[int, SemanticClass], float] = field(default_factory=dict)
     object_biases_px: Mapping[tuple[int, int], float] = field(default_factory=dict)
     nuisances: Mapping[str, float] = field(default_factory=dict)
 
     def clock(self, drive: int) -> int:
         """Number of the clock that a drive's time offset belongs to."""
-        return drive if len(self.offsets_s) > 1 else 0
+        return drive if len(self.time_offsets_s) > 1 else 0
 
-    def offset_s(self, drive: int) -> float:
+    def time_offset_s(self, drive: int) -> float:
         """Time offset of a drive [s]."""
-        return self.offsets_s[self.clock(drive)]
+        return self.time_offsets_s[self.clock(drive)]
 
     def object_bias_px(self, drive: int, track: int, semantic_class: SemanticClass) -> float:
         """Mask bias of one object [px]."""
@@ -86,13 +86,15 @@ class State:
         return {c: bias for (d, c), bias in self.biases_px.items() if d == drive}
 
     def towards(self, other: State, share: float) -> State:
-        """The state this share of the way to another one, which knows every bias that this one does."""
+        """Interpolation from this state (share 0) to another one (1), which has all of this one's biases."""
         if share >= 1.0:
             return other
         step = share * gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
         return State(
             self.cTl.compose(gtsam.Pose3.Expmap(step)),
-            tuple(a + share * (b - a) for a, b in zip(self.offsets_s, other.offsets_s, strict=True)),
+            tuple(
+                a + share * (b - a) for a, b in zip(self.time_offsets_s, other.time_offsets_s, strict=True)
+            ),
             _between(self.biases_px, other.biases_px, share),
             _between(self.object_biases_px, other.object_biases_px, share),
             _between(self.nuisances, other.nuisances, share),

@@ -1,10 +1,11 @@
-"""The covariance of a hand-eye estimate: neighbouring pairs err together, and all pairs share some error.
+"""The covariance of a hand-eye estimate: errors of neighbouring pairs are correlated, and all pairs share
+some error.
 
 A scan and an image end one pair and begin the next, so scores of neighbours are correlated: they are
 summed with falling weights (Bartlett's kernel: Newey & West, Econometrica 1987), with the usual correction
 for few pairs (Cameron & Miller, A practitioner's guide to cluster-robust inference, 2015, sec. VI.B).
-What all pairs share, such as a principal point that is off, no residual shows: it stands in
-:class:`SharedErrors`.
+An error that all pairs share, such as that of the principal point, does not show in the residuals: it is
+given by :class:`SharedErrors`.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ FloatArray = NDArray[np.float64]
 
 
 NOISE_INFORMATION_MARGIN = 2.0
-"""What noise seems to bring counts so many times: its size is known from the same few motions."""
+"""Factor on the spurious information by noise, whose size is estimated from the same few motions."""
 MOST_TAKEN_OFF = 0.5
-"""Largest part of the variance that scores of neighbours which cancel take off: few may do so by chance."""
+"""Largest fraction of the variance that may be subtracted for neighbouring scores that cancel: a few cancel
+by chance."""
 LEAST_INFORMATION = 1e-3
 """In any direction at least this part of the information remains, to keep it positive."""
 _LAGS = 3
@@ -37,7 +39,7 @@ smoothing spreads errors a little farther. More lags make the estimate noisier."
 
 @dataclass(frozen=True)
 class SharedErrors:
-    """Sigmas of what all pairs have in common.
+    """Sigmas of the errors that all pairs share.
 
     Attributes:
         direction_deg: of every direction of travel, about each axis of the camera [deg]; 0.03 deg is half a
@@ -64,7 +66,7 @@ def hand_eye_covariance(
     Args:
         graph: the terms' factors and the priors, at its optimum ``values``.
         terms: in the order of drive and time.
-        errors: what all pairs have in common.
+        errors: the errors that all pairs share.
     """
     ordering = gtsam.Ordering()
     ordering.push_back(EXTRINSIC)
@@ -98,7 +100,7 @@ def _sandwich(bread: FloatArray, excess: FloatArray) -> FloatArray:
 
 
 def _capped(covariance: FloatArray) -> FloatArray:
-    """(7, 7) covariance, nowhere wider than the priors that stand in the graph."""
+    """(7, 7) covariance, nowhere wider than the priors in the graph."""
     both = np.outer(PRIOR_SIGMAS, PRIOR_SIGMAS)
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T) / both)
     return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T * both)
@@ -118,7 +120,7 @@ def _noise_information(term: HandEyeTerm) -> FloatArray:
 
 
 def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
-    """(7, 7) inverse of the information without what noise feigns, which stays positive."""
+    """(7, 7) inverse of the information less that by noise, kept positive definite."""
     scale = unit_scale(hessian)
     both = np.outer(scale, scale)
     whitener = np.linalg.inv(np.linalg.cholesky(with_ridge(hessian * both)))

@@ -1,7 +1,7 @@
 """Pairs of camera and LiDAR motion, and their factor graph on E and D; no label, no depth.
 
-The camera's motion enters by rotation and direction alone: its length would hang on LiDAR depth placed by
-the very extrinsic that is sought.
+The camera's motion enters by rotation and direction alone: its length would depend on LiDAR depth placed by
+the extrinsic that is to be estimated.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from sst_graph.odometry.standstill import zero_velocity_update
 FloatArray = NDArray[np.float64]
 
 MIN_LENGTH_M = 0.1
-"""Shorter motions of the camera have no direction worth the name [m]."""
+"""Shorter motions of the camera do not determine a direction [m]."""
 MAX_ROTATION_SIGMA_RAD = 0.02
 """Camera motions whose rotation is known worse are left out [rad]."""
 PRIOR_SIGMAS: FloatArray = np.array([1.0] * 3 + [0.5] * 3 + [0.3])
@@ -169,7 +169,7 @@ def hand_eye_graph(terms: Sequence[HandEyeTerm], centre: State) -> gtsam.Nonline
     # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
     # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
     pull = sum(term.noise_pull for term in terms)
-    mean_s = centre.offsets_s[0] + pull * sigma_s**2
+    mean_s = centre.time_offsets_s[0] + pull * sigma_s**2
     graph.add(time_offset_prior(time_offset_key(), mean_s, sigma_s))
     return graph
 
@@ -178,7 +178,7 @@ def state_values(state: State) -> gtsam.Values:
     """E and D of a state."""
     values = gtsam.Values()
     values.insert(EXTRINSIC, state.cTl)
-    values.insert(time_offset_key(), np.array(state.offsets_s[:1]))
+    values.insert(time_offset_key(), np.array(state.time_offsets_s[:1]))
     return values
 
 
@@ -196,7 +196,7 @@ def _term(pair: MotionPair, state: State) -> HandEyeTerm:
     Ad = np.asarray(state.cTl.AdjointMap())
     covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     # 2. The factor.
-    offset_0, turn = state.offsets_s[0], pair.camera.rotation
+    offset_0, turn = state.time_offsets_s[0], pair.camera.rotation
     if directed:
         measured = gtsam.Pose3(turn, length * motion.direction)
         motions = (measured, step.aTb, step.twist_a, step.twist_b)

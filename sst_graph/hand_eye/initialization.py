@@ -1,4 +1,4 @@
-"""Where hand-eye calibration starts: the rotation in closed form, the time offset by trying all."""
+"""Initialization of hand-eye calibration: time offsets on a grid, the rotation in closed form."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ROUNDS = 6
 
 @dataclass(frozen=True)
 class MotionStart:
-    """A rotation and a time offset to begin with, and what they cost a pair."""
+    """An initial rotation and time offset, and their mean cost of a pair."""
 
     cRl: gtsam.Rot3
     offset_s: float

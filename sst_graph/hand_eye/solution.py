@@ -48,13 +48,13 @@ _FIRST_OUTER = 4
 _INNER_ITERATIONS = 10
 """Most Levenberg-Marquardt iterations on frozen motions: the next outer iteration goes on from there."""
 ALTERNATIVE_CHI2 = 9.0
-"""A different solution that costs at most this much more makes the answer ambiguous: three sigmas of one
+"""A different solution that costs at most this much more makes the estimate ambiguous: three sigmas of one
 unknown. Solutions farther apart than this (chi-squared of 7) are different."""
 
 
 @dataclass(frozen=True)
 class MotionSolution:
-    """Where the outer loop ended.
+    """Result of the outer loop.
 
     Attributes:
         state: the estimate.
@@ -153,7 +153,7 @@ def _solve(
     centre: State,
     max_outer: int = _MAX_OUTER,
 ) -> MotionSolution | None:
-    """Look the LiDAR's motion up at the time offset, optimise, until nothing moves.
+    """Interpolate the LiDAR's motion at the time offset and optimise, until the step is small.
 
     None where the offset runs away to where too few pairs are left.
     """
@@ -161,7 +161,7 @@ def _solve(
     while outer < max_outer and not converged:
         outer += 1
         # 1. The LiDAR's motion at the current offset, under the noise that the residuals have.
-        pairs = pair_motions(steps, paths, state.offsets_s[0])
+        pairs = pair_motions(steps, paths, state.time_offsets_s[0])
         if len(pairs) < max(MIN_PAIRS, LEAST_SHARE * len(steps)):
             return None
         terms, scales = hand_eye_terms(pairs, state)
@@ -173,7 +173,7 @@ def _solve(
         # alternate; stop when the step is small.
         moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
         step = step_share(outer) * difference(state, moved)
-        state = State(state.cTl.retract(step[:6]), (state.offsets_s[0] + float(step[6]),))
+        state = State(state.cTl.retract(step[:6]), (state.time_offsets_s[0] + float(step[6]),))
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
     misfit = len(terms) * (3.0 * np.log(scales.rotation) + 2.0 * np.log(scales.direction))
     return MotionSolution(state, centre, terms, scales, covariance, float(misfit), outer, converged)
@@ -181,7 +181,7 @@ def _solve(
 
 def difference(a: State, b: State) -> FloatArray:
     """(7,) step from one state to another, in the tangent space of the covariance."""
-    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.offsets_s[0] - a.offsets_s[0])
+    return np.append(gtsam.Pose3.Logmap(a.cTl.between(b.cTl)), b.time_offsets_s[0] - a.time_offsets_s[0])
 
 
 def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

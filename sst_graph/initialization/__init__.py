@@ -1,1 +1,1 @@
-"""Where a solution begins: the global search, its candidates, and which of them is right."""
+"""The initialization: a global search, its candidates, and the selection among them."""

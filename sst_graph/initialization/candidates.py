@@ -1,4 +1,4 @@
-"""What a start is searched for, and candidates for it from the frames that show most."""
+"""The problem of the initialization, and candidates from the frames with most labelled points."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _LABEL_BLUR_PX = 10.0
 """Width of the masks' blur when refined candidates are scored by the labels of all points, at an image width
 of 1242 [px]: a degree is 13 px, what some of them are still off."""
 _MIN_CLASS_POINTS = 30
-"""Fewest points of the searched classes that make a frame worth looking at."""
+"""Fewest points of the searched classes that make a frame worth searching."""
 
 
 @dataclass(frozen=True)
 class StartProblem:
-    """What a start is searched for.
+    """The problem of the initialization.
 
     Attributes:
         drives: all of them.
@@ -61,7 +61,7 @@ class StartProblem:
     def centre(self, start: State) -> State:
         """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
         cTl = gtsam.Pose3(start.cTl.rotation(), np.zeros(3)) if self.guess is None else self.guess
-        return State(cTl, (self.offset_s,) * len(start.offsets_s))
+        return State(cTl, (self.offset_s,) * len(start.time_offsets_s))
 
 
 def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[list[Candidate]]:
@@ -82,7 +82,7 @@ def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[lis
 
 
 def label_score_steps(problem: StartProblem, states: States, config: SearchConfig) -> Stepwise[FloatArray]:
-    """(m,) how much the labels of all points depend on those of their pixels, under each of the states.
+    """(m,) dependence between the labels of points and of their pixels (G statistic) at each of the states.
 
     Silhouettes compare only where LiDAR shows an object; this also counts masks without points.
 

@@ -42,8 +42,8 @@ _REACH = 1.4
 _APART = np.radians(3.0)
 """Candidates closer than this count as one [rad]."""
 _NEAR_TRANSLATION_M = 0.1
-"""Half width of the translations of the first family of candidates [m]: with less to give way, they are hard
-to mislead."""
+"""Half width of the translations of the first family of candidates [m]: with less freedom, they are more
+robust to bad labels."""
 FRAMES = 6
 """Frames that take part: more cost time; scans one after the other show much the same."""
 POINTS_PER_CLASS = 250
@@ -117,14 +117,14 @@ class Stage:
 
 
 COARSE = (Stage(45.0, 0.25, 80, samples=16, rounds=1),)
-"""For candidates that are refined by silhouettes: those reach farther than what this leaves undone."""
+"""Stages for candidates that are then refined by silhouettes, whose convergence covers the rest."""
 FINE = (
     Stage(45.0, 0.25, 80, samples=64, rounds=4),
     Stage(22.0, 0.5, 40, samples=64, rounds=4),
     Stage(10.0, 1.0, 20, samples=64, rounds=4),
     Stage(4.0, 1.0, 12, samples=64, rounds=4),
 )
-"""To the label agreement's own optimum."""
+"""Stages up to the optimum of the label agreement itself."""
 
 
 @dataclass(frozen=True)

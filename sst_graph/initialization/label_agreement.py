@@ -1,9 +1,9 @@
-"""How well labelled points and blurred masks agree under a pose: two scores with different blind spots.
+"""Agreement of labelled points with blurred masks under a pose, by two scores that fail in different cases.
 
 *Votes* adds log-likelihood ratios of each point's class at its pixel. It is sharp, but prefers poses that
 bring many points of a class onto a large mask. *Dependence* is the likelihood-ratio statistic (G-test) of
-the table of point class against mask class over what the image shows: a pose that shows one class
-only says nothing, however well it fits.
+the table of point class against mask class over what the image shows: a pose under which only one class is in
+view scores 0, however well it fits.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _BATCH_POINTS = 400_000
 
 @dataclass(frozen=True)
 class SearchFrame:
-    """One scan and its image, as the search sees them.
+    """One scan and its image, with the data that the search needs.
 
     Attributes:
         lPs: (n, 3) points [m].

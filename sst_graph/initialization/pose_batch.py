@@ -1,11 +1,11 @@
 """The silhouettes of one drive under many poses at once: normal equations for one Gauss-Newton step each.
 
-Matches are those of :func:`~sst_graph.association.edge_matching.match_edges`, made by the same rules. What
-differs is there for speed, for a search matches some hundred poses where a graph matches one: points that are
-far out of view are sorted out first; motion is of second order in the interval; the contours' distances and
-normals come from one bilinear cell; objects are taken as static, points as measured. The unknowns are pose,
-time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of that of
-:class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the answer itself.
+Matches are those of :func:`~sst_graph.association.edge_matching.match_edges`, made by the same rules. The
+differences are for speed, because the search matches some hundred poses where the graph matches one: points
+that are far out of view are sorted out first; motion is of second order in the interval; the contours'
+distances and normals come from one bilinear cell; objects are taken as static, points as measured. The
+unknowns are pose, time offset and one mask bias a class; twists are fixed, and so a step costs a hundredth of
+that of :class:`~sst_graph.graph.frozen_problem.FrozenProblem`, which gives the estimate itself.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class PoseBatch:
         distance, normals = self._look_up(seen, image)
         kind = self._classes[seen.point]
         r = distance + poses.biases[seen.pose, kind]
-        # 1. The contour faces the way out of the object, and is near; enough of the object meets one.
+        # 1. Keep contours that face outward and are near, of objects of which enough points have one.
         way, length = _directions(self.camera, seen)
         cosine = way[0] * normals[0] + way[1] * normals[1]
         matched = faces(cosine) & (np.abs(r) < GATE * kernel.scale)
@@ -299,7 +299,7 @@ def _rotated(R: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def _directions(camera: PinholeCamera, seen: _InImage) -> tuple[FloatArray, FloatArray]:
-    """(2, k) unit ways out of the objects in the image, and the lengths (k,) of the steps [px]."""
+    """(2, k) unit outward directions of the objects in the image, and the lengths (k,) of the steps [px]."""
     X, Y, Z = seen.cPs
     dX, dY, dZ = seen.ways
     farther = np.maximum(Z + dZ, _MIN_DEPTH_M)

@@ -1,7 +1,7 @@
 """Candidates refined side by side: one damped Gauss-Newton step each under every kernel.
 
-The weak priors are those of the graph. What the graph has beside pose, offset and one mask bias a class is
-fixed (twists) or left out (biases by object), so the best candidate is only a start.
+The weak priors are those of the graph. Of the graph's other unknowns, twists are fixed and mask biases by
+object are left out, so the best candidate is only a start.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """The start of the joint method: candidates, refined side by side, and the best of them selected.
 
 1. Candidates: poses of a grid whose labels agree (:mod:`~sst_graph.initialization.candidates`).
-2. Refinement: all of them by silhouettes on some scans, under narrowing kernels; the worse ones and those
-   that have met are dropped on the way (:mod:`~sst_graph.initialization.refinement`).
-3. Selection: the best by silhouettes and by the labels of all points, and different ones that are nearly as
-good.
+2. Refinement: all of them by silhouettes on some scans, under narrowing kernels; the worse ones, and those
+that have converged to one pose, are dropped from stage to stage
+(:mod:`~sst_graph.initialization.refinement`). 3. Selection: the best by silhouettes and by the labels of all
+points, and alternatives that are nearly as good.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ _WIDE_STAGES = (KERNELS_PX[:3], KERNELS_PX[3:6])
 _NARROW_STAGE = (*NARROW_KERNELS_PX, *[NARROW_KERNELS_PX[-1]] * 6)
 """Of the narrow ones; at the last scale most have converged after six steps."""
 _SELECTED = 2
-"""Most different solutions that are solved on all frames ..."""
+"""Most different starts that are solved on all frames."""
 _SELECTED_RATIO = 0.7
-"""... if their score is at least this fraction of the best one's."""
+"""Least score of such a start, as a fraction of the best one's."""
 ALTERNATIVE_RATIO = 0.9
-"""A different solution with at least this fraction of the best one's score makes the answer ambiguous."""
+"""A different solution with at least this fraction of the best one's score makes the estimate ambiguous."""
 _ALIKE_RAD, _ALIKE_M, _ALIKE_S = 0.003, 0.05, 0.01
-"""Solutions on a few frames that are closer than all of these lead to one answer."""
+"""Solutions on a few frames that are closer than all of these lead to one estimate."""
 _STILL_ALIKE = 3.0
 """While kernels are wide, candidates count as one at this many times the distance."""
 _SAME_RAD = float(np.radians(2.0))
@@ -142,7 +142,7 @@ def select_among_steps(
         equations = yield from rough.equation_steps(poses, kernels_px[-1])
         kept = _kept(poses, equations)
         poses, centres = poses.take(kept), centres.take(kept)
-    # 2. What is left under narrow ones, on all points.
+    # 2. The remaining ones under narrow kernels, on all points.
     poses = yield from refine_steps(full, poses, centres, _NARROW_STAGE)
     equations = yield from full.equation_steps(poses, _NARROW_STAGE[-1])
     # 3. The best that stayed within reach, by boundaries and by all labels.
@@ -188,15 +188,16 @@ def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
 
 
 def _alike(one: State, other: State) -> bool:
-    """Whether two solutions lead to one answer."""
+    """Whether two solutions lead to one estimate."""
     step = one.cTl.between(other.cTl)
     near = _turn_rad(one.cTl, other.cTl) < _ALIKE_RAD
     near &= bool((np.abs(step.translation()) <= _ALIKE_M).all())
-    return near and abs(one.offsets_s[0] - other.offsets_s[0]) <= _ALIKE_S
+    return near and abs(one.time_offsets_s[0] - other.time_offsets_s[0]) <= _ALIKE_S
 
 
 def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
-    """The candidates, and the first of them at other time offsets: slow frames hardly tell the offset."""
+    """The candidates, and the first of them at other time offsets: slow frames hardly determine the
+    offset."""
     if all(candidate.offset_s == guess_offset_s for candidate in candidates):
         return list(candidates)
     others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
@@ -242,7 +243,7 @@ def _kept(poses: Poses, equations: BatchEquations) -> IntArray:
 
 
 def _different(poses: Poses, scores: FloatArray, slack: float = 1.0) -> IntArray:
-    """Positions of the poses that are not alike a better one, the best first."""
+    """Positions of the poses that are not near a better one, the best first."""
     remaining, chosen = np.argsort(-scores, kind="stable"), []
     flat = poses.rotations.reshape(-1, 9)
     trace = 1.0 + 2.0 * np.cos(slack * _ALIKE_RAD)
@@ -259,7 +260,7 @@ def _different(poses: Poses, scores: FloatArray, slack: float = 1.0) -> IntArray
 
 
 def _in_reach(poses: Poses, guess: gtsam.Pose3 | None, config: SearchConfig) -> NDArray[np.bool_]:
-    """(m,) whether the translation stayed where it was searched, and did not run away with the points."""
+    """(m,) whether the translation stayed within the searched region."""
     if guess is None:
         return np.asarray(np.linalg.norm(poses.translations, axis=1) < REACH * config.free_translation_m)
     away = np.abs(poses.translations - np.asarray(guess.translation()))

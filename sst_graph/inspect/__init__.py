@@ -1,1 +1,1 @@
-"""What a result is worth, in numbers and words."""
+"""How far a result can be trusted, in numbers and words."""

@@ -1,10 +1,10 @@
-"""What each frame adds to the covariance: by itself, beside all the others, and one after the other.
+"""Information of each frame: by itself, added to all other frames, and in their order.
 
-Without a frame, the covariance is made anew from all other matches as
+Without a frame, the covariance is made again from all other matches as
 :mod:`sst_graph.covariance.cluster_robust` makes it: information, error model, and the objects left out in
-turn. The matches and their robust weights stay as they are; the estimate takes the Gauss-Newton step to the
+turn. The matches and their robust weights are kept; the estimate takes the Gauss-Newton step to the
 optimum of the other frames, and the residuals follow. Without that step, the left-out frame's gradient would
-stay in the residuals, and the spread over objects would take it for their disagreement.
+stay in the residuals, and the jackknife over objects would count it as disagreement among them.
 
 The covariance of the frames up to one, and of one by itself, is a sandwich under the error model of all: the
 information of the frames with the motion marginalised out, and the sums of their scores; sides that several
@@ -85,7 +85,7 @@ def frame_gains(
     drives: Sequence[Drive],
     robust: RobustCovariance,
 ) -> tuple[FrameInformation, ...]:
-    """What each pair brought, in the order of the pairs; pairs that share an image count as one."""
+    """Information of each pair, in the order of the pairs; pairs that share an image count as one."""
     unknowns, table, model = robust.unknowns, robust.table, robust.model
     # 1. Of each frame its factors and the scores of its matches.
     prior, twisted = _frame_information(graph, values, unknowns)
@@ -98,7 +98,7 @@ def frame_gains(
     for term, own_scores, own in zip(terms, scores, columns, strict=True):
         sums = sums.plus(term, own_scores)
         before.append(np.diag(sums.covariance(model))[own])
-    # 3. Each by itself, and beside all the others.
+    # 3. Each by itself, and added to all the others.
     found, prior_covariance = [], np.asarray(np.linalg.inv(prior))
     after = np.diag(sums.covariance(model))
     for k, (pair, rows) in enumerate(groups.values()):
@@ -115,7 +115,7 @@ def _left_out(
 ) -> FloatArray:
     """(n, n) covariance of a calibration without a frame, its matches and their weights as they are.
 
-    The whole of it is made anew from the matches that are left, error model and objects left out in turn
+    The whole of it is made again from the matches that are left, error model and objects left out in turn
     included: a frame that contradicts the others widens both, and leaving it out narrows them.
     """
     information = sums.information.copy()

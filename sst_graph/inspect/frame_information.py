@@ -1,4 +1,4 @@
-"""What each frame of a calibration added, as it stands in ``calibration.json``.
+"""Information of each frame of a calibration, as stored in ``calibration.json``.
 
 Under ``diagnostics.frame_information``, one list a quantity, one entry a frame. Ratios are relative to
 the calibration with all its frames, so that they hold whatever scale its covariance has.
@@ -19,7 +19,7 @@ from sst_graph.result import CalibrationResult, FrameId
 FloatArray = NDArray[np.float64]
 
 KEY = "frame_information"
-"""Where it stands in the diagnostics of a result."""
+"""Key in the diagnostics of a result."""
 
 DIGITS = 4
 """Significant digits that are kept."""

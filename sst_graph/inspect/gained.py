@@ -1,4 +1,4 @@
-"""Information gained by frame, of methods other than the joint one, as it stands in ``calibration.json``.
+"""Information gained by frame, of methods other than the joint one, as stored in ``calibration.json``.
 
 Under ``diagnostics.information_gained``: for the tracker what each scan added when it came, for the hand-eye
 method what each pair of motions adds to the others. Both are less than
@@ -23,14 +23,14 @@ from sst_graph.result import CalibrationResult, FrameId
 FloatArray = NDArray[np.float64]
 
 KEY = "information_gained"
-"""Where it stands in the diagnostics of a result."""
+"""Key in the diagnostics of a result."""
 
 Kind = Literal["as they came", "beside the others"]
 
 
 @dataclass(frozen=True)
 class Gain:
-    """What one frame, or one pair of motions, brought. Order of seven: the covariance's.
+    """Information of one frame or one pair of motions. The order of seven is that of the covariance.
 
     Attributes:
         frame: which frame; of a pair, the image that begins it.

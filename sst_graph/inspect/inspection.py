@@ -1,6 +1,6 @@
 """How far a result can be trusted, in numbers for people: sigmas, correlations, weak directions, frames.
 
-Pure functions of a :class:`~sst_graph.result.CalibrationResult`; nothing is measured anew.
+Pure functions of a :class:`~sst_graph.result.CalibrationResult`; nothing is measured again.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MOST_NEXT_FRAMES = 1_000_000
 
 @dataclass(frozen=True)
 class Correlation:
-    """Two unknowns that the data tie together; numbers of the covariance's order.
+    """Two correlated unknowns; numbers of the covariance's order.
 
     Attributes:
         first, second: the two.
@@ -77,7 +77,7 @@ class PixelSigma:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What there is to say about a result's uncertainty.
+    """The uncertainty of a result, analysed.
 
     Attributes:
         result: the result.
@@ -87,9 +87,10 @@ class Inspection:
         correlation: (7, 7).
         strong: the strongest correlations, strongest first.
         weakest: the direction known worst, measured in the limits, also where it is within them.
-        frames: what each frame brought; empty where the result has none.
-        redundant: positions in ``frames`` of those that each could be left out ...
-        redundant_share: ... without any sigma growing by more than this share.
+        frames: information of each frame; empty where the result has none.
+        redundant: positions in ``frames`` of those without which, one at a time, no sigma grows by more than
+            ``redundant_share``.
+        redundant_share: as a fraction of the sigma.
         plan: what to record next, or None without ``frames``.
         gained: other information by frame in the result, or None.
     """
@@ -109,7 +110,7 @@ class Inspection:
 
 
 def inspect_result(result: CalibrationResult, next_frames: int = 10) -> Inspection:
-    """Everything there is to say about a result's uncertainty.
+    """Analyse the uncertainty of a result.
 
     Args:
         next_frames: frames that the predictions add.

@@ -48,7 +48,7 @@ def inspection_text(inspection: Inspection, all_frames: bool = False) -> str:
 
 
 def correlation_sentence(pair: Correlation) -> str:
-    """What two tied unknowns mean for one another."""
+    """A sentence about two correlated unknowns."""
     i, j = pair.first, pair.second
     step = pair.slope * HUMAN[j] / HUMAN[i]
     a, b = NAMES[i], NAMES[j]
@@ -100,7 +100,7 @@ def advice_sentences(inspection: Inspection, plan: Plan) -> list[str]:
 
 
 def _elsewhere(inspection: Inspection, plan: Plan) -> str | None:
-    """What errors that frames share cost the record, where it is much."""
+    """A sentence about errors that frames share, where they dominate."""
     lost = plan.now.sigmas / plan.elsewhere.sigmas
     axes = np.argsort(-lost)[:2]
     if lost[axes[0]] < 1.2:

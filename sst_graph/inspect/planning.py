@@ -4,8 +4,8 @@ A recorded frame's view (its information on the extrinsic) is combined with any 
 twist l_twist it informs the offset through J_offset = -J_extrinsic l_twist. Frames are predicted at other
 places, each with objects and mask biases of its own, so that their information adds up.
 
-What is assumed (a focal length, a principal point) errs in every frame alike: the part of the
-covariance that considers it stays, however many frames are added.
+What is assumed (a focal length, a principal point) has the same error in every frame: that part of the
+covariance does not decrease with more frames.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ def predict(
     search: bool = True,
     lasting: FloatArray | None = None,
 ) -> Prediction:
-    """What ``count`` frames of a proposal would make of a covariance (7, 7).
+    """The covariance (7, 7) after ``count`` frames of a proposal.
 
     Without ``search`` the number of frames that is enough stays None. ``lasting``: (7, 7) part of the
     covariance that no frames reduce.
@@ -307,7 +307,7 @@ def nearer(view: FloatArray, cTl: gtsam.Pose3, factor: float = 2.0) -> FloatArra
 
 
 def limits_of(result: CalibrationResult) -> ObservabilityConfig:
-    """The limits that the result was judged by; the defaults where it has none."""
+    """The limits of observability of the result; the defaults where it has none."""
     place: Any = result.config.get("observability")
     if place is None and isinstance(result.config.get("calibration"), Mapping):
         place = result.config["calibration"].get("observability")
@@ -345,7 +345,7 @@ def _enough(
 
 
 def _vague() -> FloatArray:
-    """(7, 7) covariance of knowing nothing, as the priors of the graph have it."""
+    """(7, 7) covariance of the graph's priors alone."""
     return np.diag(np.array([1.0] * 3 + [0.5] * 3 + [0.3]) ** 2)
 
 

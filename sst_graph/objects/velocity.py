@@ -2,7 +2,7 @@
 
 The centre of an outline wanders over a vehicle while other sides of it come into view, by half a metre a
 second close by. Its end towards the LiDAR along its direction of motion, and its side towards the LiDAR
-across it, are the same pieces of it in every scan, as long as it does not pass alongside.
+across it, are the same parts of it in every scan, as long as it does not pass alongside.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class ObjectVelocities:
 def _is_carried(
     w_velocity: FloatArray, outline: FloatArray, times_s: FloatArray, outlines: Sequence[FloatArray]
 ) -> bool:
-    """Whether a velocity carries an outline to where the first and the last scan around show it."""
+    """Whether an outline, moved with a velocity, is where the first and the last scan around show it."""
     shares = []
     for velocity in (w_velocity, np.zeros(2)):
         distances = [

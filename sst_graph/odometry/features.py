@@ -141,7 +141,7 @@ def follow_corners(
     if len(corners) == 0:
         return np.zeros((0, 2)), np.zeros(0, np.bool_)
     there, found = _flow(gray_a, gray_b, corners, None)
-    # The way back starts from where the corner was: two pyramid levels are enough to check it.
+    # The backward track starts at the corner's first position: two pyramid levels are enough to check it.
     back, found_back = _flow(gray_b, gray_a, there, corners)
     height, width = gray_a.shape[:2]
     good = (

@@ -53,7 +53,7 @@ _SEARCH_ITERATIONS = 6
 _STANDSTILL_M, _STANDSTILL_INLIER_RATIO = 0.02, 0.65
 """No farther shift is tried where the best of the nearest ones stays within this distance of the prediction
 with at least this fraction of its points paired: standstill [m, 1]. Along a street's walls a scan may well
-stay where it was started, which its neighbours show."""
+stay where it was started, which neighbouring starts show."""
 _MISSED_COST = 1.0
 """What a point without a voxel to pair with costs in the choice among starts; a pair costs its squared,
 whitened residual."""

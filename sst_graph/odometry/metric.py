@@ -34,7 +34,7 @@ length, yet at standstill it makes such a track a full constraint on the rotatio
 _ITERATIONS = 15
 """Most Gauss-Newton steps; it stops where a step is below 1e-5."""
 _FAILED_RAD, _FAILED_M = 0.1, 3.0
-"""Sigmas of a motion that could not be estimated [rad, m]: the way in 0.1 s at 30 m/s."""
+"""Sigmas of a motion that could not be estimated [rad, m]: the distance in 0.1 s at 30 m/s."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def motion_from_depths(
     # 1. The best of a few starts.
     noise = max(MIN_NOISE_PX, direction_motion.noise_px)
     pose = min(_starts(problem, direction_motion), key=lambda start: problem.cost(start, noise))
-    # 2. Robust Gauss-Newton, the noise measured along the way.
+    # 2. Robust Gauss-Newton, with the noise estimated at each step.
     for _ in range(_ITERATIONS):
         terms, noise = problem.linearize(pose, noise)
         step = np.linalg.solve(terms.information + 1e-9 * np.eye(6), -terms.gradient)
@@ -102,7 +102,7 @@ def motion_from_depths(
     terms, _ = problem.linearize(pose, noise)
     if terms.depth_inliers < _MIN_DEPTHS:
         return _failed(tracks, direction_motion)
-    # 3. Covariance, with what all tracks share.
+    # 3. Covariance, with the errors that all tracks share.
     covariance = terms.covariance()
     t = pose.rotation().matrix().T @ pose.translation()
     covariance[3:, 3:] += shared.scale_sigma**2 * np.outer(t, t)
@@ -229,7 +229,7 @@ class _Problem:
         turn = np.stack([line, np.column_stack([-line[:, 1], line[:, 0]])], axis=1)
         value = np.einsum("nij,nj->ni", turn, error)
         value[:, 0] += slope * (self.rho - rho)
-        # 3. The fitted depth leans on the noise along the line: it may turn only the row across.
+        # 3. The fitted depth depends on the noise along the line, so it may change only the row across it.
         q_H_pose = np.concatenate([skew(q), np.broadcast_to(-np.eye(3), (len(q), 3, 3))], axis=2)
         J = turn @ self.camera.uv_H_cP(q) @ q_H_pose
         J[:, 0, 3:] *= self.rho[:, None]

@@ -1,4 +1,4 @@
-"""Motions of a sensor on a vehicle, smoothed forth and back.
+"""Motions of a sensor on a vehicle, smoothed forwards and backwards.
 
 Registration errs at each stamp: a pose that is 1 cm too far ahead makes one interval too long and the next
 too short. A vehicle's twist does not jump like that, so most of it can be separated: the twist is an
@@ -120,7 +120,7 @@ class _Step:
 
 
 class _Run:
-    """Motions in a row, filtered forth and smoothed back.
+    """Consecutive motions, filtered forwards and smoothed backwards.
 
     Inside, lengths of time are in units of the first interval, twists in units of its noise.
     """

@@ -15,7 +15,7 @@ SweepSense = Literal["clockwise", "counterclockwise"]
 SweepStamp = Literal["forward", "start", "end"]
 """Which instant of a turn the scan's stamp names."""
 SweepOutput = Literal["times", "raw", "compensated"]
-"""What the data tell of a rolling sweep: the time of each point; the points as measured and no times; the
+"""What the data hold of a rolling sweep: the time of each point; the points as measured and no times; the
 points moved to where they lie at the stamp by the true ego motion (moving objects stay as measured)."""
 
 _MOST_PIXELS, _LONGEST_S, _FARTHEST_M = 10_000_000, 1000.0, 5000.0
@@ -46,7 +46,7 @@ class SimulationConfig(Settings):
         sweep_start_deg: azimuth at which a turn begins and ends, counter-clockwise from forward [deg].
         sweep_stamp: the instant that a scan's stamp names; of a turn that begins ahead, ``forward`` is its
             start.
-        sweep_output: what the data tell of a rolling sweep.
+        sweep_output: what the data hold of a rolling sweep.
         azimuth_limit_deg: points beyond this azimuth, either side of forward, are cut off [deg].
         azimuth_step_deg: nominal angle between two firings of one laser [deg].
         range_noise_m: standard deviation of the range [m].
@@ -100,5 +100,5 @@ class SimulationConfig(Settings):
 
     @property
     def gives_times(self) -> bool:
-        """Whether the data tell the time of each point."""
+        """Whether the data have the time of each point."""
         return self.rolling and self.sweep_output == "times"

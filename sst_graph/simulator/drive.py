@@ -91,7 +91,7 @@ class SimulatedDrive:
 
     @property
     def sweep(self) -> str:
-        """What the drive tells of its sweep: that the whole scan is taken at once, or nothing."""
+        """What the drive states about its sweep: that the whole scan is taken at once, or nothing."""
         return "auto" if self.config.rolling else "compensated"
 
     @property

@@ -1,4 +1,4 @@
-"""One image against one scan, for a graph of the user's own: the matches behind his alignment factor."""
+"""Matches of one image and one scan for an alignment factor in a graph of your own."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ FloatArray = NDArray[np.float64]
 
 VEHICLES = (SemanticClass.VEHICLE,)
 SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
-"""In somebody else's graph nobody corrects the information afterwards: a side of an object counts once."""
+"""In a graph of your own the information is not corrected afterwards: each side of an object counts as one
+measurement."""
 SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
 
 

@@ -1,4 +1,4 @@
-"""Where alignment terms stand in a graph: the trajectory's poses, extrinsic, time offset and mask biases."""
+"""Keys of alignment terms in a graph: the trajectory's poses, extrinsic, time offset and mask biases."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class AlignmentKeys:
-    """Where the terms of one camera stand in a graph.
+    """Keys of the terms of one camera in a graph.
 
     Attributes:
         trajectory: poses wTb of the body, one at each scan's stamp.

@@ -1,6 +1,6 @@
-"""One image and one scan in a graph of the user's own: matched anew at every estimate.
+"""One image and one scan in a graph of the user's own: matched again at every estimate.
 
-A term holds its data, and where extrinsic, time offset and the trajectory stand in the graph. At any values
+A term holds its data, and the keys of extrinsic, time offset and trajectory in the graph. At any values
 it finds the two poses between which the image was taken in true time, stamp + offset, matches scan and image
 there, and makes its factor (:func:`sst_graph.factors.pose_alignment_factor`). Matches are frozen in a
 factor: it is valid near the values at which it was made, and :class:`TermMatches` measures how far they have
@@ -190,7 +190,7 @@ class AlignmentTerm:
         scans, image: as the data have them, kept as their features: one scan or several of the poses around.
             Of several that one is taken which is nearest to the image in true time.
         camera: of the image.
-        keys: where extrinsic, offset and the poses stand in the graph; the trajectory needs a pose at a
+        keys: of extrinsic, offset and the poses in the graph; the trajectory needs a pose at a
             scan's stamp.
         config: how to match.
         l_velocities: for each scan (3,) over ground of objects that move, in the scan's LiDAR frame [m/s], by

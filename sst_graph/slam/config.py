@@ -1,4 +1,4 @@
-"""When alignment terms are matched again, under which kernel, and how sure they may be."""
+"""Schedule of matching alignment terms again, and the bounds of their information."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""How sure extrinsic and time offset are in a graph of the user's own.
+"""Covariance of extrinsic and time offset in a graph of your own.
 
 The graph's marginal P takes all matches for independent, each with the error that its factor gives it. But
-the matches of one side of one object err together, in one image and in all that show it. With J a match's
-derivatives, w its weight and sigma its error in the factor, the score of an error e is w J e / sigma^2, and
+the errors of matches on one side of one object are correlated, in one image and in all that show it. With J a
+match's derivatives, w its weight and sigma its error in the factor, the score of an error e is w J e /
+sigma^2, and
 
     C = P + P (Var(scores) - sum w J J' / sigma^2) P,
 
@@ -11,8 +12,9 @@ of ``calibrate`` (:func:`sst_graph.covariance.cluster_robust.fit_error_model`). 
 factors claim, for a match, and ``side_sigma_px``, for a side in all images: a short drive shows less than
 there is, for pose and offset are fitted to the same sides.
 
-A class whose mask bias is no variable keeps it in the answer. What the matches say of it is worked out as if
-it were one (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C (Schmidt).
+The mask bias of a class for which it is no variable shifts the estimate. It is estimated from the matches as
+if it were a variable (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C
+(Schmidt).
 
 Along a direction that the data hardly determine, as forward against later at one speed, a common error of a
 pixel is many times what independent matches leave: there the two covariances differ most.
@@ -177,7 +179,7 @@ def rows_of(matches: TermMatches, sides: ObjectSides, values: gtsam.Values) -> T
 
 
 def least_errors(config: RematchConfig) -> ErrorModel:
-    """What is known of the errors before any residual: variances of a side [px^2], and of a match over what
+    """Prior knowledge of the errors: variances of a side [px^2], and of a match over what
     its factor gives it."""
     return ErrorModel(config.side_sigma_px**2, 0.0, 1.0)
 

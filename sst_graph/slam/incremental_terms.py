@@ -47,7 +47,7 @@ _KNOWN = 0.5
 """The kernel is narrowed only when extrinsic and offset are known to less than this share of it in the image
 (one sigma): a single image must not decide."""
 _RESCALE = 0.2
-"""The factors are made anew when the scale of their information is off by more than this share."""
+"""The factors are made again when the scale of their information is off by more than this share."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class IncrementalTerms:
         Args:
             graph, values: as the solver's own ``update`` takes them; the first hold extrinsic and offset.
             terms: new ones; a term whose image lies after the last pose waits for it.
-            stamps: for a smoother, stamp of each variable [s]; extrinsic and offset are stamped anew here.
+            stamps: for a smoother, stamp of each variable [s]; extrinsic and offset are stamped again here.
         """
         stamps = self._stamped(stamps)
         self._solve(graph, values, stamps, self._leaving(stamps))

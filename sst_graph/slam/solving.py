@@ -1,10 +1,10 @@
 """Matching again while a graph is solved: Levenberg-Marquardt, and what all solvers share.
 
 The loop solves with frozen matches, matches again at the solution, and narrows the robust kernel
-wherever a round has moved the matched points little beside it (deterministic annealing, as in robust ICP).
-While the kernel is wide, what the matches hardly determine is held by a *proximal* prior on extrinsic and
-offset about the present estimate, whose sigmas are a kernel's width in the image: matches inform no farther
-than they reach. It follows the estimate, so it adds no bias, and it is removed at the end.
+wherever a round has moved the matched points by much less than its scale (deterministic annealing, as in
+robust ICP). While the kernel is wide, what the matches hardly determine is held by a *proximal* prior on
+extrinsic and offset about the present estimate, whose sigmas are a kernel's width in the image: matches
+inform no farther than they reach. It follows the estimate, so it adds no bias, and it is removed at the end.
 
 The covariance of extrinsic and offset is cluster-robust (:mod:`sst_graph.slam.covariance`), and the factors
 are scaled down by its mean ratio to what they claim, so that the marginals of the graph itself have the same

@@ -1,4 +1,4 @@
-"""What may be wrong with alignment terms in a graph, each with the figure behind it."""
+"""Warnings about alignment terms in a graph, each with its figure."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WarningKind(Enum):
     OVERCONFIDENT_MARGINAL = (
         "the graph's own marginal is smaller than the matches allow; use the covariance of the solution"
     )
-    MASK_BIAS = "outlines that lie beside the edges, and no mask bias in the graph (AlignmentKeys.biases_px)"
+    MASK_BIAS = "outlines that differ from the edges, and no mask bias in the graph (AlignmentKeys.biases_px)"
 
 
 @dataclass(frozen=True)

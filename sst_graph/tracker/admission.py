@@ -14,7 +14,7 @@ _CLOSEST_NS = 1_000_000
 _FARTHEST_NS = 86_400 * 10**9
 """A stamp that is farther ahead of the one before is an error, not a pause: a day [ns]."""
 _ELSEWHERE = 5
-"""So many stamps in a row that rise, but elsewhere, are no error: the clock was set."""
+"""Stamps in a row, rising but far from those before, that show that the clock was set."""
 
 
 class StampOrder:
@@ -41,7 +41,7 @@ class StampOrder:
         """Whether a stamp may be used; nothing but a refusal is remembered.
 
         Returns:
-            0, or by how much the stamps went elsewhere and now go on from there [ns].
+            0, or by how much the clock was set [ns].
 
         Raises:
             DataError: it is out of place; those after it may show that the clock was set.

@@ -1,4 +1,4 @@
-"""Do the data contradict what a tracker assumes? Score tests from its sums, at any time.
+"""Score tests of the assumptions in the tracker, from its sums.
 
 What leaves the window is kept as one Gaussian on the unknowns x and the parameters of all assumptions
 (:class:`~sst_graph.tracker.window.gaussian.Gaussian`), and as sums of the scores of sides over both.
@@ -10,7 +10,7 @@ matches add, and
 
 is one Newton step: f is the mean robust weight over the mean curvature, s the span of the parameter. The
 threshold, and what few objects make of it, are the batch's (:mod:`sst_graph.batch.assumption_tests`).
-Objects are not left out in turn: where an assumption is wrong all of them show it.
+There is no jackknife over objects: where an assumption is wrong, the residuals of all objects show it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.batch.assumption_tests import Finding, few_objects
+from sst_graph.batch.assumption_tests import ParameterTest, few_objects_factor
 from sst_graph.covariance.considered import AssumptionConfig
 from sst_graph.covariance.jackknife import bounded_ratio
 from sst_graph.errors import EstimationError
@@ -29,7 +29,7 @@ _EVERY = 10
 """Scans between two tests: they cost about as much as the covariance, which each frame has."""
 
 
-def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[Finding, ...]:
+def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[ParameterTest, ...]:
     """Score test of each assumption that the matches determine, the most contradicted first.
 
     Raises:
@@ -47,7 +47,7 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
     curvature = np.maximum(information, 0.0) / bounded_ratio(smoother.weight_curvature_ratio) + before
     values = score / curvature
     sigmas = np.sqrt(np.maximum(information + excess, 0.0) + before) / curvature
-    sigmas *= few_objects(smoother.objects, config.threshold)
+    sigmas *= few_objects_factor(smoother.objects, config.threshold)
     found = []
     for place, name in enumerate(smoother.held_names):
         assumption = ASSUMPTIONS[name]
@@ -55,12 +55,12 @@ def score_findings(smoother: WindowSmoother, config: AssumptionConfig) -> tuple[
             continue
         value, sigma = float(values[place]), float(sigmas[place])
         contradicted = abs(value) > config.threshold * sigma
-        found.append(Finding(assumption, value, sigma, contradicted))
+        found.append(ParameterTest(assumption, value, sigma, contradicted))
     return tuple(sorted(found, key=lambda finding: -finding.score))
 
 
 class AssumptionTests:
-    """When a running tracker tests what it assumes, and what it has found.
+    """Tests of the assumptions in a running tracker, and their results.
 
     Attributes:
         found: findings of the last test, by name of the assumption: (value, sigma, contradicted).
@@ -71,9 +71,9 @@ class AssumptionTests:
         self.found: dict[str, tuple[float, float, bool]] = {}
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
+    def findings(self) -> tuple[ParameterTest, ...]:
         """Of the last test, the most contradicted first."""
-        return tuple(Finding(ASSUMPTIONS[name], *values) for name, values in self.found.items())
+        return tuple(ParameterTest(ASSUMPTIONS[name], *values) for name, values in self.found.items())
 
     def restart(self) -> None:
         """A new calibration begins."""

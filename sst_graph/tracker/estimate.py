@@ -1,4 +1,4 @@
-"""The running estimate: the window's smoother, its covariance, and what is derived from them."""
+"""The running estimate: the window's smoother, its covariance, and quantities derived from them."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.assumption_tests import with_test_results
-from sst_graph.covariance.considered import Considered, considered
+from sst_graph.covariance.considered import Considered, considered_by_steps
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
-from sst_graph.tracker.monitor.statistic import Estimate
+from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.start.initializer import Initialization
 from sst_graph.tracker.start.solution import Guess
 from sst_graph.tracker.uncertainty import Uncertainty
@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FrameMatches:
-    """What was matched with a scan, at the estimate before it.
+    """The matches made with a new scan, at the estimate before it.
 
     Attributes:
         scan: its number.
@@ -68,7 +68,7 @@ class OnlineEstimate:
     """Extrinsic and time offset over the window and all that has left it.
 
     Attributes:
-        guess: what holds while there is no estimate.
+        guess: the calibration while there is no estimate.
         smoother: the graph of the window; None while there is no estimate.
         uncertainty: covariance of the estimate.
         tests: whether the data contradict what is assumed.
@@ -106,7 +106,7 @@ class OnlineEstimate:
         _LOG.info("tracker: started over %d scans", initialization.scans)
 
     def restart(self, guess: Guess) -> None:
-        """Give the estimate up."""
+        """Discard the estimate."""
         self.guess = guess
         self.stop_relinearization()
         self.smoother, self.uncertainty = None, Uncertainty.nothing()
@@ -156,26 +156,26 @@ class OnlineEstimate:
         }
 
     def reported_covariance(self) -> FloatArray:
-        """(7, 7) of the present estimate, with what assumptions that may be wrong add to it."""
+        """(7, 7) covariance of the present estimate, with the considered assumptions."""
         return self.covariance[:7, :7] + self.considered().covariance(7)
 
     def considered(self) -> Considered:
-        """How the present estimate depends on the assumptions that are not estimated beside it."""
-        beside = considered(self.uncertainty.steps, self.config.calibration.assumptions)
-        return with_test_results(beside, self.tests.findings)
+        """The considered assumptions: those whose parameters are not estimated."""
+        considered = considered_by_steps(self.uncertainty.steps, self.config.calibration.assumptions)
+        return with_test_results(considered, self.tests.findings)
 
-    def for_comparison(self) -> Estimate:
-        """The running estimate as frames are compared with it."""
+    def for_comparison(self) -> ComparedEstimate:
+        """The running estimate, for the comparison of new frames with it."""
         assert self.smoother is not None
-        return Estimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
+        return ComparedEstimate(self.smoother.point, self.uncertainty.joint, self.smoother.model)
 
     def history(self) -> list[HistoryEntry]:
         """The calibration of every epoch, smoothed over all of them, with covariances (drift mode)."""
         if self.smoother is None:
             return []
         entries = self.past_epochs.smoothed(self.smoother)
-        beside = self.considered().covariance(7)
-        return [dataclasses.replace(entry, covariance=entry.covariance + beside) for entry in entries]
+        extra = self.considered().covariance(7)
+        return [dataclasses.replace(entry, covariance=entry.covariance + extra) for entry in entries]
 
     # ------------------------------------------------------------------ a frame
 
@@ -203,25 +203,25 @@ class OnlineEstimate:
             smoother.update(matches.found, set(matches.missing), window.first_scan, window.objects.live)
             window.dynamics.changed_scans -= matches.chosen
         self.entered.extend(new)
-        # 2. Now and then the whole window is matched and linearized anew, some scans with each frame.
+        # 2. At times the whole window is matched and linearized again, some scans with each frame.
         self._schedule_relinearization(matches.scan)
         # 3. Covariance, and what the scan contributed to it.
         self.uncertainty = Uncertainty.of(smoother)
         if new:
             self.information_log.add(matches.scan, self.reported_covariance())
-        # 4. Do the data contradict what is assumed?
+        # 4. Test the assumptions.
         self.tests.update(matches.scan, smoother)
         self.past_epochs.take(smoother)
 
     def begin_relinearization(self) -> None:
-        """Match the window anew with the frames to come; no scan leaves meanwhile if none has yet."""
+        """Match the window again with the frames to come; no scan leaves meanwhile if none has yet."""
         window = self.matcher.window
         window.dynamics.test_all()
         self.relinearization = WindowRelinearization(self.matcher)
         window.growing = window.first_scan == self.schedule.first
 
     def stop_relinearization(self) -> None:
-        """Leave a relinearization of the window, if there is one, as it is."""
+        """Stop a relinearization of the window, if one is under way."""
         self.relinearization, self.matcher.window.growing = None, False
 
     def _schedule_relinearization(self, scan: int) -> None:
@@ -236,7 +236,8 @@ class OnlineEstimate:
     def _share(self) -> float:
         """Factor on the weights of matches.
 
-        In drift mode matches count as little as their clusters allow, so that the walk has its share.
+        In drift mode the weights are divided by the inflation of the cluster-robust covariance, so that
+        matches and random walk are weighted consistently.
         """
         return 1.0 / self.uncertainty.inflation if self.config.drift.enabled else 1.0
 

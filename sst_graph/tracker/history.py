@@ -50,7 +50,7 @@ class History:
         smoother.retired.clear()
 
     def cut(self) -> None:
-        """Forget all: what comes is of another calibration."""
+        """Forget all epochs: the calibration has changed."""
         self.epochs.clear()
 
     def smoothed(self, smoother: WindowSmoother) -> list[HistoryEntry]:

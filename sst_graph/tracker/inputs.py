@@ -1,4 +1,4 @@
-"""What comes from the sensors: checked, measured and kept."""
+"""Input of the tracker: data are checked, features and motion extracted and kept."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sst_graph.validation import checked_image, checked_scan
 _MAX_IMAGES = 600
 """Most images that are kept, for any number of them may come while no scan does: a minute at 10 Hz."""
 _MAX_FAILURES = 10
-"""After so many scans or images in a row that could not be used, what is kept is the likely reason."""
+"""Failures in a row after which the window is given up: it is then their likely cause."""
 _SEARCH_MARGIN_S = 1.0
 """Images farther from a scan are kept, too, until the time offset is known [s]."""
 
@@ -51,7 +51,7 @@ class SensorInputs:
         self._restart_motion()
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what failed."""
+        """All but the failures."""
         return {**vars(self), "failures": deque(maxlen=_MAX_FAILURES)}
 
     def restart(self) -> None:
@@ -124,7 +124,7 @@ class SensorInputs:
         return len(self.failures) == self.failures.maxlen
 
     def _forget_images(self, estimate: OnlineEstimate) -> None:
-        """Keep no more images than scans may meet that are there, or still come."""
+        """Drop the images that no scan, present or to come, can be paired with."""
         margin_s = self.config.late_s + max(0.0, estimate.point.offset_s)
         margin_s += 0.0 if estimate.exists else _SEARCH_MARGIN_S
         self.window.forget_images(round(1e9 * margin_s), _MAX_IMAGES)

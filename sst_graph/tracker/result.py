@@ -10,7 +10,7 @@ from sst_graph.batch.assumption_tests import assumption_report
 from sst_graph.config import to_dict
 from sst_graph.inspect.gained import KEY, to_document
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult, FrameId, Status
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def tracker_result(
     tracker: Tracker, drive: str = "stream", camera_name: str = UNNAMED_CAMERA
 ) -> CalibrationResult:
     """The present estimate as a result; frames used are those of the window."""
-    last, estimate, window = current(tracker), tracker.estimate, tracker.inputs.window
+    last, estimate, window = current_update(tracker), tracker.estimate, tracker.inputs.window
     status: Status = "ok" if last.status == "ok" else "not_converged"
     reasons = tuple(f"{weak.sentence}: {weak.advice}" for weak in last.weak_directions)
     if last.status == "unobservable":

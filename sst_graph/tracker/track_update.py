@@ -1,4 +1,4 @@
-"""What the tracker answers to each frame."""
+"""What the tracker returns for each frame."""
 
 from __future__ import annotations
 

@@ -13,13 +13,13 @@ from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
-from sst_graph.tracker.answer import answer, current
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
 from sst_graph.tracker.inputs import SensorInputs
+from sst_graph.tracker.make_update import current_update, make_update
 from sst_graph.tracker.marginal import TrackedMarginal, increment, tracked_marginal
 from sst_graph.tracker.monitor.monitor import Monitor
-from sst_graph.tracker.monitor.statistic import Estimate
+from sst_graph.tracker.monitor.statistic import ComparedEstimate
 from sst_graph.tracker.result import tracker_result
 from sst_graph.tracker.start.initializer import (
     NUMERICAL_ERRORS,
@@ -44,7 +44,7 @@ class Tracker:
     """Extrinsic and time offset of one LiDAR and one camera, frame by frame.
 
     Frames, or scans and images on their own, come in the order of their stamps (images may come a little
-    late). No input raises: what cannot be used leaves everything as it was, and the answer says why.
+    late). No input raises: what cannot be used leaves everything as it was, and the update says why.
 
     Attributes:
         setup: camera, settings and guess that it was made with.
@@ -75,7 +75,7 @@ class Tracker:
     def add(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image and scan; either may be missing, and either may be refused alone."""
         if not isinstance(frame, Frame) or (frame.image is None and frame.scan is None):
-            return answer(self, 0, "a frame without scan and without image")
+            return make_update(self, 0, "a frame without scan and without image")
         of_image = None if frame.image is None else self.add_image(frame.image)
         if frame.scan is None:
             assert of_image is not None
@@ -95,7 +95,7 @@ class Tracker:
             with Snapshot(self):
                 # 2. Its contours go into the window.
                 self.inputs.add_image(checked, clock_step_ns, self.estimate)
-                return answer(self, checked.stamp_ns)
+                return make_update(self, checked.stamp_ns)
         except Exception as error:
             return self._not_added("image", image, error)
 
@@ -107,21 +107,21 @@ class Tracker:
             with Snapshot(self):
                 # 2. Its boundary points, and the motion that led to it, go into the window.
                 jump = self.inputs.add_scan(checked, clock_step_ns, self.estimate)
-                # 3. Stamps that jumped: earlier frames have another time offset.
+                # 3. Restart where stamps jumped: earlier frames have another time offset.
                 if restart := self._restart_by_stamps(clock_step_ns, jump):
                     return self._restart(restart, checked.stamp_ns)
-                # 4. Without an estimate: some work on a start.
+                # 4. Without an estimate: some work on the initialization.
                 if not self.estimate.exists:
                     return self._initialize(checked.stamp_ns)
-                # 5. Match new scans, and some of the window anew.
+                # 5. Match new scans, and some of the window again.
                 matches = self.estimate.match(self.inputs.window.next_scan - 1)
-                # 6. Compare new frames with the estimate before they are used: has the calibration changed?
+                # 6. Change detection: compare new frames with the estimate before they are used.
                 chi2, change = self.monitor.check(matches, self.estimate)
                 if change is not None:
                     return self._restart(change, checked.stamp_ns)
-                # 7. Put the matches into the graph, and estimate.
+                # 7. Add the matches to the graph, and estimate.
                 self.estimate.update(matches)
-                # 8. Do frames since the start agree with it, and may the estimate be adopted?
+                # 8. Check the start against later frames; adopt the estimate where held-out frames agree.
                 return self._review(matches, checked.stamp_ns, chi2)
         except Exception as error:
             return self._not_added("scan", scan, error)
@@ -129,35 +129,35 @@ class Tracker:
     def optimize(self, last: TrackUpdate | None = None, max_iterations: int = 20) -> TrackUpdate:
         """Solve the whole window as the batch does, as at the end of a drive.
 
-        A start that is not done yet is brought to its end first.
+        A start that is under way is completed first.
 
         Args:
-            last: answer to the last frame; what it holds of that frame stays.
+            last: update of the last frame; its fields about that frame are kept.
             max_iterations: under the narrowest kernel.
 
         Returns:
-            The answer with the solution; ``converged`` says whether it converged.
+            The update with the solution; ``converged`` says whether it converged.
         """
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
         if converged is not None and at_end:
             self.monitor.check_start_at_end(self.estimate)
-        return dataclasses.replace(current(self, last), converged=converged)
+        return dataclasses.replace(current_update(self, last), converged=converged)
 
     def result(self, drive: str = "stream", camera_name: str = UNNAMED_CAMERA) -> CalibrationResult:
         """The present estimate as a calibration result; the frames used are those of the window."""
         return tracker_result(self, drive, camera_name)
 
     def marginal(self, since: TrackedMarginal | None = None) -> TrackedMarginal:
-        """What is known of extrinsic and time offset, as a factor for a graph of one's own.
+        """The marginal on extrinsic and time offset, as a factor for a graph of your own.
 
         Linearized at the estimate, with the reported covariance: estimated parameters of assumptions are
         marginalized out, those that are not estimated are considered.
 
-        To add it as it grows: ``known = tracker.marginal()`` once; then, whenever wanted,
+        To add it incrementally: ``known = tracker.marginal()`` once; then, whenever wanted,
         ``more = tracker.marginal(since=known)`` into the graph and ``known = known.plus(more)``. All parts
         are linearized at the first one's point, and their sum is the tracker's information. A single part
-        may be negative in some direction: frames may also show that less is known than it seemed.
+        may be negative in some direction: frames may also show that the covariance was too small.
 
         Args:
             since: an earlier marginal of this tracker, with what was added since.
@@ -182,7 +182,7 @@ class Tracker:
     def save(self, path: str | Path) -> None:
         """Write a checkpoint; a file that exists is replaced in one step.
 
-        iSAM2 and the odometry's map are built anew first, so that this tracker and one that is loaded go on
+        iSAM2 and the odometry's map are built again first, so that this tracker and one that is loaded go on
         alike. :class:`~sst_graph.tracker.storage.checkpoint.Saver` spreads the work over frames.
 
         Raises:
@@ -208,19 +208,21 @@ class Tracker:
     # ------------------------------------------------------------------ steps
 
     def _initialize(self, stamp_ns: int) -> TrackUpdate:
-        """Some work towards a first estimate."""
+        """Do the work of one frame towards a first estimate."""
         try:
             initialization = self.initializer.work(self.matcher)
         except NUMERICAL_ERRORS as error:
             self.initializer.failed()
-            return answer(self, stamp_ns, f"no start yet: {' '.join(str(error).split())}")
+            return make_update(self, stamp_ns, f"no start yet: {' '.join(str(error).split())}")
         if initialization is not None:
             return self._begin(initialization, stamp_ns)
         under_way = self.initializer.under_way
-        return answer(self, stamp_ns, "looking for a start" if under_way else "collecting frames for a start")
+        return make_update(
+            self, stamp_ns, "searching for a start" if under_way else "collecting frames for a start"
+        )
 
     def _finish_start(self) -> bool:
-        """Do all that is left of a start, where one can be made; whether there is an estimate."""
+        """Complete a start, where one can be made; whether there is an estimate."""
         try:
             initialization = self.initializer.finish(self.matcher)
         except NUMERICAL_ERRORS as error:
@@ -233,21 +235,24 @@ class Tracker:
     def _begin(self, initialization: Initialization, stamp_ns: int) -> TrackUpdate:
         """Go on from a first estimate, if the frames that it is made of agree with it."""
         smoother, window = initialization.smoother, self.inputs.window
-        estimate = Estimate(smoother.point, initialization.uncertainty.joint, smoother.model)
+        estimate = ComparedEstimate(smoother.point, initialization.uncertainty.joint, smoother.model)
         if why := self.monitor.changes.check_start(list(smoother.entries), estimate):
             return self._restart(Restart(self.initializer.guess, len(window.scans) // 2, why), stamp_ns)
         self.estimate.begin(initialization)
         self.initializer.succeeded()
         self.monitor.begin(window.next_scan)
-        return answer(self, stamp_ns)
+        return make_update(self, stamp_ns)
 
     def _restart_by_stamps(self, clock_step_ns: int, jump: Jump | None) -> Restart | None:
-        """The restart that stamps call for: a clock was set, or stamps jumped against their interval."""
+        """The restart after a jump of the stamps: a clock was set, or stamps jumped against their
+        interval."""
         window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
             near = Guess(point.cTl, point.offset_s, guess.search)
-            return Restart(near, len(window.scans), f"{moved}: the calibration is estimated anew", alarm=True)
+            return Restart(
+                near, len(window.scans), f"{moved}: the calibration is estimated again", alarm=True
+            )
         if jump is None:
             return None
         image, scan = jump.place
@@ -265,24 +270,24 @@ class Tracker:
     def _restart(self, restart: Restart, stamp_ns: int) -> TrackUpdate:
         """Give up the estimate and all scans but the last few."""
         level = logging.WARNING if restart.alarm else logging.INFO
-        _LOG.log(level, "tracker: estimates anew from %d ns on: %s", stamp_ns, restart.reason)
+        _LOG.log(level, "tracker: estimates again from %d ns on: %s", stamp_ns, restart.reason)
         self.estimate.restart(restart.guess)
         self.monitor.restart()
         self.inputs.window.keep_scans(restart.scans)
         self.initializer.restart(restart.guess, len(self.inputs.window.scans), restart.alarm)
-        return answer(self, stamp_ns, restart.reason, chi2=restart.chi2, alarm=restart.alarm)
+        return make_update(self, stamp_ns, restart.reason, chi2=restart.chi2, alarm=restart.alarm)
 
     def _review(self, matches: FrameMatches, stamp_ns: int, chi2: float | None) -> TrackUpdate:
-        """The answer to a scan that has been used; the estimate is adopted where held-out frames agree."""
+        """The update for a scan that has been used; the estimate is adopted where held-out frames agree."""
         self.monitor.recheck_start(matches.scan, self.estimate)
         reason = "" if matches.new else "no match: no scan met an image that shows the same objects"
-        update = answer(self, stamp_ns, reason, chi2=chi2)
+        update = make_update(self, stamp_ns, reason, chi2=chi2)
         trusted = update.status == "ok" and not update.suspected_change
         adopted = bool(matches.new) and self.monitor.adoption.propose(self.estimate.point, trusted)
         return dataclasses.replace(update, adopted=adopted)
 
     def _not_added(self, sensor: Sensor, data: object, error: Exception) -> TrackUpdate:
-        """The answer to data that could not be used; if that goes on, the window is given up."""
+        """The update for data that could not be used; if that goes on, the window is given up."""
         why = str(error)
         if not isinstance(error, DataError):
             if not isinstance(error, NUMERICAL_ERRORS):
@@ -292,7 +297,7 @@ class Tracker:
                 point, guess = self.estimate.point, self.initializer.guess
                 self.inputs.restart()
                 self._restart(Restart(Guess(point.cTl, point.offset_s, guess.search), 0, why), 0)
-                why = f"{why}; the calibration is estimated anew"
+                why = f"{why}; the calibration is estimated again"
         stamp_ns = getattr(data, "stamp_ns", 0)
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS
-        return dataclasses.replace(answer(self, int(stamp_ns) if known else 0, why), refused=(sensor,))
+        return dataclasses.replace(make_update(self, int(stamp_ns) if known else 0, why), refused=(sensor,))

@@ -20,14 +20,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Covariance of an estimate, and what it rests on.
+    """Covariance of an estimate, and its parts.
 
     Attributes:
         joint: cluster-robust covariance of all unknowns.
         inflation: how much larger it is than that of independent matches.
         by_static_objects: (7, 7) covariance of extrinsic and offset by static objects alone; None where no
             object moves.
-        steps: (7,) how extrinsic and offset follow each parameter that is held at 0, by name.
+        steps: (7,) derivative of extrinsic and offset by each parameter that is held at 0, by name.
     """
 
     joint: EstimateCovariance

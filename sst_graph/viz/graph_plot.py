@@ -1,4 +1,4 @@
-"""A picture of the factor graph behind a result, drawn from what the result knows."""
+"""A picture of the factor graph of a result, drawn from the result alone."""
 
 from __future__ import annotations
 

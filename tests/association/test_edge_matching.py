@@ -107,7 +107,7 @@ def test_gate_and_bias() -> None:
     assert match_silhouettes(pair, grown, 0.0, {VEHICLE: 3.0}, KERNEL, MatchConfig()) == {}
 
 
-def test_faces_that_look_another_way_do_not_match() -> None:
+def test_contours_that_face_another_direction_do_not_match() -> None:
     points = ring()
     inward = 2.0 * points.lPs - points.outward
     half = np.arange(90) % 2 == 0

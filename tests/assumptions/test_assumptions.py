@@ -109,8 +109,8 @@ def test_several_parameters_add_up() -> None:
 
 
 @pytest.mark.parametrize("name", ASSUMPTIONS)
-def test_every_assumption_says_what_it_is(name: str) -> None:
+def test_every_assumption_has_violation_remedy_and_source(name: str) -> None:
     assumption = ASSUMPTIONS[name]
-    assert assumption.name == name and assumption.finding and assumption.remedy and assumption.source
+    assert assumption.name == name and assumption.violation and assumption.remedy and assumption.source
     assert 0.0 < assumption.sigma < assumption.span
     assert assumption.figure(0.01234, 0.004).startswith(f"{name} = 0.0123 ± 0.004")

@@ -137,7 +137,7 @@ def test_velocities_are_those_of_the_street(drive: Drive, truth: GroundTruth) ->
         assert np.linalg.norm(velocity_at(motions, k)) == pytest.approx(true_speed, rel=0.1, abs=0.1)
 
 
-def test_no_guess_no_answer(drive: Drive) -> None:
+def test_without_a_guess_there_is_no_estimate(drive: Drive) -> None:
     for method in METHODS:
         result = calibrate_prepared([drive], None, config_of(method))
         assert result.status == "unobservable" and "needs a guess" in result.reasons[0]
@@ -154,7 +154,7 @@ def test_a_camera_that_sees_no_point(drive: Drive, truth: GroundTruth) -> None:
         assert result.T_camera_lidar.equals(behind, 1e-12)
 
 
-def test_without_motion_the_paper_says_so(drive: Drive, truth: GroundTruth) -> None:
+def test_the_paper_reports_missing_motion(drive: Drive, truth: GroundTruth) -> None:
     still = dataclasses.replace(
         drive, scans=drive.scans[:5], images=drive.images[:5], image_pairs=drive.image_pairs[:4]
     )
@@ -174,7 +174,7 @@ def test_without_a_stop(drive: Drive, truth: GroundTruth) -> None:
     assert static.status != "ok" and any("no frame is known to stand" in r for r in static.reasons)
 
 
-def test_a_delay_for_each_drive_is_for_joint_only(street: Path) -> None:
+def test_time_offset_per_drive_needs_method_joint(street: Path) -> None:
     settings = dataclasses.replace(config_of("paper"), time_offset_per_drive=True)
     with pytest.raises(ConfigError, match="time_offset_per_drive needs method joint, found paper"):
         calibrate(open_source(street), gtsam.Pose3(), settings)

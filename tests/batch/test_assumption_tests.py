@@ -13,8 +13,8 @@ from streets import crowded_street
 
 from sst_graph.assumptions import ASSUMPTIONS
 from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
-from sst_graph.batch.answer import Guess
-from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects
+from sst_graph.batch.assumption_tests import LinearProblem, SolvedProblem, few_objects_factor
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
@@ -71,18 +71,18 @@ def test_the_parts_of_the_sigmas_add_up(clean: CalibrationResult) -> None:
 
 @pytest.mark.parametrize("k1", [-0.1])
 def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
-    bent = prepared(k1)
-    plain = calibrated(bent)
+    distorted = prepared(k1)
+    plain = calibrated(distorted)
     assert plain.status == "not_converged"
     assert any("k1 = " in reason for reason in plain.reasons)
     assert plain.diagnostics["assumptions"]["k1"]["estimate"] == pytest.approx(k1, abs=0.02)
     config = dataclasses.replace(CONFIG, assumptions=AssumptionConfig(estimate=("k1",)))
-    result = calibrated(bent, config)
+    result = calibrated(distorted, config)
     found = result.diagnostics["estimated"]["k1"]
     assert found["value"] == pytest.approx(k1, abs=5.0 * found["sigma"]) and found["sigma"] < 0.02
     # Points beyond the radius at which the lens would turn back tell nothing of it.
     assert found["sigma"] > 0.002
-    # What the labels say of k1 where nothing is bent is in both.
+    # What the labels say of k1 where nothing is distorted is in both.
     rotation_deg, translation_m = difference(result, calibrated(prepared(), config))
     assert rotation_deg < 0.1 and translation_m < 0.015
 
@@ -113,7 +113,7 @@ def problem() -> SolvedProblem:
     return SolvedProblem(problem, solve_joint(short, guess, (5.0, 3.0)))
 
 
-def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(problem: SolvedProblem) -> None:
+def test_the_linear_problem_agrees_with_a_solution_for_each_parameter(problem: SolvedProblem) -> None:
     linear = LinearProblem.of(problem, ["k1", "cx", "skew"])
     for name in ("k1", "skew"):
         start = dataclasses.replace(problem.solution.state, nuisances={name: 0.0})
@@ -121,7 +121,7 @@ def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(probl
         robust = robust_covariance(alone.graph, alone.values, alone.pairs, alone.state, problem.objects)
         column = robust.unknowns.column(nuisance_key(name))
         sigma = np.sqrt(robust.matrix[column, column])
-        few = few_objects(int(robust.table.objects.max()) + 1, 3.3)
+        few = few_objects_factor(int(robust.table.objects.max()) + 1, 3.3)
         found = linear.alone(name, CONFIG.assumptions)
         assert found.value == pytest.approx(alone.state.nuisances[name], abs=0.5 * sigma)
         assert found.sigma == pytest.approx(few * sigma, rel=0.4)
@@ -129,8 +129,8 @@ def test_one_linear_problem_tells_what_a_solution_for_each_parameter_tells(probl
 
 def test_the_table_counts_what_was_found() -> None:
     def one(case: str, size: float, status: str, error: float, against: tuple[str, ...]) -> Run:
-        errors, told = np.full(7, error), {"k1": (size, 0.01), "cx": (0.0, 5.0)}
-        return Run(1, case, size, status, errors, np.eye(7), told, against)
+        errors, estimates = np.full(7, error), {"k1": (size, 0.01), "cx": (0.0, 5.0)}
+        return Run(1, case, size, status, errors, np.eye(7), estimates, against)
 
     text = table(
         [
@@ -146,10 +146,10 @@ def test_the_table_counts_what_was_found() -> None:
     assert "- clean: 1 runs, 0 contradicted, 0 not ok, 0 silent" in text
 
 
-def test_rows_count_sizes_in_deviations_where_asked() -> None:
+def test_rows_count_sizes_in_deviations_with_in_sigmas() -> None:
     def one(seed: int, case: str, size: float) -> Run:
-        told = {"k1": (size, 0.01 * seed)}
-        return Run(seed, case, size, "ok", np.zeros(7), np.eye(7), told, ())
+        estimates = {"k1": (size, 0.01 * seed)}
+        return Run(seed, case, size, "ok", np.zeros(7), np.eye(7), estimates, ())
 
     runs = [one(seed, CLEAN, 0.0) for seed in (1, 3)]
     runs += [one(seed, "k1", sign * 0.05 * seed) for seed in (1, 3) for sign in (1.0, -1.0)]
@@ -173,23 +173,23 @@ def test_a_wrong_focal_length_is_contradicted() -> None:
 def test_a_wider_assumption_gives_a_wider_covariance(clean: CalibrationResult) -> None:
     wide = with_overrides(CONFIG, ["assumptions.focal=0.01", "assumptions.test=false"])
     result = calibrated(prepared(), wide)
-    report, told = result.diagnostics["assumptions"], clean.diagnostics["assumptions"]
+    report, estimates = result.diagnostics["assumptions"], clean.diagnostics["assumptions"]
     assert "estimate" not in report["focal"]
     # Untested, all other assumptions keep their prior deviations.
     for name, entry in report.items():
         assert entry["sigma"] == CONFIG.assumptions.sigma(name) or name == "focal"
-    sensitivities = {name: np.array(told[name]["sensitivity"]) for name in ASSUMPTIONS}
+    sensitivities = {name: np.array(estimates[name]["sensitivity"]) for name in ASSUMPTIONS}
     gained = np.diag(result.covariance - clean.covariance)
     expected = sum(
-        (report[name]["sigma"] ** 2 - told[name]["sigma"] ** 2) * sensitivities[name] ** 2
+        (report[name]["sigma"] ** 2 - estimates[name]["sigma"] ** 2) * sensitivities[name] ** 2
         for name in ASSUMPTIONS
     )
     np.testing.assert_allclose(gained, expected, rtol=2e-3, atol=1e-9)
 
 
-def test_few_objects_ask_for_more() -> None:
-    assert few_objects(1000, 3.3) == pytest.approx(1.0, abs=0.01)
-    assert few_objects(9, 3.3) == few_objects(3, 3.3) > few_objects(20, 3.3) > 1.1
+def test_few_objects_raise_the_deviation() -> None:
+    assert few_objects_factor(1000, 3.3) == pytest.approx(1.0, abs=0.01)
+    assert few_objects_factor(9, 3.3) == few_objects_factor(3, 3.3) > few_objects_factor(20, 3.3) > 1.1
 
 
 @pytest.mark.parametrize(

@@ -13,14 +13,14 @@ import pytest
 from stored import simulated
 
 from sst_graph import CalibrationConfig, open_source
-from sst_graph.batch.answer import Guess
 from sst_graph.batch.calibrate import calibrate_prepared, prepare_drives
 from sst_graph.batch.contradictions import find_contradictions
+from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.motion_factor import fuse_motion
 from sst_graph.batch.part_solver import Part, PartSolver, SolvedPart
-from sst_graph.batch.problem import CalibrationProblem, Estimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.config import with_overrides
-from sst_graph.covariance.contradiction import PartAnswer
+from sst_graph.covariance.contradiction import PartEstimate
 from sst_graph.drive.preparation import Drive
 from sst_graph.graph.outer_loop import JointConfig, solve_joint
 from sst_graph.graph.state import State
@@ -207,7 +207,7 @@ def test_the_offset_of_every_drive_counts() -> None:
         assert offsets["standing"] > 3.0 * CONFIG.observability.offset_s > offsets["moving"]
 
 
-def test_parts_carry_the_tracks_of_their_scans() -> None:
+def test_parts_have_the_tracks_of_their_scans() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     parts, scans = parts_of(drives, STREET.time_offset_s), (3, 4, 5, 6, 10, 11)
     tracks = parts.problem.tracks.part(0, scans)
@@ -223,7 +223,7 @@ def test_parts_carry_the_tracks_of_their_scans() -> None:
     assert support.shape == (6,) and (support > 0.0).all()
 
 
-def test_a_part_without_labels_in_common_says_nothing() -> None:
+def test_a_part_without_common_labels_has_no_estimate() -> None:
     drives = prepare_drives([Edited(street(), frames_of())], CONFIG)
     blank = replace(drives[0], images=tuple(replace(image, contours={}) for image in drives[0].images))
     parts = parts_of([blank], STREET.time_offset_s)
@@ -239,12 +239,12 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     solution = solve_joint(joint, parts.reference, (5.0, 3.0))
     sigmas = np.array([0.001] * 3 + [0.01] * 3 + [0.003])
     sure = np.diag(np.array([0.01] * 3 + [1.0] * 3 + [0.01]) ** 2)
-    agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartAnswer(np.zeros(7), sure))
+    agrees = SolvedPart(Part(0, (0, 1, 2, 3)), solution.state, PartEstimate(np.zeros(7), sure))
     away = np.zeros(7)
     away[1] = np.radians(20.0)
-    differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartAnswer(away, np.diag(sigmas**2)))
+    differs = SolvedPart(Part(0, (4, 5, 6, 7)), solution.state, PartEstimate(away, np.diag(sigmas**2)))
     for stretches, used in (([agrees], True), ([agrees, differs], False)):
-        labels = replace(Estimate.of(solution, objects), covariance=np.diag(sigmas**2))
+        labels = replace(JointEstimate.of(solution, objects), covariance=np.diag(sigmas**2))
         found = fuse_motion(parts.problem, labels, stretches)
         assert bool(found.diagnostics.get("fused")) is used
         assert (found.estimate is labels) is not used

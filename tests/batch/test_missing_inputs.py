@@ -24,8 +24,8 @@ def test_a_drive_with_gaps_is_calibrated(tmp_path: Path, capsys: pytest.CaptureF
     out = tmp_path / "out"
     assert main(["calibrate", str(tmp_path / "street"), "--out", str(out)]) == 3
     lines = capsys.readouterr().err.splitlines()
-    told = [line for line in lines if "left out" in line]
-    assert len(told) == 1 and "1 images without mask, 1 images without picture" in told[0]
+    warnings = [line for line in lines if "left out" in line]
+    assert len(warnings) == 1 and "1 images without mask, 1 images without picture" in warnings[0]
     document = json.loads((out / "calibration.json").read_text())
     assert document["diagnostics"]["left_out"] == {
         "street/00": {

@@ -31,7 +31,8 @@ def test_a_slow_drive_with_a_stop(shift: int, status: str) -> None:
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(("use_motion", "status"), [("auto", "unobservable"), ("always", "ok")])
 def test_a_steady_drive(use_motion: str, status: str) -> None:
-    """At one speed the labels cannot tell forward from later; the pitching body can, where it is heard."""
+    """At one speed the labels do not separate forward and time offset; the pitching of the body does, where
+    motion is used."""
     drive = open_source(PARKED, image_shift=1)
     result = calibrate(
         drive, drive.nominal, with_overrides(CalibrationConfig(), [f"use_motion={use_motion}"])

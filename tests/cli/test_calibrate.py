@@ -62,13 +62,13 @@ def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest
 
     assert main(["inspect", str(out), "--json"]) == 0
     inspection = json.loads(capsys.readouterr().out)
-    told = [(frame["drive"], frame["frame"]) for frame in inspection["frames"]]
+    inspected = [(frame["drive"], frame["frame"]) for frame in inspection["frames"]]
     used = [(frame["drive"], frame["frame"]) for frame in document["frames_used"]]
-    assert set(told) <= set(used) and len(told) >= 0.9 * len(used)
+    assert set(inspected) <= set(used) and len(inspected) >= 0.9 * len(used)
     assert inspection["frames"][-1]["sigma_ratio_so_far"] == [1.0] * 7
 
 
-def test_what_cannot_be_told_is_said(
+def test_an_unobservable_direction_is_reported(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "result"
@@ -98,7 +98,7 @@ def test_no_guess_at_all(street: Path, tmp_path: Path) -> None:
     assert list((tmp_path / "result").glob("*.png"))
 
 
-def test_nothing_is_replaced_unasked(
+def test_nothing_is_replaced_without_overwrite(
     street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "result"

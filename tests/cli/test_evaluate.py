@@ -107,7 +107,7 @@ def test_overlay_writes_a_picture(result_file: Path, kitti_drive: Path, tmp_path
     assert picture.shape[1] >= 720 and picture.shape[0] > 2 * 6 * (720 // 8)
 
 
-def test_overlay_replaces_only_when_told(
+def test_overlay_replaces_only_with_overwrite(
     result_file: Path, kitti_drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "picture.png"

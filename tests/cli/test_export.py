@@ -68,7 +68,7 @@ def test_a_result_that_is_not_ok_needs_force(result_file: Path, capsys: pytest.C
     assert "STATUS unobservable" in forced.out and "timeshift_cam_imu: 0.1" in forced.out
 
 
-def test_replaces_only_when_told(
+def test_replaces_only_with_overwrite(
     result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "tf.yaml"

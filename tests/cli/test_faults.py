@@ -68,7 +68,7 @@ def test_a_killed_tracker_resumes_to_the_same_bytes(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_the_work_without_a_trace(bench: Bench, number: int) -> None:
+def test_a_signal_leaves_no_unfinished_output(bench: Bench, number: int) -> None:
     _holds(ended_by(bench, COMMANDS["simulate"], number, [0.85]))
 
 

@@ -81,7 +81,7 @@ def test_an_overlay_pairs_as_the_calibration_did(
     assert np.abs(shown.astype(int) - cv2.imread(str(tmp_path / "c.png"))).max() > 50
 
 
-def test_other_pairs_are_refused_and_other_measurements_said(
+def test_other_pairs_are_refused_and_other_measurements_reported(
     street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["overlay", str(shifted), str(street), "--out", str(tmp_path / "a.png")]
@@ -93,7 +93,7 @@ def test_other_pairs_are_refused_and_other_measurements_said(
     assert "was made with --sweep auto, found --sweep instant" in capsys.readouterr().err
 
 
-def test_a_start_of_other_pairs_is_said(
+def test_a_start_of_other_pairs_is_reported(
     street: Path, shifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     start = str(shifted / "calibration.json")
@@ -104,7 +104,7 @@ def test_a_start_of_other_pairs_is_said(
     assert "warning" not in capsys.readouterr().err
 
 
-def test_a_truth_of_other_pairs_is_said(
+def test_a_truth_of_other_pairs_is_reported(
     street: Path, shifted: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     truth = street / "sequences" / "00" / "groundtruth.json"

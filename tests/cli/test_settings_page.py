@@ -16,6 +16,6 @@ def test_there_are_few_enough_to_read() -> None:
     assert len(ENTRIES) <= 60
 
 
-def test_every_setting_says_what_it_is() -> None:
+def test_every_setting_has_a_text() -> None:
     assert [entry.name for entry in ENTRIES if not entry.doc.endswith(".")] == []
     assert len({entry.doc for entry in ENTRIES}) == len(ENTRIES)

@@ -74,7 +74,7 @@ def test_bad_settings(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_nothing_is_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_replaced_without_overwrite(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "drive"
     assert main(["simulate", str(out), "--seed", "1", *SMALL]) == 0
     before = (

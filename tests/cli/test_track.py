@@ -175,7 +175,7 @@ def test_resumed_on_another_drive(
         assert captured.out == "" and "another drive (another scan of" in captured.err
 
 
-def test_resumed_with_nothing_said_or_the_same_said(
+def test_resumed_without_options_or_with_the_same(
     street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Settings that are not named are the checkpoint's; those that are, are its own."""

@@ -1,4 +1,4 @@
-"""What is considered of a parameter after the data were heard, against its generative model."""
+"""What is considered of a parameter given the data, against its generative model."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 K1 = Evidence(estimate=0.0, deviation=0.008, prior=0.001, span=0.3, prevalence=0.5)
 
 
-def told(estimate: float, **change: float) -> float:
+def considered_sigma(estimate: float, **change: float) -> float:
     return considered_sigmas({"k1": dataclasses.replace(K1, estimate=estimate, **change)})["k1"]
 
 
@@ -36,36 +36,36 @@ def test_the_mean_square_is_that_of_drawn_parameters(
 ) -> None:
     thetas, seen = drawn
     alike = np.abs(seen - estimate) < 0.05 * K1.deviation
-    assert told(estimate) == pytest.approx(np.sqrt((thetas[alike] ** 2).mean()), rel=0.05)
+    assert considered_sigma(estimate) == pytest.approx(np.sqrt((thetas[alike] ** 2).mean()), rel=0.05)
 
 
-def test_the_more_the_data_complain_the_more_is_considered() -> None:
-    sigmas = [told(score * K1.deviation) for score in (0.0, 1.0, 2.0, 3.0, 5.0)]
+def test_the_considered_sigma_grows_with_the_estimate() -> None:
+    sigmas = [considered_sigma(score * K1.deviation) for score in (0.0, 1.0, 2.0, 3.0, 5.0)]
     assert (np.diff(sigmas) > 0.0).all()
     # Data that contradict the assumption leave nothing of the prior.
     assert sigmas[-1] == pytest.approx(5.0 * K1.deviation, rel=0.1)
 
 
-def test_what_the_data_know_well_stays_as_it_is() -> None:
-    assert told(0.0, deviation=1e-5) == K1.prior
+def test_a_well_determined_parameter_keeps_its_prior() -> None:
+    assert considered_sigma(0.0, deviation=1e-5) == K1.prior
 
 
 def test_an_assumption_that_is_hardly_ever_broken_keeps_its_prior() -> None:
-    assert told(0.008, prevalence=1e-6) == pytest.approx(K1.prior, rel=1e-2)
+    assert considered_sigma(0.008, prevalence=1e-6) == pytest.approx(K1.prior, rel=1e-2)
 
 
 def test_what_holds_exactly_is_never_considered() -> None:
-    assert told(0.1, prior=0.0) == 0.0
+    assert considered_sigma(0.1, prior=0.0) == 0.0
 
 
-def test_two_explanations_share_one_oddity() -> None:
+def test_two_assumptions_share_one_deviation() -> None:
     seen = dataclasses.replace(K1, estimate=0.02, prevalence=0.2)
     alone, both = considered_sigmas({"a": seen}), considered_sigmas({"a": seen, "b": seen})
     assert K1.prior < both["b"] == both["a"] < alone["a"]
 
 
-def test_an_oddity_without_end_is_still_a_number() -> None:
-    assert told(1e6) == pytest.approx(1e6 * (0.3**2 / (0.3**2 + 0.008**2)), rel=0.1)
+def test_a_huge_estimate_gives_a_finite_sigma() -> None:
+    assert considered_sigma(1e6) == pytest.approx(1e6 * (0.3**2 / (0.3**2 + 0.008**2)), rel=0.1)
 
 
 def test_all_assumptions_together_leave_room_for_none_broken() -> None:

@@ -1,4 +1,4 @@
-"""Differences of answers against their covariance: probabilities, directions that count, words."""
+"""Differences of estimates against their covariance: probabilities, directions that count, words."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from sst_graph.covariance.contradiction import Difference, PartAnswer, combined, name_step
+from sst_graph.covariance.contradiction import Difference, PartEstimate, combined, name_step
 
 SIGMAS = np.array([0.001] * 3 + [0.01] * 3 + [0.002])
 FORWARD = gtsam.Pose3(
@@ -18,8 +18,8 @@ FORWARD = gtsam.Pose3(
 )
 
 
-def part(step: np.ndarray, sigmas: np.ndarray = SIGMAS, clusters: float = np.inf) -> PartAnswer:
-    return PartAnswer(step, np.diag(sigmas**2), clusters)
+def part(step: np.ndarray, sigmas: np.ndarray = SIGMAS, clusters: float = np.inf) -> PartEstimate:
+    return PartEstimate(step, np.diag(sigmas**2), clusters)
 
 
 def test_the_length_is_chi_squared_where_covariances_are_known() -> None:
@@ -39,7 +39,7 @@ def test_probabilities_hold_for_covariances_from_few_clusters() -> None:
         parts = []
         for _ in range(2):
             samples = SIGMAS * rng.normal(size=(14, 7))
-            parts.append(PartAnswer(samples.mean(axis=0), np.cov(samples.T) / 14, 14))
+            parts.append(PartEstimate(samples.mean(axis=0), np.cov(samples.T) / 14, 14))
         difference = Difference.of(*parts)
         p_values.append(difference.p_value)
         naive.append(replace(difference, freedom=np.inf).p_value)

@@ -56,11 +56,11 @@ def test_independent_pairs_count_as_such(white: np.ndarray) -> None:
     assert _ratios(white[1:]) == pytest.approx(np.ones(7), abs=0.45)
 
 
-def test_neighbours_that_err_together_count_less(white: np.ndarray) -> None:
+def test_correlated_neighbours_count_less(white: np.ndarray) -> None:
     together = (white[1:] + white[:-1]) / np.sqrt(2.0)
     assert 1.3 < np.mean(_ratios(together)) < 2.2
 
 
-def test_neighbours_that_cancel_count_more_but_not_without_end(white: np.ndarray) -> None:
+def test_neighbours_that_cancel_count_more_up_to_a_bound(white: np.ndarray) -> None:
     ratios = _ratios((white[1:] - white[:-1]) / np.sqrt(2.0))
     assert ratios == pytest.approx(np.full(7, 1.0 - MOST_TAKEN_OFF), abs=1e-6)

@@ -30,7 +30,7 @@ def test_a_good_covariance_has_none() -> None:
     assert weak_directions(GOOD, CTL, CONFIG) == ()
 
 
-def test_forward_against_delay() -> None:
+def test_forward_and_time_offset_are_named_together() -> None:
     # At 8 m/s, 1 m forward equals 125 ms; along the LiDAR's x axis.
     step = np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0, 0.05])
     (weak,) = weak_directions(with_direction(step), CTL, CONFIG)
@@ -54,7 +54,7 @@ def test_what_hardly_separates_must_be_known_better() -> None:
     assert weak_directions(sure + np.outer(0.5 * tied, 0.5 * tied), CTL, CONFIG) == ()
 
 
-def test_what_stands_alone_must_separate_offset_and_translation() -> None:
+def test_static_objects_alone_must_separate_offset_and_translation() -> None:
     """Only what ties the two as closely as constant speed counts, and only past the limits."""
     tied = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     (weak,) = inseparable_directions(with_direction(tied), CTL, CONFIG)
@@ -69,7 +69,7 @@ def test_what_stands_alone_must_separate_offset_and_translation() -> None:
     assert len(inseparable_directions(with_direction(tied) + np.outer(alone, alone), CTL, CONFIG)) == 1
 
 
-def test_the_other_sign_of_the_delay() -> None:
+def test_the_other_sign_of_the_time_offset() -> None:
     (weak,) = weak_directions(with_direction(np.array([0.0, 0.0, 0.0, 0.4, 0.0, 0.0, -0.05])), CTL, CONFIG)
     # Forward and earlier is the same line as backward and later.
     forward, later = "shifted forward" in weak.sentence, "later" in weak.sentence

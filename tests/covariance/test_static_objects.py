@@ -9,7 +9,7 @@ import numpy as np
 from streets import prepared_street, standing_street
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.answer import Answer, Guess, result_of
+from sst_graph.batch.method_estimate import Guess, MethodEstimate, result_of
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.factors import RobustKernel
@@ -73,7 +73,7 @@ def test_where_nothing_moves_it_is_the_whole_one() -> None:
     assert static_covariance(robust, pairs) is robust.matrix
 
 
-def test_what_only_moving_objects_tell_is_not_called_known() -> None:
+def test_what_only_dynamic_objects_determine_is_unobservable() -> None:
     good = np.diag(np.array([1e-3] * 3 + [0.01] * 3 + [0.0005]) ** 2)
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     for by_static_objects, status in (
@@ -81,7 +81,9 @@ def test_what_only_moving_objects_tell_is_not_called_known() -> None:
         (good, "ok"),
         (good + np.outer(step, step), "unobservable"),
     ):
-        answer = Answer(standing_street().truth.cTl, 0.1, good, (), by_static_objects=by_static_objects)
+        answer = MethodEstimate(
+            standing_street().truth.cTl, 0.1, good, (), by_static_objects=by_static_objects
+        )
         result = result_of(answer, [prepared_street()], Guess(gtsam.Pose3()), CalibrationConfig())
         assert result.status == status
     assert "by static objects alone" in result.reasons[0] and len(result.weak_directions) == 1

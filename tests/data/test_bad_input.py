@@ -291,7 +291,7 @@ def test_points_that_are_no_numbers_are_left_out_with_their_labels_and_times(
     assert drive_.left_out.counts() == {"points": 2, "scans_with_such_points": 1}
 
 
-def test_nothing_missing_is_nothing_to_say(drive: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_complete_data_report_nothing_missing(drive: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", "sst_graph"):
         assert prepare_drive(open_source(drive), (SemanticClass.VEHICLE,)).left_out.counts() == {}
     assert caplog.records == []

@@ -121,9 +121,7 @@ def test_damaged_pictures_are_refused_and_nothing_is_printed(
         joined([*chunks(encoded(".png"))[:1], (b"iCCP", b"bad\0\0"), *chunks(encoded(".png"))[1:]]),
     ],
 )
-def test_whole_pictures_are_read_in_silence(
-    tmp_path: Path, data: bytes, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_whole_pictures_print_nothing(tmp_path: Path, data: bytes, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "a"
     path.write_bytes(data)
     assert picture_size(path) == (WIDTH, HEIGHT)

@@ -21,7 +21,7 @@ def street() -> SimulatedDrive:
     )
 
 
-def test_it_says_of_the_sweep_what_the_source_says(street: SimulatedDrive) -> None:
+def test_a_kept_drive_has_the_sweep_of_its_source(street: SimulatedDrive) -> None:
     assert KeptDrive.of(street).sweep == street.sweep == "compensated"
     assert KeptDrive.of(street, sweep="auto").sweep == "auto"
 

@@ -103,13 +103,13 @@ def prepared() -> Drive:
     return one
 
 
-@pytest.mark.parametrize(("turn_s", "told"), [(0.1, False), (0.2, False), (1.0, True)])
-def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, told: bool) -> None:
+@pytest.mark.parametrize(("turn_s", "reported"), [(0.1, False), (0.2, False), (1.0, True)])
+def test_scans_as_measured_of_a_turn_that_no_scanner_needs(turn_s: float, reported: bool) -> None:
     """Stamps ten times too far apart: what was measured in a tenth of a second seems to take a whole one."""
     for sense, fraction in (("clockwise", -1.0), ("counterclockwise", 1.0)):
         decision = SweepDecision(sense, SweepTiming(fraction, np.pi, turn_s))  # type: ignore[arg-type]
         found = stamps(replace(prepared(), sweep=decision))
-        assert (found is not None and "run too fast" in found.cause) == told
+        assert (found is not None and "run too fast" in found.cause) == reported
     # Compensated clouds of a drive of which every tenth scan was kept.
     sparse = replace(prepared(), sweep=SweepDecision("compensated", SweepTiming(0.0, np.pi, turn_s)))
     assert stamps(sparse) is None
@@ -183,7 +183,7 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
 
 
 @pytest.mark.parametrize("fault", ["masks of another drive", "clouds in camera axes"])
-def test_what_shows_only_once_a_result_is_doubted(fault: str) -> None:
+def test_checks_that_run_only_where_a_result_is_not_ok(fault: str) -> None:
     """Neither is certain by itself: masks may be coarse, and a scanner may be mounted on its side."""
     wrong = INPUT_FAULTS[fault](drive(), other())
     assert causes(wrong) == []
@@ -191,7 +191,7 @@ def test_what_shows_only_once_a_result_is_doubted(fault: str) -> None:
     assert result.status != "ok" and NAMED[fault] in result.reasons[0]
 
 
-def test_without_the_search_for_causes_the_doubts_stand_alone() -> None:
+def test_without_the_search_for_causes_only_the_reasons_remain() -> None:
     wrong = INPUT_FAULTS["Tr inverted"](drive(), other())
     result = calibrate(wrong, wrong.nominal, CalibrationConfig(find_causes=False))
     assert result.status != "ok" and not any("inverted" in reason for reason in result.reasons)
@@ -220,7 +220,7 @@ def test_a_common_shift_is_measured(right: int, down: int) -> None:
     assert abs(found.down_px - down) < 4.0 * found.sigma_px[1] < 1.6
 
 
-def test_blank_pictures_tell_no_shift() -> None:
+def test_blank_pictures_determine_no_shift() -> None:
     mask, picture = scene(1)
     assert mask_shift(contour_profiles(mask, np.zeros_like(picture), SemanticClass.VEHICLE)) is None
 
@@ -244,7 +244,7 @@ def test_pictures_of_another_size(scale: float, name: str) -> None:
     camera = PinholeCamera(721.0, 721.0, 609.6, 172.9, round(1242 * scale), round(375 * scale))
     finding = image_size(camera)
     assert finding is not None and f"the pictures are {name} the size" in finding.cause
-    # The principal point tells the ratio to some per cent only.
+    # The principal point determines the ratio to some per cent only.
     ratio = re.search(r"\(about ([0-9.]+)\)", finding.check)
     assert ratio is not None and abs(float(ratio[1]) / scale - 1.0) < 0.05
 
@@ -252,7 +252,7 @@ def test_pictures_of_another_size(scale: float, name: str) -> None:
 CTL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.array([0.05, -0.08, -0.27]))
 
 
-def test_an_answer_beside_the_start_is_another_camera() -> None:
+def test_a_result_a_baseline_from_the_start_is_another_camera() -> None:
     covariance = np.eye(7) * 0.01**2
     right = gtsam.Pose3(gtsam.Rot3(), np.array([-0.54, 0.0, 0.0])) * CTL
     finding = other_camera(CTL, right, covariance)
@@ -277,7 +277,7 @@ def test_angles_in_the_wrong_unit(degrees: bool, words: str, sequence: str) -> N
     assert found is not None and words in found.cause
 
 
-def test_an_unclear_search_blames_no_start() -> None:
+def test_an_ambiguous_search_reports_no_wrong_start() -> None:
     behind = CTL * gtsam.Pose3(gtsam.Rot3.Rz(np.pi), np.zeros(3))
     clear, unclear = Fit(behind, 0.0, 0.6, 0.8), Fit(behind, 0.0, 0.35, 0.6)
     found = wrong_start(CTL, clear)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from streets import prepared_street
 
 from sst_graph.batch import CalibrationConfig
-from sst_graph.batch.answer import Answer, Guess, result_of
+from sst_graph.batch.method_estimate import Guess, MethodEstimate, result_of
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import FrameIntervals, Jump, StampMonitor, jumps_of
 
@@ -78,7 +78,7 @@ def test_images_sent_twice_are_no_jump() -> None:
     assert not jumps(np.sort(np.concatenate([steady(), steady()[20::7]])))
 
 
-def test_a_hiccup_that_is_caught_up_is_no_jump() -> None:
+def test_a_pause_that_is_caught_up_is_no_jump() -> None:
     stamps = steady(jitter_ms=0.2)
     stamps[40:44] += np.array([60, 45, 30, 15]) * 1_000_000
     assert not jumps(stamps)
@@ -155,7 +155,7 @@ def long_drive(milliseconds: float) -> Drive:
 
 
 def test_a_drive_whose_clock_jumps_has_no_one_offset() -> None:
-    answer = Answer(gtsam.Pose3(), 0.0, 1e-8 * np.eye(7), ())
+    answer = MethodEstimate(gtsam.Pose3(), 0.0, 1e-8 * np.eye(7), ())
     for milliseconds, check, status in (
         (0.0, True, "ok"),
         (30.0, False, "ok"),

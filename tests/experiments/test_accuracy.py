@@ -105,7 +105,7 @@ def test_drives_without_data_are_refused() -> None:
         drives.run(DrivesConfig())
 
 
-def test_spread_and_median_of_answers() -> None:
+def test_spread_and_median_of_results() -> None:
     turned = [gtsam.Pose3(gtsam.Rot3.Rz(np.radians(a)), np.zeros(3)) for a in (0.0, 0.5, -0.25)]
     answers = [SimpleNamespace(T_camera_lidar=pose) for pose in turned]
     assert drives._spread_deg(answers) == pytest.approx(0.75)

@@ -47,7 +47,7 @@ def test_what_did_not_converge_or_is_wrong_is_counted_and_left_out() -> None:
     assert float(cells[5]) == pytest.approx(1.0) and cells[7].count("%") == 3
 
 
-def test_the_offset_of_a_drive_that_stands_is_not_judged() -> None:
+def test_the_offset_of_a_drive_at_standstill_is_left_out() -> None:
     moving = Run(np.full(7, 0.01), np.eye(7) * 1e-4, False)
     error = np.append(np.full(6, 0.01), 0.0)
     standing = Run(error, np.eye(7) * 1e-4, False, offset_observable=False)

@@ -29,7 +29,7 @@ def test_marginals_miss_by_more_the_more_drives_disagree(script: ModuleType) -> 
 
 
 @pytest.mark.parametrize("apart", [0.0, 8.0])
-def test_rounds_come_to_the_joint_answer(script: ModuleType, apart: float) -> None:
+def test_rounds_converge_to_the_joint_estimate(script: ModuleType, apart: float) -> None:
     _, misses = script.pair(1, apart)
     assert misses == sorted(misses, reverse=True)
     assert misses[-1] < 0.005

@@ -45,13 +45,13 @@ def drawn_results(template: CalibrationResult, count: int, claimed: float) -> li
 
 
 @pytest.mark.parametrize("claimed", [1.0, 0.5])
-def test_the_spread_of_drawn_answers_is_what_was_drawn(claimed: float) -> None:
+def test_the_spread_of_drawn_results_is_that_of_the_draws(claimed: float) -> None:
     template = CalibrationResult(gtsam.Pose3(), 0.0, np.eye(7), "ok", standing_street().camera)
     deviations, covariances = deviations_of(drawn_results(template, 200, claimed))
     assert spread_in_sigmas(deviations, covariances) == pytest.approx([1.0 / claimed] * 3, rel=0.08)
 
 
-def test_doubted_answers_are_left_out() -> None:
+def test_results_that_are_not_converged_are_left_out() -> None:
     template = CalibrationResult(gtsam.Pose3(), 0.0, np.eye(7), "ok", standing_street().camera)
     results = drawn_results(template, 4, 1.0)
     far = replace(results[0], time_offset_s=5.0, status="not_converged")

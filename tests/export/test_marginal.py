@@ -244,16 +244,16 @@ def test_fusing_two_drives_equals_the_joint_batch() -> None:
 @pytest.mark.parametrize("seeds", [(3, 4), (5, 6), (7, 8)])
 def test_fusing_drives_through_marginals_equals_one_graph_of_both(seeds: tuple[int, int]) -> None:
     # Each drive linearized at its own optimum: thousandths to hundredths of a sigma from the joint LM, for
-    # the frozen graphs are not quadratic. Marginals taken anew at the fused point close the gap.
+    # the frozen graphs are not quadratic. Marginals taken again at the fused point close the gap.
     drives = []
     for seed in seeds:
         graph, start = drive(seed, 20)
         drives.append((graph, _optimum(graph, start)))
-    answer = _batch(drives)
+    joint = _batch(drives)
     first = [marginal_of_graph(graph, at) for graph, at in drives]
-    assert in_sigmas(fuse_marginals(first), *answer) < 0.03 < in_sigmas(first[0], *answer)
+    assert in_sigmas(fuse_marginals(first), *joint) < 0.03 < in_sigmas(first[0], *joint)
     fused, parts = fuse_graphs(drives)
-    assert in_sigmas(fused, *answer) < 1e-3
+    assert in_sigmas(fused, *joint) < 1e-3
     # the parts stand about the fused point, and there they add up to it
     for part in parts:
         assert np.linalg.norm(part.cTl.localCoordinates(fused.cTl)) < 1e-6
@@ -263,10 +263,10 @@ def test_fusing_drives_through_marginals_equals_one_graph_of_both(seeds: tuple[i
 
 def test_a_stored_marginal_follows_the_second_drive() -> None:
     # one after the other: the first drive's marginal goes as a factor into the second one's graph, is then
-    # asked for anew where that ends, and goes in again
+    # made again where that ends, and goes in again
     (one, at_one), (two, start) = drive(3, 20), drive(4, 20)
     at_one = _optimum(one, at_one)
-    answer = _batch([(one, at_one), (two, start)])
+    joint = _batch([(one, at_one), (two, start)])
     distances, point = [], None
     for _ in range(4):
         stored = CalibrationMarginal.from_json(marginal_of_graph(one, at_one, at=point).to_json())
@@ -275,17 +275,17 @@ def test_a_stored_marginal_follows_the_second_drive() -> None:
         found = _optimum(graph, start)
         point = found.atPose3(EXTRINSIC), float(found.atVector(TIME_OFFSET)[0])
         both = marginal_of_graph(graph, found)
-        distances.append(in_sigmas(both, *answer))
+        distances.append(in_sigmas(both, *joint))
     assert 1e-3 < distances[0] < 0.03 and distances[-1] < 1e-3
 
 
 def test_real_matches_of_two_simulated_drives() -> None:
     graphs = [_matched(number) for number in range(2)]
-    answer = _batch(graphs)
+    joint = _batch(graphs)
     fused, _ = fuse_graphs(graphs)
-    assert in_sigmas(fused, *answer) < 1e-3
+    assert in_sigmas(fused, *joint) < 1e-3
     alone = [marginal_of_graph(graph, values) for graph, values in graphs]
-    assert min(in_sigmas(part, *answer) for part in alone) > 0.1
+    assert min(in_sigmas(part, *joint) for part in alone) > 0.1
 
 
 def _matched(number: int) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:

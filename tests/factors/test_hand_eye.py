@@ -80,7 +80,7 @@ def test_jacobians_at_100_states(kind, with_offset):
 def test_a_weaving_drive_gives_extrinsic_and_delay_back(kind):
     offset_true, offset_0, pose = 0.08, 0.0, TRUE.retract(np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.1]))
     values = at(pose, offset_0)
-    for _ in range(3):  # outer loop: the LiDAR's motion is taken anew over the interval found
+    for _ in range(3):  # outer loop: the LiDAR's motion is taken again over the interval found
         graph, offset_0 = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
         for t1 in np.arange(0.0, 12.0, 0.5):
             c1Tc2, *lidar = pair(t1, t1 + 0.5, offset_true, offset_0)

@@ -1,6 +1,6 @@
 """The factors on poses beside odometry, IMU preintegration and GPS, under LM, iSAM2 and fixed-lag smoothers.
 
-One graph, in which nothing is told of the calibration but by the camera's factors: every solver comes to the
+One graph, in which only the camera's factors determine the calibration: every solver comes to the
 truth from a start that is off in everything.
 """
 
@@ -211,7 +211,7 @@ def test_fixed_lag_smoothers(drive, kind, combined):
         solver = gtsam.BatchFixedLagSmoother(lag_s)
     for k in range(FRAMES):
         graph, values = new_at(k, drive, combined)
-        # extrinsic, offset and the one bias are stamped anew each time, or they would leave with the lag
+        # extrinsic, offset and the one bias are stamped again each time, or they would leave with the lag
         lasting = [E, D] if combined else [E, D, IMU_BIAS]
         stamps = dict.fromkeys([*values.keys(), *lasting], k * PERIOD_S)
         solver.update(graph, values, stamps)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sst_graph.assumptions import ASSUMPTIONS
-from sst_graph.batch.assumption_tests import Finding
+from sst_graph.batch.assumption_tests import ParameterTest
 from sst_graph.drive.preparation import image_features
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.files.object_store import Block, Blocks, PackedArray, lay_out, restored, stored
@@ -166,7 +166,7 @@ def test_objects_of_the_package() -> None:
 
 
 def test_a_finding_holds_its_assumption_by_name() -> None:
-    finding = Finding(ASSUMPTIONS["k1"], 0.1, 0.02, True)
+    finding = ParameterTest(ASSUMPTIONS["k1"], 0.1, 0.02, True)
     found = _again(finding)
     assert found.assumption is ASSUMPTIONS["k1"] and found.sentence == finding.sentence
     assert (found.value, found.sigma, found.contradicted) == (0.1, 0.02, True)

@@ -43,9 +43,9 @@ def test_keys_are_distinct() -> None:
 
 def test_clocks_and_biases_of_a_state() -> None:
     shared = State(gtsam.Pose3(), (0.1,), {(0, VEHICLE): 0.5, (1, VEHICLE): -0.5}, {(0, 7): 0.8})
-    assert [shared.clock(d) for d in (0, 1)] == [0, 0] and shared.offset_s(1) == 0.1
+    assert [shared.clock(d) for d in (0, 1)] == [0, 0] and shared.time_offset_s(1) == 0.1
     own = State(gtsam.Pose3(), (0.1, 0.2))
-    assert [own.offset_s(d) for d in (0, 1)] == [0.1, 0.2]
+    assert [own.time_offset_s(d) for d in (0, 1)] == [0.1, 0.2]
     assert shared.biases_of(1) == {VEHICLE: -0.5}
     # An object's bias is its class's until it has its own.
     assert [shared.object_bias_px(0, t, VEHICLE) for t in (7, 8)] == [0.8, 0.5]
@@ -58,7 +58,7 @@ def test_part_of_the_way_to_another_state() -> None:
     there = State(gtsam.Pose3.Expmap(turn), (1.0, 1.0), {(0, VEHICLE): 3.0}, {(0, 7): 2.0, (0, 8): 5.0})
     way = here.towards(there, 0.25)
     np.testing.assert_allclose(gtsam.Pose3.Logmap(way.cTl), 0.25 * turn, atol=1e-12)
-    assert way.offsets_s == (0.25, 1.0) and way.biases_px == {(0, VEHICLE): 1.5}
+    assert way.time_offsets_s == (0.25, 1.0) and way.biases_px == {(0, VEHICLE): 1.5}
     # A bias that was not known before is taken over.
     assert way.object_biases_px == {(0, 7): 1.25, (0, 8): 5.0}
     assert here.towards(there, 1.0) is there
@@ -96,7 +96,7 @@ def test_the_optimum_is_near_the_truth_and_becomes_the_state() -> None:
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(found.cTl.between(state.cTl).rotation()))) < 0.5
     assert found.biases_px[0, VEHICLE] == optimum.atVector(bias_key(0, VEHICLE))[0]
     assert set(found.object_biases_px) == {(0, track) for _, _, track in tracked_objects(pairs)}
-    assert found.offsets_s == (optimum.atVector(time_offset_key())[0],)
+    assert found.time_offsets_s == (optimum.atVector(time_offset_key())[0],)
 
 
 def test_a_guess_is_what_the_priors_hold() -> None:
@@ -104,6 +104,6 @@ def test_a_guess_is_what_the_priors_hold() -> None:
     guess = State(state.cTl.retract(np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])), (0.25,))
     at_guess, values = joint_graph(pairs, state, CONFIG, guess)
     at_state, _ = joint_graph(pairs, state, CONFIG)
-    surplus = at_guess.error(values) - at_state.error(values)
+    excess = at_guess.error(values) - at_state.error(values)
     off = np.array([0.5 / PRIOR_ROTATION_SIGMA_RAD, 0.25 / CONFIG.time_offset_sigma_s])
-    assert surplus == pytest.approx(0.5 * off @ off, rel=1e-6)
+    assert excess == pytest.approx(0.5 * off @ off, rel=1e-6)

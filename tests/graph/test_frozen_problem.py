@@ -158,7 +158,8 @@ def test_the_optimum_is_the_graphs() -> None:
     found, expected = problem.state_at(point), state_from(optimum, state, pairs)
     sigmas = np.sqrt(np.diag(system.covariance())[:7])
     away = np.append(
-        gtsam.Pose3.Logmap(expected.cTl.between(found.cTl)), found.offsets_s[0] - expected.offsets_s[0]
+        gtsam.Pose3.Logmap(expected.cTl.between(found.cTl)),
+        found.time_offsets_s[0] - expected.time_offsets_s[0],
     )
     assert np.abs(away / sigmas).max() < 0.01
     assert found.object_biases_px.keys() == expected.object_biases_px.keys()
@@ -166,7 +167,7 @@ def test_the_optimum_is_the_graphs() -> None:
     marginals = gtsam.Marginals(graph, problem.values_at(point))
     joint = marginals.jointMarginalCovariance([EXTRINSIC, time_offset_key()])
     step = np.append(
-        gtsam.Pose3.Logmap(state.cTl.between(point.cTl)), found.offsets_s[0] - state.offsets_s[0]
+        gtsam.Pose3.Logmap(state.cTl.between(point.cTl)), found.time_offsets_s[0] - state.time_offsets_s[0]
     )
     length = float(np.sqrt(step @ np.linalg.solve(joint.fullMatrix(), step)))
     assert problem.step_sigmas(point, system) == pytest.approx(length, rel=1e-4)

@@ -261,7 +261,7 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
 
 def test_the_joint_method_hears_the_motion(street: Path) -> None:
     source = open_source(street, frames="0:12")
-    # Labels that tell the offset to 11 ms, not to 3: the motion alone tells it to 32 ms.
+    # Labels that determine the offset to 11 ms, not to 3: the motion alone determines it to 32 ms.
     weak = ["search.enabled=false", "noise.side_sigma_px=10"]
     settings = with_overrides(CalibrationConfig(), weak)
     deaf = calibrate(source, source.nominal, dataclasses.replace(settings, use_motion="never"))

@@ -28,7 +28,7 @@ from sst_graph.initialization.label_agreement import (
     States,
 )
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 from sst_graph.types import SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -66,7 +66,7 @@ def sampled(
 
 
 def scores_of(agreement: AgreementMap, states: States) -> np.ndarray:
-    return whole(agreement.score_steps(states))
+    return run_to_end(agreement.score_steps(states))
 
 
 def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3, list[Candidate]]:
@@ -74,7 +74,7 @@ def search(config: SearchConfig, stages: tuple[Stage, ...]) -> tuple[gtsam.Pose3
     turn = np.radians(15.0) * np.array([2.0, -1.0, 2.0]) / 3.0
     guess = source.truth.cTl.retract(np.concatenate([turn, [0.05, -0.05, 0.05]]))
     problem = SearchProblem(frames, source.camera, [VEHICLE], guess, 0.0, config)
-    return guess, whole(search_steps(problem, stages))
+    return guess, run_to_end(search_steps(problem, stages))
 
 
 SMALL = SearchConfig()
@@ -180,7 +180,7 @@ def test_nothing_to_search_with() -> None:
     source, frames = drive()
     problem = SearchProblem(frames, source.camera, [SemanticClass.TWO_WHEELER], None, 0.0, SMALL)
     with pytest.raises(EstimationError, match="no labelled point"):
-        whole(search_steps(problem, STAGES))
+        run_to_end(search_steps(problem, STAGES))
 
 
 @pytest.mark.parametrize("count", [3, 60, 5000])

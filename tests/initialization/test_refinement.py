@@ -13,7 +13,7 @@ from sst_graph.graph.outer_loop import KERNELS_PX, JointConfig, JointProblem, so
 from sst_graph.graph.state import State
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 from sst_graph.types import SemanticClass
 
 JOINT = JointConfig()
@@ -26,11 +26,11 @@ def problem(*drives: Drive) -> RefinementProblem:
 
 def refined(drive: Drive, start: Poses) -> Poses:
     """Under all kernels, and some more steps under the last one."""
-    return whole(refine_steps(problem(drive), start, start, (*KERNELS_PX, *[KERNELS_PX[-1]] * 8)))
+    return run_to_end(refine_steps(problem(drive), start, start, (*KERNELS_PX, *[KERNELS_PX[-1]] * 8)))
 
 
 def equations(of: RefinementProblem, poses: Poses, scale_px: float) -> BatchEquations:
-    return whole(of.equation_steps(poses, scale_px))
+    return run_to_end(of.equation_steps(poses, scale_px))
 
 
 def around(*degrees: tuple[float, float, float]) -> Poses:
@@ -83,7 +83,7 @@ def test_nothing_in_view_stays_with_its_prior() -> None:
     )
     steps = equations(problem(prepared_street()), far, 20.0)
     assert steps.seen[0] == 0.0 and not steps.H.any()
-    moved = whole(refine_steps(problem(prepared_street()), far, far, (20.0,)))
+    moved = run_to_end(refine_steps(problem(prepared_street()), far, far, (20.0,)))
     np.testing.assert_allclose(moved.translations, far.translations)
 
 

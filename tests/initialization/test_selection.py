@@ -1,4 +1,4 @@
-"""Which start is right, and when no answer is believed, on a small standing drive."""
+"""Selection of a start, and its refusals, on a small drive at standstill."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from sst_graph.initialization.selection import (
     select_among_steps,
     select_start_steps,
 )
-from sst_graph.stepwise import whole
+from sst_graph.stepwise import run_to_end
 from sst_graph.types import SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -121,22 +121,22 @@ def test_the_right_one_of_three_is_selected() -> None:
     candidates = [
         Candidate(turned(*a), 0.0, 1.0) for a in ((25.0, 0.0, 0.0), (0.0, 1.0, 2.0), (0.0, -30.0, 0.0))
     ]
-    selection = whole(select_among_steps(start_problem(truth()), candidates, JOINT.graph, START))
+    selection = run_to_end(select_among_steps(start_problem(truth()), candidates, JOINT.graph, START))
     assert off_deg(selection.starts[0][0]) < 1.0
     assert len(selection.starts) <= 3
 
 
-def test_a_pose_far_from_the_guess_is_no_answer() -> None:
+def test_a_pose_far_from_the_guess_is_refused() -> None:
     candidates = [Candidate(turned(0.0, 1.0, 2.0), 0.0, 1.0)]
     far = gtsam.Pose3(truth().rotation(), truth().translation() + np.array([0.0, 0.9, 0.0]))
     with pytest.raises(EstimationError, match="near the guess"):
-        whole(select_among_steps(start_problem(far), candidates, JOINT.graph, START))
+        run_to_end(select_among_steps(start_problem(far), candidates, JOINT.graph, START))
 
 
 @pytest.mark.parametrize("guess", [True, False])
 def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     rough = turned(8.0, -6.0, 9.0) if guess else None
-    selection: Selection = whole(select_start_steps(start_problem(rough), JOINT.graph, START))
+    selection: Selection = run_to_end(select_start_steps(start_problem(rough), JOINT.graph, START))
     # It leads where the truth leads, which with the few vehicles of this street is 0.9 deg away.
     start = selection.starts[0][0]
     problem = JointProblem([prepared_street()], Tracks([prepared_street()]), JOINT)
@@ -148,10 +148,10 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
 
 def test_without_a_search_the_guess_is_the_start() -> None:
     off, guess = replace(START, enabled=False), turned(1.0, 0.0, 0.0)
-    selection = whole(select_start_steps(start_problem(guess, 0.1), JOINT.graph, off))
+    selection = run_to_end(select_start_steps(start_problem(guess, 0.1), JOINT.graph, off))
     assert selection.starts == ((guess, 0.1),)
     with pytest.raises(EstimationError, match="no guess"):
-        whole(select_start_steps(start_problem(None), JOINT.graph, off))
+        run_to_end(select_start_steps(start_problem(None), JOINT.graph, off))
 
 
 def test_labels_tell_a_pose_that_shows_none_of_the_vehicles() -> None:
@@ -161,5 +161,5 @@ def test_labels_tell_a_pose_that_shows_none_of_the_vehicles() -> None:
         np.stack([cTl.translation() for cTl in poses]),
         np.zeros(3),
     )
-    scores = whole(label_score_steps(start_problem(None), states, START))
+    scores = run_to_end(label_score_steps(start_problem(None), states, START))
     assert scores[0] > 1.5 * scores[1] and scores[0] > 1.5 * scores[2] and scores[0] > 5.0

@@ -1,4 +1,4 @@
-"""What frames bring, against the covariance computed anew from some of the frames."""
+"""What frames bring, against the covariance computed again from some of the frames."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 NOISE = 0.003
-"""Relative changes of a sigma that matching anew makes, whatever is left out."""
+"""Relative changes of a sigma that matching again makes, whatever is left out."""
 
 
 def bits(without: np.ndarray, full: np.ndarray) -> float:
@@ -50,7 +50,7 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     kernel = RobustKernel("geman_mcclure", KERNELS_PX[-1])
     steps = gtsam.GaussNewtonParams()
     steps.setMaxIterations(2)
-    # all frames, too, matched anew: what is left is due to the frame
+    # all frames, too, matched again: what is left is due to the frame
     again = associate([drive], tracks, solution.state, kernel, config.graph)
 
     def calibrated(pairs: list[PairMatches]) -> np.ndarray:
@@ -72,8 +72,8 @@ def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     large = np.abs(found) > 0.1  # a change of all sigmas together by 1 % is 0.1 bit
     assert large.sum() > 5
     np.testing.assert_array_equal(np.sign(claimed[large]), np.sign(found[large]))
-    told, grown = np.array([frame.without for frame in frames]), np.array(ratios)
-    for one, other in zip(told.T, grown.T, strict=True):
+    predicted, grown = np.array([frame.without for frame in frames]), np.array(ratios)
+    for one, other in zip(predicted.T, grown.T, strict=True):
         assert spearmanr(one, other)[0] > 0.8
         large = np.abs(np.log(other)) > NOISE
         assert large.sum() > 20 and np.mean((one > 1.0)[large] == (other > 1.0)[large]) > 0.9

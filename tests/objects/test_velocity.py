@@ -126,7 +126,7 @@ def test_what_is_known_grows_with_the_scans_around_and_is_forgotten() -> None:
         whole.append(velocities.add(k, _scan(k * PERIOD_NS, wTl, corners), {NAME: 7}, wTl))
         if k == 6:
             early = velocities.of(6, NAME)
-    # The first velocity tells of all scans before; then those around which all has been seen.
+    # The first velocity is applied to all scans before; then those around which all has been seen.
     assert whole[2] == set() and whole[3] == {0, 1, 2} and whole[11] == {7}
     late = velocities.of(6, NAME)
     assert early is not None and late is not None and late.sigma_mps < 0.3 * early.sigma_mps

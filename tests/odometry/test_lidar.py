@@ -97,7 +97,7 @@ def test_driving_forward_and_left_by_hand() -> None:
         assert np.linalg.norm(error[:3]) < 0.002
 
 
-def test_sigmas_are_honest_within_a_factor_of_two() -> None:
+def test_sigmas_hold_within_a_factor_of_two() -> None:
     poses = path(5.0, 0.1, 14)
     motions = lidar_odometry(scan_at(pose, k * PERIOD_NS, 50 + k) for k, pose in enumerate(poses))
     whitened = [
@@ -108,7 +108,7 @@ def test_sigmas_are_honest_within_a_factor_of_two() -> None:
     assert 0.2 < size < 2.0
 
 
-def test_a_tunnel_says_that_the_way_along_is_weak() -> None:
+def test_a_tunnel_is_weak_along_its_axis() -> None:
     def tunnel(k: int) -> Scan:
         rng = np.random.default_rng(k)
         x = rng.uniform(-40, 40, 9000)
@@ -178,7 +178,7 @@ def test_unusable_points_are_left_out_and_the_rest_thinned() -> None:
     assert len(usable_points(many, 1.0, 100.0, 100)[0]) == 100
 
 
-def test_ground_does_not_drown_the_walls() -> None:
+def test_ground_points_do_not_dominate_the_walls() -> None:
     points, classes = street(np.random.default_rng(1))
     few_walls = np.concatenate(
         [points[classes == SemanticClass.GROUND], points[classes == SemanticClass.BUILDING][::12]]

@@ -38,7 +38,7 @@ def of(motions: list[RelativeMotion]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_noise_goes_and_the_sigma_says_how_far(scale: float) -> None:
+def test_smoothing_removes_noise_as_its_sigma_claims(scale: float) -> None:
     before, after, squares = [], [], []
     for seed in range(8):
         motions, truth = drive(60, seed, scale)
@@ -105,7 +105,7 @@ def test_motion_by_motion() -> None:
     np.testing.assert_allclose(of(window)[0][-20:], expected[-20:], atol=1e-9)
 
 
-def test_what_is_no_longer_asked_for_is_forgotten() -> None:
+def test_motions_that_have_left_are_forgotten() -> None:
     motions, _ = drive(60, 3)
     smoother = MotionSmoother(reach=10)
     for k in range(5, 61):
@@ -114,7 +114,7 @@ def test_what_is_no_longer_asked_for_is_forgotten() -> None:
     assert len(run.motions) == len(run.smoothed) == len(run._steps) == 15
 
 
-def test_a_motion_that_turns_out_to_be_none() -> None:
+def test_a_motion_that_later_counts_as_standstill() -> None:
     """The latest motions are at rest as soon as the next one is, too."""
     motions, _ = drive(20, 4)
     rests = [RelativeMotion(m.from_ns, m.to_ns, gtsam.Pose3(), m.covariance) for m in motions[15:]]

@@ -83,7 +83,7 @@ def test_vehicle_points_fall_on_the_vehicle_mask(motion: str, changes: dict[str,
     assert np.average(shares, weights=counts) >= 0.995
 
 
-def test_a_wrong_delay_or_extrinsic_shows() -> None:
+def test_a_wrong_time_offset_or_extrinsic_shows() -> None:
     """What the test above measures is sensitive to what it is there to find."""
     turning = drive(motion="turning", vehicle_density=0.25)
     source = changed(turning, label_noise=0.0, time_offset_s=-0.3)

@@ -80,14 +80,14 @@ def test_poses_give_the_lidars_motion_with_tr(drive: SimulatedDrive, folder: Pat
         assert camera.between(lidar).equals(gtsam.Pose3(np.array(truth["T_camera_lidar"])), 1e-9)
 
 
-def test_an_existing_folder_is_kept_unless_told(drive: SimulatedDrive, folder: Path) -> None:
+def test_an_existing_folder_is_kept_without_overwrite(drive: SimulatedDrive, folder: Path) -> None:
     before = (folder / "times.txt").read_bytes()
     with pytest.raises(ConfigError, match="not empty"):
         write_drive(drive, folder.parent.parent)
     assert (folder / "times.txt").read_bytes() == before
 
 
-def test_progress_is_told_and_a_failure_leaves_nothing(drive: SimulatedDrive, tmp_path: Path) -> None:
+def test_progress_is_reported_and_a_failure_leaves_nothing(drive: SimulatedDrive, tmp_path: Path) -> None:
     calls: list[tuple[int, int]] = []
 
     def progress(done: int, total: int) -> None:

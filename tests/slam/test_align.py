@@ -115,7 +115,7 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
     assert on_poses.error(values) == pytest.approx(plain.error(values), rel=1e-3)
 
 
-def test_a_vehicle_that_moves_is_carried_along() -> None:
+def test_a_moving_vehicle_is_moved_with_its_velocity() -> None:
     # moved by hand to where it is when the image is taken, it meets the same contours
     scan, image = frame(2)
     truth, camera, velocity, offset_s = drive().truth, drive().camera, np.array([0.8, -1.5, 0.1]), 0.05

@@ -101,7 +101,7 @@ def test_a_mask_bias_that_is_no_variable_is_found_and_considered() -> None:
     estimate, sigma = found.mask_biases_px[VEHICLE]
     assert estimate == pytest.approx(joint[7], rel=1e-9) == pytest.approx(-bias, abs=4.0 * sigma)
     assert sigma == pytest.approx(np.sqrt(np.linalg.inv(H)[7, 7]), rel=0.01)
-    # the whole of the step between the two answers is within the covariance
+    # the whole of the step between the two estimates is within the covariance
     assert found.clustered[0, 0] < found.covariance[0, 0]
     off = joint[:7] - step
     assert off @ np.linalg.solve(found.covariance, off) < 1.0
@@ -129,7 +129,7 @@ def test_errors_of_sides_are_found_in_the_residuals() -> None:
     assert (quiet.side, quiet.match) == (1.5**2, 1.0)
 
 
-def test_a_marginal_that_is_too_sure_is_told() -> None:
+def test_a_marginal_that_is_too_sure_gives_a_warning() -> None:
     """One side of one object in a hundred images: its error does not average."""
     rng, shape = np.random.default_rng(5), random_rows(100, 4, 40, seed=5)
     seen = rng.normal(size=(4 * SIDES, COLUMNS))  # a side lies in every image alike
@@ -179,10 +179,12 @@ def solution(steady: Street) -> RematchSolution:
     return solve_with_terms(*steady.whole(steady.start(1)), terms)
 
 
-def test_forward_against_later_is_told_as_weak(steady: Street, solution: RematchSolution) -> None:
+def test_forward_against_time_offset_is_weak(steady: Street, solution: RematchSolution) -> None:
     weak = [w for w in solution.warnings if w.kind is WarningKind.WEAK_DIRECTION]
     assert len(weak) == 1 and weak[0].value > 2.0 and weak[0].limit == 1.0
-    assert "cannot be told from the image taken later" in weak[0].detail and "record a stop" in str(weak[0])
+    assert "cannot be distinguished from the image taken later" in weak[0].detail and "record a stop" in str(
+        weak[0]
+    )
     assert steady.nees(solution.values, solution.covariance) < 18.5  # 99 % of 7
 
 
@@ -200,7 +202,7 @@ def test_matches_that_count_in_full_are_too_sure(steady: Street, solution: Remat
     assert by_hand.times_too_sure > 2.0
     P = gtsam.Marginals(graph, solution.values).jointMarginalCovariance([E, D]).fullMatrix()
     np.testing.assert_allclose(by_hand.marginal, P, rtol=1e-6)
-    # the scaled graph of the solution tells the same covariance
+    # the scaled graph of the solution has the same covariance
     scaled = calibration_covariance(solution.graph, solution.values, solution.matches)
     ratios = np.diag(scaled.covariance) / np.diag(by_hand.covariance)
     assert ratios.min() > 0.8 and ratios.max() < 1.25

@@ -60,7 +60,7 @@ def test_levenberg_marquardt_comes_to_the_truth(street: Street, solution: Rematc
     assert street.nees(solution.values, solution.covariance) < 14.0
 
 
-def test_the_marginals_of_the_graph_tell_the_same_size(street: Street, solution: RematchSolution) -> None:
+def test_the_marginals_of_the_graph_have_the_same_size(street: Street, solution: RematchSolution) -> None:
     marginals = gtsam.Marginals(solution.graph, solution.values)
     P = marginals.jointMarginalCovariance([E, D]).fullMatrix()
     assert street.nees(solution.values, P) < 14.0
@@ -73,7 +73,7 @@ def test_the_marginals_of_the_graph_tell_the_same_size(street: Street, solution:
     assert larger.min() > 1.0 and np.exp(np.log(larger).mean()) > 2.0
 
 
-def test_wide_priors_are_told_and_narrow_ones_are_not(street: Street, solution: RematchSolution) -> None:
+def test_wide_priors_give_a_warning_and_narrow_ones_do_not(street: Street, solution: RematchSolution) -> None:
     (warning,) = solution.warnings
     assert warning.kind is WarningKind.WIDE_UNCERTAINTY and warning.unit == "px"
     assert warning.value > warning.limit == pytest.approx(120.0)
@@ -118,7 +118,7 @@ def test_isam2_holds_each_factor_once(street: Street) -> None:
     assert graph.nrFactors() == len(custom) + len(street.motions) + 3
 
 
-def test_wide_priors_are_told_at_the_first_matches(street: Street) -> None:
+def test_wide_priors_give_a_warning_at_the_first_matches(street: Street) -> None:
     trajectory = Trajectory()
     keys = AlignmentKeys(trajectory, E, D)
     terms, warnings = IncrementalTerms(gtsam.ISAM2(isam2_params()), keys), []
@@ -162,7 +162,7 @@ def test_the_scan_nearest_in_true_time_is_taken(street: Street) -> None:
     ("offset_s", "state", "sign"),
     [(100.0, TermState.AFTER_TRAJECTORY, 1.0), (-100.0, TermState.BEFORE_TRAJECTORY, -1.0)],
 )
-def test_beyond_the_trajectory_is_told(
+def test_an_image_beyond_the_trajectory_is_reported(
     street: Street, offset_s: float, state: TermState, sign: float
 ) -> None:
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
@@ -173,7 +173,7 @@ def test_beyond_the_trajectory_is_told(
     assert "ms" in str(matches)
 
 
-def test_poses_that_are_not_there_are_told(street: Street) -> None:
+def test_missing_poses_are_reported(street: Street) -> None:
     _, values = street.whole((street.cTl, street.offset_s))
     other = Trajectory([X(k) for k in range(24)], [stamp + 1 for stamp in street.stamps_ns])
     assert street.term(4, AlignmentKeys(other, E, D)).matched(values, 5.0).state is TermState.NO_SCAN_POSE
@@ -182,15 +182,15 @@ def test_poses_that_are_not_there_are_told(street: Street) -> None:
     assert term.matched(values, 5.0).state is TermState.POSE_MISSING
 
 
-def test_few_matches_are_told(street: Street) -> None:
+def test_few_matches_are_reported(street: Street) -> None:
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
     term = replace(term, config=TermConfig(min_matches=10_000))
     _, values = street.whole((street.cTl, street.offset_s))
     assert term.matched(values, 5.0).state is TermState.FEW_MATCHES
 
 
-def test_constants_a_double_and_a_body_may_stand_in(street: Street) -> None:
-    """The offset as a double, the poses those of a body: the same answer."""
+def test_keys_may_be_constants_a_double_or_of_a_body(street: Street) -> None:
+    """The offset as a double, the poses those of a body: the same estimate."""
     bTl = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for k in range(len(street.scans)):
@@ -281,7 +281,7 @@ def test_a_real_drive(stop: Street, kind: str) -> None:
 @pytest.mark.drives
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize("with_bias", [False, True])
-def test_a_drive_at_one_speed_is_told_and_its_covariance_holds(with_bias: bool) -> None:
+def test_a_drive_at_one_speed_gives_a_warning_and_its_covariance_holds(with_bias: bool) -> None:
     """Nothing separates forward from later there: 20 to 45 cm off, and known to be."""
     drive = real(PARKED)
     keys = AlignmentKeys(drive.trajectory(), E, D, {SemanticClass.VEHICLE: B} if with_bias else {})
@@ -292,7 +292,7 @@ def test_a_drive_at_one_speed_is_told_and_its_covariance_holds(with_bias: bool) 
     terms = [drive.term(k, keys) for k in range(len(drive.images))]
     solution = solve_with_terms(graph, values, terms)
     weak = [w for w in solution.warnings if w.kind is WarningKind.WEAK_DIRECTION]
-    assert weak and "cannot be told from the image taken later" in weak[0].detail
+    assert weak and "cannot be distinguished from the image taken later" in weak[0].detail
     off = np.append(
         drive.cTl.localCoordinates(solution.values.atPose3(E)),
         solution.values.atVector(D)[0] - drive.offset_s,

@@ -1,4 +1,4 @@
-"""What is taken for granted, in the tracker: considered, tested, estimated."""
+"""Assumptions in the tracker: considered, tested, estimated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sst_graph.assumptions import ASSUMPTIONS, held_at_zero
 from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.config import with_overrides
 from sst_graph.covariance.cluster_robust import robust_covariance
-from sst_graph.covariance.considered import AssumptionConfig, consider
+from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.drive.preparation import ImageFeatures, prepare_drive
@@ -27,7 +27,7 @@ from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State, nuisance_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Gaussian, Point
 from sst_graph.tracker.window.window import Window
@@ -60,37 +60,37 @@ def street() -> KeptDrive:
 
 
 @pytest.fixture(scope="module")
-def bent(street: KeptDrive) -> KeptDrive:
+def distorted(street: KeptDrive) -> KeptDrive:
     """The same through a lens with radial distortion."""
     return with_distortion(street, K1)
 
 
-def _tracked(drive: KeptDrive, *settings: str, settle: bool = True) -> Tracker:
+def _tracked(drive: KeptDrive, *settings: str, optimize: bool = True) -> Tracker:
     assert drive.truth is not None
     tracker = Tracker(drive.camera, _config(*settings), drive.truth.cTl, 0.04)
     for frame in drive:
         tracker.add(frame)
-    if settle:
+    if optimize:
         tracker.optimize()
     return tracker
 
 
 @pytest.fixture(scope="module")
-def settled(street: KeptDrive) -> Tracker:
+def optimized(street: KeptDrive) -> Tracker:
     """The street's tracker at its end, with all frames in the window."""
     return _tracked(street)
 
 
 @pytest.fixture(scope="module")
-def estimating(bent: KeptDrive) -> Tracker:
-    """The bent street's tracker at its end, with the distortion as a variable."""
-    return _tracked(bent, 'calibration.assumptions.estimate=["k1"]')
+def estimating(distorted: KeptDrive) -> Tracker:
+    """The distorted street's tracker at its end, with the distortion as a variable."""
+    return _tracked(distorted, 'calibration.assumptions.estimate=["k1"]')
 
 
 @pytest.fixture(scope="module")
-def leaving(bent: KeptDrive) -> Tracker:
+def leaving(distorted: KeptDrive) -> Tracker:
     """The same while it runs; most frames have left its window."""
-    return _tracked(bent, 'calibration.assumptions.estimate=["k1"]', "window=12", settle=False)
+    return _tracked(distorted, 'calibration.assumptions.estimate=["k1"]', "window=12", optimize=False)
 
 
 def _state(tracker: Tracker) -> State:
@@ -104,37 +104,39 @@ def _state(tracker: Tracker) -> State:
     return dataclasses.replace(state, object_biases_px={**state.object_biases_px, **biases})
 
 
-def test_what_the_tracker_considers_is_what_the_batch_does(settled: Tracker) -> None:
+def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -> None:
     """The batch's function on the window's own matches, at the tracker's state."""
-    assert settled.estimate.smoother is not None
-    entries = dict(sorted(settled.estimate.smoother.entries.items()))
-    assert list(entries) == list(range(len(entries))) and not settled.estimate.smoother.sums.recent
-    pairs, state = [entry.pair for entry in entries.values()], _state(settled)
-    guess = State(settled.initializer.guess.cTl or gtsam.Pose3(), (settled.initializer.guess.offset_s,))
-    graph, values = joint_graph(pairs, state, settled.matcher.graph, guess)
+    assert optimized.estimate.smoother is not None
+    entries = dict(sorted(optimized.estimate.smoother.entries.items()))
+    assert list(entries) == list(range(len(entries))) and not optimized.estimate.smoother.sums.recent
+    pairs, state = [entry.pair for entry in entries.values()], _state(optimized)
+    guess = State(optimized.initializer.guess.cTl or gtsam.Pose3(), (optimized.initializer.guess.offset_s,))
+    graph, values = joint_graph(pairs, state, optimized.matcher.graph, guess)
     robust = robust_covariance(
-        graph, values, pairs, state, [settled.inputs.window.objects_of(list(entries))[0]]
+        graph, values, pairs, state, [optimized.inputs.window.objects_of(list(entries))[0]]
     )
-    plain = consider(robust, pairs, values, state, settled.setup.config.calibration.assumptions)
-    expected = with_test_results(plain, settled.estimate.tests.findings)
-    found = settled.estimate.considered()
+    plain = considered_by_matches(
+        robust, pairs, values, state, optimized.setup.config.calibration.assumptions
+    )
+    expected = with_test_results(plain, optimized.estimate.tests.findings)
+    found = optimized.estimate.considered()
     assert dict(found.sigmas) == dict(expected.sigmas) and set(found.sigmas) == set(ASSUMPTIONS)
-    scale = np.sqrt(np.diag(settled.estimate.covariance)[:7])
+    scale = np.sqrt(np.diag(optimized.estimate.covariance)[:7])
     for name, step in expected.sensitivities.items():
         size = np.linalg.norm(step / scale)
         np.testing.assert_allclose(found.sensitivities[name] / scale, step / scale, atol=1e-3 * size)
     np.testing.assert_allclose(
         np.sqrt(np.diag(found.covariance(7))), np.sqrt(np.diag(expected.covariance(7))), rtol=1e-3
     )
-    total = settled.estimate.covariance[:7, :7] + expected.covariance(7)
-    np.testing.assert_allclose(np.diag(settled.estimate.reported_covariance()), np.diag(total), rtol=1e-3)
+    total = optimized.estimate.covariance[:7, :7] + expected.covariance(7)
+    np.testing.assert_allclose(np.diag(optimized.estimate.reported_covariance()), np.diag(total), rtol=1e-3)
 
 
 N, HELD = 9, 3
 
 
 def _holding(seed: int, tracks: tuple[int, ...] = ()) -> tuple[Gaussian, FloatArray]:
-    """A belief that holds parameters, and its rows."""
+    """A Gaussian with held parameters, and its rows."""
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((40, N + len(tracks) + HELD))
     point = Point(gtsam.Pose3(), 0.1, np.zeros(2), tracks, np.zeros(len(tracks)))
@@ -143,33 +145,36 @@ def _holding(seed: int, tracks: tuple[int, ...] = ()) -> tuple[Gaussian, FloatAr
 
 def test_held_parameters_are_conditioned_on_and_follow_everything() -> None:
     """Solved for as if they were unknowns, they agree with the dense problem after each operation."""
-    belief, _ = _holding(1, (4, 7))
-    assert belief.held == HELD
-    n = belief.point.size
-    np.testing.assert_array_equal(belief.without_held().information, belief.information[:n, :n])
-    covariance, mean = np.linalg.inv(belief.information), np.linalg.solve(belief.information, belief.vector)
-    smaller, T = belief.without([4])
+    gaussian, _ = _holding(1, (4, 7))
+    assert gaussian.held == HELD
+    n = gaussian.point.size
+    np.testing.assert_array_equal(gaussian.without_held().information, gaussian.information[:n, :n])
+    covariance, mean = (
+        np.linalg.inv(gaussian.information),
+        np.linalg.solve(gaussian.information, gaussian.vector),
+    )
+    smaller, T = gaussian.without([4])
     kept = [*range(N), N + 1, *range(n, n + HELD)]
     np.testing.assert_allclose(np.linalg.inv(smaller.information), covariance[np.ix_(kept, kept)], atol=1e-9)
     np.testing.assert_allclose(np.linalg.solve(smaller.information, smaller.vector), mean[kept], atol=1e-9)
-    np.testing.assert_allclose(T @ belief.vector, smaller.vector, atol=1e-12)
+    np.testing.assert_allclose(T @ gaussian.vector, smaller.vector, atol=1e-12)
     walk = np.linspace(0.1, 0.5, 7)
-    after = belief.drifted(walk)
+    after = gaussian.drifted(walk)
     expected = covariance + np.diag([*walk, *np.zeros(n + HELD - 7)])
     np.testing.assert_allclose(np.linalg.inv(after.information), expected, atol=1e-8)
     step = np.linspace(-0.01, 0.01, n)
     step[:6] = 0.0
-    moved = belief.at(belief.point.moved(step))
+    moved = gaussian.at(gaussian.point.moved(step))
     away = np.append(step, np.zeros(HELD))
     np.testing.assert_allclose(np.linalg.solve(moved.information, moved.vector), mean - away, atol=1e-9)
-    wider = belief.with_objects({9: 0}, 0.5)
+    wider = gaussian.with_objects({9: 0}, 0.5)
     assert wider.held == HELD and wider.point.tracks == (4, 7, 9)
     again, _ = wider.without([9])
-    np.testing.assert_allclose(again.information, belief.information, atol=1e-9)
-    np.testing.assert_allclose(again.vector, belief.vector, atol=1e-9)
+    np.testing.assert_allclose(again.information, gaussian.information, atol=1e-9)
+    np.testing.assert_allclose(again.vector, gaussian.vector, atol=1e-9)
 
 
-def test_beliefs_that_hold_nothing_take_nothing_of_others() -> None:
+def test_gaussians_without_held_parameters_ignore_those_of_others() -> None:
     whole, _ = _holding(2, (4,))
     own = whole.without_held()
     assert own.plus(whole).held == 0
@@ -205,10 +210,10 @@ def test_time_counts_from_the_first_image_whatever_is_kept(street: KeptDrive) ->
     assert window.drive()[0].origin_ns == 1_000_000_000
 
 
-def test_a_clean_street_contradicts_nothing(settled: Tracker) -> None:
-    update = current(settled)
+def test_a_clean_street_contradicts_nothing(optimized: Tracker) -> None:
+    update = current_update(optimized)
     assert update.contradictions == () and update.status == "ok" and update.estimated == {}
-    report = settled.result().diagnostics["assumptions"]
+    report = optimized.result().diagnostics["assumptions"]
     assert list(report) == list(ASSUMPTIONS)
     tested = {name for name, entry in report.items() if "estimate" in entry}
     assert tested == {name for name, assumption in ASSUMPTIONS.items() if assumption.by_matches}
@@ -217,9 +222,9 @@ def test_a_clean_street_contradicts_nothing(settled: Tracker) -> None:
 
 def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     drive = with_principal_point(street, 20.0, 0.0)
-    # A dozen vehicles in half-size pictures tell it to 16 px at most: asked for one deviation.
-    tracker = _tracked(drive, "calibration.assumptions.threshold=1.0", settle=False)
-    update = current(tracker)
+    # A dozen vehicles in half-size pictures determine it to 16 px at most: the threshold is one.
+    tracker = _tracked(drive, "calibration.assumptions.threshold=1.0", optimize=False)
+    update = current_update(tracker)
     assert update.status == "contradicted" and "principal point cx" in update.contradictions[0]
     assert update.to_dict()["contradictions"] == list(update.contradictions)
     result = tracker.result()
@@ -229,58 +234,58 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     assert 10.0 < found.value < 30.0  # one step from where matches are near
     # Not tested: nothing is found, and no more is considered than beforehand.
     tracker.estimate.tests.restart()
-    assert current(tracker).contradictions == () and current(tracker).status != "contradicted"
+    assert current_update(tracker).contradictions == () and current_update(tracker).status != "contradicted"
     assert tracker.estimate.considered().sigmas["cx"] == ASSUMPTIONS["cx"].sigma
-    assert np.all(current(tracker).sigmas < update.sigmas)
+    assert np.all(current_update(tracker).sigmas < update.sigmas)
 
 
 def test_what_is_estimated_agrees_with_the_batch(
-    street: KeptDrive, bent: KeptDrive, settled: Tracker, estimating: Tracker
+    street: KeptDrive, distorted: KeptDrive, optimized: Tracker, estimating: Tracker
 ) -> None:
     """And it is the answer of the street without distortion."""
-    update = current(estimating)
+    update = current_update(estimating)
     assert update.contradictions == (), update
     value, sigma = update.estimated["k1"]
     assert abs(value - K1) < 3.0 * sigma and sigma < 0.05
     assert held_at_zero(("k1",)) == tuple(estimating.estimate.considered().sigmas)
     # The batch, with the same variable, from the same start.
     config = estimating.setup.config.estimating.calibration
-    drive = prepare_drive(bent, config.classes, config.prepare)
-    assert bent.truth is not None
+    drive = prepare_drive(distorted, config.classes, config.prepare)
+    assert distorted.truth is not None
     tracks = object_tracks(drive)
     joint = dataclasses.replace(
         config.joint,
         graph=dataclasses.replace(config.noise, lower_edges=estimating.matcher.graph.lower_edges),
     )
-    start = State(bent.truth.cTl, (0.04,))
+    start = State(distorted.truth.cTl, (0.04,))
     solution = solve_joint(JointProblem([drive], Tracks([drive], [tracks]), joint), start)
     robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, [tracks])
     state, column = solution.state, robust.unknowns.column(nuisance_key("k1"))
     turn = gtsam.Pose3.Logmap(update.T_camera_lidar.between(state.cTl))
-    step = np.array([*turn, state.offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
+    step = np.array([*turn, state.time_offset_s(0) - update.time_offset_s, state.nuisances["k1"] - value])
     sigmas = np.sqrt(np.diag(robust.matrix)[[*range(7), column]])
     assert np.abs(step / sigmas).max() < 1.0, np.round(step / sigmas, 2)
     own = np.sqrt(np.diag(estimating.estimate.covariance)[:7])
     np.testing.assert_allclose([*own, sigma], sigmas, rtol=0.3)
     # Without distortion.
-    clean = current(settled)
+    clean = current_update(optimized)
     back = gtsam.Pose3.Logmap(update.T_camera_lidar.between(clean.T_camera_lidar))
     assert np.abs(back / update.sigmas[:6]).max() < 3.0
 
 
-def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, bent: KeptDrive, tmp_path: Path) -> None:
+def test_a_checkpoint_holds_what_is_estimated(leaving: Tracker, distorted: KeptDrive, tmp_path: Path) -> None:
     assert leaving.estimate.smoother is not None and leaving.estimate.smoother.sums.recent
     leaving.save(tmp_path / "tracker")
     again = Tracker.load(tmp_path / "tracker")
-    assert current(again).to_dict() == current(leaving).to_dict()
-    assert current(again).to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
-    last = bent[len(bent) - 1]
+    assert current_update(again).to_dict() == current_update(leaving).to_dict()
+    assert current_update(again).to_dict()["estimated"]["k1"]["value"] == pytest.approx(K1, abs=0.1)
+    last = distorted[len(distorted) - 1]
     assert last.scan is not None and last.image is not None
     later = [dataclasses.replace(one, stamp_ns=one.stamp_ns + 100_000_000) for one in (last.image, last.scan)]
     for tracker in (leaving, again):
         tracker.add_image(later[0])  # type: ignore[arg-type]
         tracker.add_scan(later[1])  # type: ignore[arg-type]
-    assert current(again).to_dict() == current(leaving).to_dict()
+    assert current_update(again).to_dict() == current_update(leaving).to_dict()
 
 
 def test_the_marginal_is_of_extrinsic_and_offset_alone(leaving: Tracker) -> None:
@@ -295,10 +300,11 @@ def shifted(sigma: float) -> AssumptionConfig:
     return with_overrides(AssumptionConfig(), [f"cx={sigma}", f"cy={sigma}"])
 
 
-def test_the_principal_point_turns_the_camera(settled: Tracker) -> None:
-    """Told that it lies 1 px to the right, the answer turns back as a turn that moves all points by 1 px."""
-    camera, cTl = settled.setup.camera, settled.estimate.point.cTl
-    step = settled.estimate.considered().sensitivities["cx"]
+def test_the_principal_point_turns_the_camera(optimized: Tracker) -> None:
+    """With the principal point 1 px to the right, the answer turns back as a turn that moves all points by 1
+    px."""
+    camera, cTl = optimized.setup.camera, optimized.estimate.point.cTl
+    step = optimized.estimate.considered().sensitivities["cx"]
     turned = np.asarray(cTl.AdjointMap() @ step[:6])  # a step of the camera
     assert turned[1] == pytest.approx(-1.0 / camera.fx, rel=0.3), turned * camera.fx
     assert abs(turned[0]) < 0.3 / camera.fx

@@ -230,7 +230,7 @@ def test_wider_dtypes_and_other_orders_are_converted(street: SimulatedDrive, fra
 def test_one_slip_of_a_clock_is_refused_and_a_clock_that_was_set_is_not(
     running: Path, frames: list[Frame]
 ) -> None:
-    """A stamp years ahead does not shut out what follows; one that stays elsewhere estimated anew there."""
+    """A stamp years ahead does not shut out what follows; one that stays elsewhere estimated again there."""
     tracker, year = Tracker.load(running), 365 * 86_400 * 10**9
     scans = [frame.scan for frame in frames[14:]]
     assert all(scan is not None for scan in scans)
@@ -302,7 +302,7 @@ def test_after_ten_failures_in_a_row_the_window_is_given_up(running: Path, frame
     )
     updates = [tracker.add_scan(frame.scan) for frame in frames[14:25]]
     assert all(update.refused == ("scan",) for update in updates[:10])
-    assert "estimated anew" in updates[9].reason and not updates[10].refused
+    assert "estimated again" in updates[9].reason and not updates[10].refused
     assert not tracker.estimate.exists
 
 

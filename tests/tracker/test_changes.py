@@ -14,9 +14,9 @@ from streets import EARLY_START, knocked, sigmas_apart, tracker_from_truth, turn
 from sst_graph import Tracker
 from sst_graph.covariance.observability import ObservabilityConfig
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
 from sst_graph.tracker.config import AlarmConfig, DriftConfig
 from sst_graph.tracker.history import HistoryEntry
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Frame, SemanticClass
 
@@ -36,7 +36,7 @@ def _warmed_up(tracker: Tracker) -> Tracker:
 
 
 @pytest.mark.parametrize("kind", ["knock", "clock"])
-def test_a_step_raises_the_alarm_and_is_learnt(
+def test_a_step_raises_the_alarm_and_is_estimated(
     street: SimulatedDrive, frames: list[Frame], kind: str
 ) -> None:
     """The camera is knocked, or its clock jumps: noticed within ten frames, though little is known yet."""
@@ -92,11 +92,11 @@ def test_a_smaller_jump_in_the_first_seconds_is_not_silent(
 ) -> None:
     """With one object left out the others may show too little for an alarm so early: it is suspected then."""
     tracker = _warmed_up(tracker_from_truth(street, dataclasses.replace(EARLY_START, alarm=BY_LABELS)))
-    told = [
+    alarm = [
         update.alarm or bool(update.suspected_change)
         for update in jumped(tracker, frames[: STEP + 10], jump_ms)
     ]
-    assert any(told)
+    assert any(alarm)
 
 
 @pytest.mark.parametrize(
@@ -120,9 +120,9 @@ def test_stamps_that_jump_against_their_interval_are_an_alarm(
         updates.append(tracker.add(dataclasses.replace(frame, image=image, scan=scan)))
     alarms = [i for i, update in enumerate(updates) if update.alarm]
     assert len(alarms) == 1 and STEP <= alarms[0] < STEP + 6
-    told = updates[alarms[0]]
-    assert f"{sensor} stamps jumped" in told.reason and told.status == "alarm"
-    assert told.chi2 is not None and told.chi2 > tracker.setup.config.alarm.chi2
+    alarm = updates[alarms[0]]
+    assert f"{sensor} stamps jumped" in alarm.reason and alarm.status == "alarm"
+    assert alarm.chi2 is not None and alarm.chi2 > tracker.setup.config.alarm.chi2
     offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
     assert (
         tracker.estimate.exists
@@ -216,7 +216,7 @@ def _sure_tracker(street: SimulatedDrive) -> Tracker:
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
 
-def test_a_knock_that_nothing_can_show_is_not_called_ok(
+def test_a_knock_that_no_frame_can_show_is_not_ok(
     street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All that is in view moves from then on: no alarm can be raised, and the status says so."""
@@ -255,7 +255,7 @@ def test_frames_that_show_nothing_let_the_estimate_age(
         status.append(update.status)
         if frame.index == STEP + 5:
             tracker.save(tmp_path / "tracker.npz")
-            resumed = current(Tracker.load(tmp_path / "tracker.npz"))
+            resumed = current_update(Tracker.load(tmp_path / "tracker.npz"))
             assert resumed.unconfirmed_s == update.unconfirmed_s > 0.5
             assert resumed.offset_unconfirmed_s == update.offset_unconfirmed_s > 0.5
     assert status[CHECKED - 5 : CHECKED] == ["unconfirmed"] * 5
@@ -314,7 +314,7 @@ def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -
     off, sigmas = np.array(errors).T
     assert np.abs(off).max() < 0.25 and np.mean(np.abs(off) < 2.5 * sigmas) > 0.8
     last_deg = 0.25e-9 * ((follows.inputs.window.last_stamp_ns or 0) - start_ns)
-    at_end = [_yaw_error(street, current(tracker), last_deg)[0] for tracker in (follows, steady)]
+    at_end = [_yaw_error(street, current_update(tracker), last_deg)[0] for tracker in (follows, steady)]
     assert abs(at_end[0]) < 0.5 * abs(at_end[1])
 
 

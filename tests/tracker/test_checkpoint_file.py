@@ -230,7 +230,7 @@ def _inputs(tracker: Any) -> Any:
 def test_a_forged_tracker_is_refused(tmp_path: Path, good: bytes, change: Callable[[Any], Any]) -> None:
     document, data = parts_of(good)
     change(document["tracker"])
-    refused(tmp_path, forged(document, data), "an incomplete checkpoint|a tracker that does not answer")
+    refused(tmp_path, forged(document, data), "an incomplete checkpoint|a tracker that gives no estimate")
 
 
 @pytest.mark.parametrize(
@@ -262,7 +262,7 @@ def test_another_head_is_refused(tmp_path: Path, head: str, message: str) -> Non
 def test_forged_blocks_are_refused(tmp_path: Path, good: bytes, change: Callable[[Any], Any]) -> None:
     document, data = parts_of(good)
     change(document["blocks"])
-    refused(tmp_path, forged(document, data), "an incomplete checkpoint|a tracker that does not answer")
+    refused(tmp_path, forged(document, data), "an incomplete checkpoint|a tracker that gives no estimate")
 
 
 def test_another_thing_than_a_tracker_is_refused(tmp_path: Path, good: bytes) -> None:

@@ -13,7 +13,7 @@ from sst_graph import Tracker
 from sst_graph.errors import EstimationError
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, fuse_marginals
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.marginal import TrackedMarginal, increment, moved_to
 from sst_graph.types import Frame
 
@@ -30,7 +30,7 @@ def _far(seed: int, start: int = 1) -> TrackedMarginal:
 
 
 @pytest.fixture(scope="module")
-def told(
+def marginals(
     street: SimulatedDrive, frames: list[Frame]
 ) -> tuple[TrackedMarginal, list[TrackedMarginal], Tracker]:
     """The first marginal of a tracker, what it added every four frames since, and the tracker."""
@@ -51,34 +51,34 @@ def told(
 
 
 def test_the_parts_together_are_the_whole(
-    told: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
+    marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker],
 ) -> None:
-    first, parts, tracker = told
+    first, parts, tracker = marginals
     # Parts are no answers of their own: they are added, not compared.
     whole, fused = tracker.marginal(), fuse_marginals([first, *parts], significance=0.0)
     scale = np.sqrt(np.outer(np.diag(whole.information), np.diag(whole.information)))
     np.testing.assert_allclose(fused.information / scale, whole.information / scale, atol=1e-6)
     assert fused.cTl.equals(whole.cTl, 1e-9)
     assert fused.offset_s == pytest.approx(whole.offset_s, abs=1e-9)
-    np.testing.assert_allclose(whole.covariance(), current(tracker).covariance, rtol=1e-6)
+    np.testing.assert_allclose(whole.covariance(), current_update(tracker).covariance, rtol=1e-6)
     # And it did grow on the way.
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
 
 
-def test_in_a_graph_of_one_s_own(told: tuple[TrackedMarginal, list[TrackedMarginal], Tracker]) -> None:
+def test_in_a_graph_of_one_s_own(marginals: tuple[TrackedMarginal, list[TrackedMarginal], Tracker]) -> None:
     """As factors of gtsam, added one after the other: the answer and its covariance are the tracker's."""
-    first, parts, tracker = told
+    first, parts, tracker = marginals
     graph = gtsam.NonlinearFactorGraph()
     for part in (first, *parts):
         graph.add(part.factor())
     values = gtsam.LevenbergMarquardtOptimizer(graph, first.point()).optimize()
-    update = current(tracker)
+    update = current_update(tracker)
     assert update.covariance is not None
     sigmas = np.sqrt(np.diag(update.covariance))
     step = gtsam.Pose3.Logmap(update.T_camera_lidar.between(values.atPose3(EXTRINSIC)))
     step = np.append(step, values.atVector(TIME_OFFSET)[0] - update.time_offset_s)
     assert np.abs(step / sigmas).max() < 1e-3
-    # Told twice it would be too sure; told in parts it is not.
+    # Counted twice, the information would be too large; in parts it is not.
     variance = gtsam.Marginals(graph, values).marginalCovariance(TIME_OFFSET)[0, 0]
     assert variance == pytest.approx(sigmas[6] ** 2, rel=1e-3)
 
@@ -103,7 +103,7 @@ def test_before_a_start_and_after_a_change(street: SimulatedDrive, frames: list[
     tracker = tracker_from_truth(street)
     with pytest.raises(EstimationError, match="no estimate yet"):
         tracker.marginal()
-    assert current(tracker).covariance is None and current(tracker).covariance_reason
+    assert current_update(tracker).covariance is None and current_update(tracker).covariance_reason
     for frame in frames[:9]:
         tracker.add(frame)
     known = tracker.marginal()

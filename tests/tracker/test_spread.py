@@ -11,7 +11,7 @@ from sst_graph import Tracker
 from sst_graph.errors import EstimationError
 from sst_graph.files.object_store import stored
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.tracker.start.initializer import _Run
 from sst_graph.tracker.start.solution import Guess, first_estimate_steps
 from sst_graph.tracker.storage.snapshot import Snapshot
@@ -99,7 +99,7 @@ def test_the_graph_of_a_start_is_made_some_scans_a_frame(street: SimulatedDrive,
     assert tracker.estimate.exists and seen == {False, True} and most <= 6
 
 
-def test_the_answer_comes_when_its_work_was_asked_for() -> None:
+def test_the_estimate_is_returned_when_its_work_is_requested() -> None:
     def counting() -> Stepwise[int]:
         for _ in range(5):
             yield 2
@@ -107,7 +107,7 @@ def test_the_answer_comes_when_its_work_was_asked_for() -> None:
 
     run = _Run(counting())  # type: ignore[arg-type]
     assert [run.until(work) for work in (4, 10, 3, 11, 10)] == [None, None, None, 7, None]
-    assert _Run(counting()).until(None) == 7 == whole(counting())  # type: ignore[arg-type]
+    assert _Run(counting()).until(None) == 7 == run_to_end(counting())  # type: ignore[arg-type]
 
 
 def test_a_failure_is_raised_each_time() -> None:

@@ -14,7 +14,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import EstimationError
 from sst_graph.graph.state import State
-from sst_graph.stepwise import Stepwise, whole
+from sst_graph.stepwise import Stepwise, run_to_end
 from sst_graph.tracker.start import solution as tracker_start
 from sst_graph.tracker.start.solution import Guess, first_estimate_steps
 from sst_graph.tracker.window.gaussian import Point
@@ -33,18 +33,18 @@ def _solved(turn_deg: float, cost: float) -> tracker_start._Solved:
 def test_a_better_pose_that_has_not_converged_prevents_a_start(
     monkeypatch: pytest.MonkeyPatch, turn_deg: float, cost: float, refused: bool
 ) -> None:
-    """It must be clearly better, and of another basin: else it is the same answer on its way."""
+    """It must be clearly better, and of another basin: else it is the same solution before convergence."""
     drive = Drive("none", None, (), (), (), ())  # type: ignore[arg-type]
 
-    def starts(drive: Drive, guess: Guess, config: TrackerConfig, delay_s: float) -> Stepwise[list[State]]:
+    def starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -> Stepwise[list[State]]:
         yield 1
-        return [State(gtsam.Pose3(), (delay_s,))]
+        return [State(gtsam.Pose3(), (reach_s,))]
 
     def solution(
         drive: Drive, start: State, kernels_px: Sequence[float], config: TrackerConfig
     ) -> Stepwise[tracker_start._Solved]:
         yield 1
-        if start.offset_s(0) > 0.0:
+        if start.time_offset_s(0) > 0.0:
             raise tracker_start._NotConverged("still moved", _solved(turn_deg, cost))
         return _solved(0.0, 3.0)
 
@@ -54,9 +54,9 @@ def test_a_better_pose_that_has_not_converged_prevents_a_start(
         with pytest.raises(
             EstimationError, match=r"cost 2\.500 against 3\.000 a point\), but has not converged"
         ):
-            whole(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig()))
+            run_to_end(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig()))
     else:
-        assert whole(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig())).cTl.equals(
+        assert run_to_end(first_estimate_steps(drive, Guess(None, 0.0), TrackerConfig())).cTl.equals(
             gtsam.Pose3(), 1e-9
         )
 

@@ -11,7 +11,7 @@ from streets import knocked, tracker_from_truth
 
 from sst_graph import Tracker
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.uncertainty import Uncertainty
 from sst_graph.types import Frame
@@ -19,10 +19,11 @@ from sst_graph.types import Frame
 KNOCK_DEG = 1.5
 
 
-def answers(
+def updates_of(
     street: SimulatedDrive, frames: list[Frame], step: int | None
 ) -> tuple[Tracker, list[TrackUpdate]]:
-    """A tracker, which starts with the eighth frame, and its answers where the camera is knocked at one."""
+    """A tracker, which starts with the eighth frame, and its updates_of where the camera is knocked at
+    one."""
     tracker, updates = tracker_from_truth(street), []
     for frame in frames:
         assert frame.image is not None
@@ -37,8 +38,8 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
     street: SimulatedDrive, frames: list[Frame], step: int
 ) -> None:
     """The start is given up within some frames, not ok before; the next one is of the frames since."""
-    tracker, updates = answers(street, frames, step)
-    given_up = [i for i, update in enumerate(updates) if "estimated anew" in update.reason]
+    tracker, updates = updates_of(street, frames, step)
+    given_up = [i for i, update in enumerate(updates) if "estimated again" in update.reason]
     assert given_up and step <= given_up[0] < step + 12 and len(given_up) <= 2
     assert not any(update.status == "ok" for update in updates[: given_up[0]])
     assert all(updates[i].status == "starting" and not updates[i].accepted for i in given_up)
@@ -50,25 +51,25 @@ def test_a_knock_during_or_after_a_start_is_not_averaged(
 
 
 def test_quiet_frames_contradict_no_start(street: SimulatedDrive, frames: list[Frame]) -> None:
-    _, updates = answers(street, frames[:26], None)
-    assert not any("estimated anew" in update.reason for update in updates)
+    _, updates = updates_of(street, frames[:26], None)
+    assert not any("estimated again" in update.reason for update in updates)
     assert updates[7].accepted
 
 
-def test_labels_that_always_contradict_are_no_way_without_end(
+def test_labels_that_always_contradict_do_not_restart_for_ever(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
     """A limit that any frames are past: two starts are refused, the third stays."""
     tracker = tracker_from_truth(street)
     tracker.monitor.changes.start_threshold = 0.1
     updates = [tracker.add(frame) for frame in frames[:30]]
-    assert sum("estimated anew" in update.reason for update in updates) == 2
+    assert sum("estimated again" in update.reason for update in updates) == 2
     assert tracker.estimate.exists
 
 
 def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, frames: list[Frame]) -> None:
     """One object of each pair counts half as static: static ones alone determine less, and decide."""
-    tracker, _ = answers(street, frames[:20], None)
+    tracker, _ = updates_of(street, frames[:20], None)
     assert tracker.estimate.smoother is not None
     assert (
         tracker.estimate.smoother.static_information() is None
@@ -94,7 +95,7 @@ def test_what_only_moving_objects_determine_is_weak(street: SimulatedDrive, fram
     step = np.array([0.0, 0.0, 0.0, 0.06, 0.0, 0.0, 0.0075])
     for by_static_objects, weak in ((None, 0), (good, 0), (good + np.outer(step, step), 1)):
         tracker.estimate.uncertainty = Uncertainty(joint, 1.0, by_static_objects)
-        update = current(tracker)
+        update = current_update(tracker)
         assert len(update.weak_directions) == weak
         assert (update.status == "unobservable") == bool(weak)
     assert "by static objects alone" in update.weak_directions[0].sentence

@@ -18,7 +18,7 @@ from sst_graph.inspect.gained import gained_of
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.result import CalibrationResult
 from sst_graph.simulator import SimulatedDrive
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.types import Frame
 
@@ -69,7 +69,7 @@ def test_the_result_has_the_information_of_each_scan(running: Path) -> None:
     first, *rest = gained.gains
     assert first.bits is None and len(rest) > 5
     assert sum(gain.bits or 0.0 for gain in rest) > 3.0
-    np.testing.assert_allclose(rest[-1].values, current(tracker).sigmas, rtol=1e-3)
+    np.testing.assert_allclose(rest[-1].values, current_update(tracker).sigmas, rtol=1e-3)
 
 
 def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: list[Frame]) -> None:

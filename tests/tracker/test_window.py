@@ -1,4 +1,4 @@
-"""The tracker's window: objects judged to move as the batch judges them, and what is forgotten."""
+"""The tracker's window: dynamic objects are those of the batch, and what is forgotten."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _window(drive: Drive, scans: int) -> Window:
     return window
 
 
-def test_objects_are_judged_as_the_batch_judges_them() -> None:
+def test_dynamic_objects_are_those_of_the_batch() -> None:
     drive = _drive(30)
     tracks = object_tracks(drive)
     speeds = find_dynamic_objects(drive, tracks)
@@ -101,7 +101,7 @@ def test_an_object_that_starts_to_move_changes_past_scans() -> None:
     assert before and before <= later
 
 
-def test_an_object_that_moved_lately_is_restless() -> None:
+def test_an_object_that_moved_lately_is_recently_moving() -> None:
     """Number 3 stops at 1.2 s: it may pass for one that stands, and is recently_moving for a while."""
     drive = _drive(40)
     window, recently_moving = Window(CAMERA, 50), {}

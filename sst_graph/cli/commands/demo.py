@@ -1,4 +1,4 @@
-"""``sst-graph demo``: the whole way on a simulated street, from disk, checked against the truth."""
+"""``sst-graph demo``: simulate a street, calibrate it from disk, compare with the truth."""
 
 from __future__ import annotations
 

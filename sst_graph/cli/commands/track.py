@@ -52,12 +52,12 @@ def _track(
 ) -> tuple[Tracker, TrackUpdate]:
     """Add the frames, and save the tracker as it goes; solve the window as a whole after the last.
 
-    The last line and the result are the same answer. With a checkpoint it is that of the tracker in the file,
-    whose arrays have the file's memory layout: the result is the same to the last bit whether the run was
-    broken off and resumed or not.
+    The last line and the result hold the same estimate. With a checkpoint it is that of the tracker in the
+    file, whose arrays have the file's memory layout: the result is the same to the last bit whether the run
+    was interrupted and resumed or not.
 
     Returns:
-        The tracker, and its last answer.
+        The tracker, and its last update.
     """
     update = None
     with ExitStack() as outputs:
@@ -86,7 +86,7 @@ def _optimized(
     update: TrackUpdate | None,
     saver: Saver | None,
 ) -> tuple[Tracker, TrackUpdate]:
-    """The tracker that is saved, or the one given where none is, its whole window solved; and its answer."""
+    """The tracker that is saved, or the one given where none is, its whole window solved; and its update."""
     if saver is not None:
         saver.finish()
         tracker = Tracker.load(args.checkpoint)

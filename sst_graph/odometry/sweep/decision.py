@@ -1,4 +1,4 @@
-"""Whether the points of a drive were moved to one instant, or which way its scanner turned."""
+"""Whether the points of a drive were compensated to one instant, or in which sense its scanner turned."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from sst_graph.odometry.lidar import LidarOdometry
-from sst_graph.odometry.sweep.estimate import Estimate, at_hypothesis, estimate, start_of
+from sst_graph.odometry.sweep.estimate import SweepEstimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
 from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
@@ -45,8 +45,8 @@ _MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 3.0, 0.25
 """Least motion from the first scan of a window to its last: with less, surfaces are seen from one side only,
 with the same errors in every scan [m, rad]."""
 _ERROR_RATE = 0.001
-"""A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: as much speaks against the true
-one in this share of drives at most, where the error model holds."""
+"""A hypothesis is excluded where another is 1 / _ERROR_RATE times as likely: such evidence against the true
+one occurs in this fraction of drives at most, where the error model holds."""
 _TOLERANCE = 0.2
 """The estimated share may differ so much from 0 or 1 beside three of its sigmas."""
 _LONG_SWEEP_M = 1.0
@@ -58,7 +58,7 @@ _MIN_EXPECTED = 0.5
 
 @dataclass(frozen=True)
 class SweepDecision:
-    """What was decided of the sweep, and why.
+    """The decision about the sweep, and its evidence.
 
     Attributes:
         kind: the hypothesis, or why there is none.
@@ -151,7 +151,7 @@ class _PairMotion:
 def decide_sweep(
     scan_at: Callable[[int], Scan | None], count: int, stamp: SweepStamp = "forward"
 ) -> SweepDecision:
-    """Decide it from the scans of a drive that have no times of their points.
+    """Decide the sweep from the scans of a drive that have no times of their points.
 
     Args:
         scan_at: scan at a position, or None where the frame has none.
@@ -234,7 +234,9 @@ def _decide(windows: Sequence[Window], timing: SweepTiming) -> SweepDecision:
     return replace(_compare_hypotheses(windows, found, timing), speed_mps=speed)
 
 
-def _compare_hypotheses(windows: Sequence[Window], found: Estimate, timing: SweepTiming) -> SweepDecision:
+def _compare_hypotheses(
+    windows: Sequence[Window], found: SweepEstimate, timing: SweepTiming
+) -> SweepDecision:
     """The three hypotheses by their evidence, that of compensated points being 1."""
     evidence = found.evidence(windows)
     ratios: dict[str, FloatArray] = {name: evidence.log_ratio(f) for name, f in FRACTIONS.items()}

@@ -61,7 +61,7 @@ class Quadratic:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class SweepEstimate:
     """Result of the registration.
 
     Attributes:
@@ -145,7 +145,7 @@ class Evidence:
         return np.asarray(np.maximum(least, 0.0) + np.minimum(most, 0.0))
 
 
-def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> Estimate:
+def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) -> SweepEstimate:
     """Share and start of least cost, iterated from those given, with the poses of the windows."""
     for number in range(_MAX_ITERATIONS):
         present = fraction, sector
@@ -159,17 +159,17 @@ def estimate(windows: Sequence[Window], fraction: float = 0.0, sector: int = 0) 
         sector = best
         if done:
             break
-    return Estimate(fraction, sector, quadratic, normals, present, _misfit(windows))
+    return SweepEstimate(fraction, sector, quadratic, normals, present, _misfit(windows))
 
 
-def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, iterations: int) -> Estimate:
+def at_hypothesis(windows: Sequence[Window], fraction: float, sector: int, iterations: int) -> SweepEstimate:
     """The cost around a given share and start, with the poses that go with it."""
     for number in range(iterations):
         quadratic, normals = _matched(windows, fraction, sector, number)
         _move(windows, normals, np.zeros(1 + SECTORS))
     shares = quadratic.free()
     best = int(np.argmin(quadratic.cost(shares)))
-    return Estimate(float(shares[best]), best, quadratic, normals, (fraction, sector), _misfit(windows))
+    return SweepEstimate(float(shares[best]), best, quadratic, normals, (fraction, sector), _misfit(windows))
 
 
 def _matched(

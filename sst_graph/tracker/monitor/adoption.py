@@ -1,4 +1,4 @@
-"""Whether a candidate may replace the calibration in use: its covariance and held-out frames must agree."""
+"""Adoption: a new estimate replaces the calibration in use where held-out frames agree."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sst_graph.association.edge_matching import GATE
-from sst_graph.drive.preparation import Drive, outline_size
+from sst_graph.drive.preparation import Drive, boundary_count
 from sst_graph.factors import alignment_cost
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, associate
@@ -37,7 +37,7 @@ class Adoption:
         self.costs: deque[tuple[float, float]] = deque(maxlen=frames)
 
     def restart(self) -> None:
-        """Forget the comparison; the calibration in use stays until a better one has shown itself."""
+        """Forget the comparison; the calibration in use stays until another one is adopted."""
         self.costs.clear()
 
     def add_held_out(
@@ -46,7 +46,7 @@ class Adoption:
         """Compare candidate and calibration in use on new frames, before these are used.
 
         Args:
-            cost: of the frames at a point; None where nothing can be seen.
+            cost: of the frames at a point; None where no boundary point is in view.
             candidate: the estimate before them.
             guess: what is in use while nothing has been adopted.
         """
@@ -80,12 +80,12 @@ def held_out_cost(
     kernel: RobustKernel,
     config: GraphConfig,
 ) -> float | None:
-    """Mean robust cost of the boundary points of frames that took no part; None where none can be seen.
+    """Mean robust cost of the boundary points of frames that took no part; None where none is in view.
 
     A point that finds no contour costs as much as the farthest match.
     """
     pairs = associate([drive], tracks, point.state(classes), kernel, config)
-    counted = [(pair, outline_size(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
+    counted = [(pair, boundary_count(drive.scans[pair.pair.scan], config.lower_edges)) for pair in pairs]
     return mean_cost(counted, point, classes, kernel)
 
 

@@ -1,8 +1,8 @@
-"""Has the calibration changed? New frames, and those of a start, against an estimate made before or of them.
+"""Change detection: new frames against the estimate made before them; frames of a start against its estimate.
 
-One test serves both: chi-squared of the frames' scores at the estimate, under a kernel wide enough for a step
-to stay in sight (:mod:`sst_graph.tracker.monitor.statistic`). A start is checked with parts of its own
-frames; from then on each new frame is checked before it is used.
+One test serves both: chi-squared of the frames' scores at the estimate, under a kernel wide enough for
+matches to survive a step of the calibration (:mod:`sst_graph.tracker.monitor.statistic`). A start is checked
+with parts of its own frames; from then on each new frame is checked before it is used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from sst_graph.tracker.monitor.statistic import (
     CONFIRMATIONS,
     FRAMES,
     ChangeStatistic,
-    Estimate,
+    ComparedEstimate,
     EstimateCovariance,
 )
 from sst_graph.tracker.sums.linearized_pair import LinearizedPair
@@ -31,28 +31,29 @@ from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.matcher import WindowMatcher
 
 _KERNEL = RobustKernel("geman_mcclure", 12.0)
-"""Kernel of the comparison [px]: wide enough for a turn of the camera by 1 degree to stay in sight."""
+"""Kernel of the comparison [px]: wide enough for matches to survive a turn of the camera by 1 degree."""
 _LEAST_SHARE_OF_OTHERS = 0.2
-"""Share of the statistic that must remain without any one object: labels of one car may err for a while."""
+"""Share of the statistic that must remain without any one object: the labels of one car may be wrong for a
+while."""
 _SINGLE_OBJECT_FACTOR = 4.0
-"""A single object is believed after FRAMES + CONFIRMATIONS frames at this many times the threshold."""
+"""A single object raises the alarm after FRAMES + CONFIRMATIONS frames at this many times the threshold."""
 _MAX_PENDING_FRAMES = 20
 """Frames in a row past the threshold after which a suspected change is given up: the estimate has followed
 the objects by then, whether they were right or not."""
 _LOST_FRAMES = 8
-"""Frames in a row, but for one, in which next to nothing in view meets the image's labels: the step is larger
-than matches reach."""
+"""Frames in a row, but for one, in which almost no boundary point in view meets the image's labels: the step
+is larger than the range of the matches."""
 _LOST_SHARE = 0.12
-"""Share of the boundary points in view that is next to nothing."""
+"""Largest fraction of the boundary points in view that counts as almost none."""
 _LEAST_IN_VIEW = 16
-"""Boundary points of an object in view; of fewer, none may meet a contour by chance."""
+"""Boundary points of an object in view; with fewer, it can happen by chance that none meets a contour."""
 _START_CHI2 = 15.0
 """A start is refused where the statistic of some of its own frames is larger. These frames are part of the
 estimate, so the statistic is well below chi-squared's where they are of one calibration."""
 _WARM_UP_SCANS = 15
 """Scans after a start in which a contradiction gives up the start and is no alarm."""
 _MAX_REFUSED_STARTS = 2
-"""Starts in a row that are refused because frames contradict them: labels may err as much."""
+"""Starts in a row that are refused because frames contradict them: the labels may have such errors."""
 _CONFIRM_SPEED_MPS = 3.0
 """Slower than this a jump of the clock can hardly be seen: such time does not count [m/s]."""
 
@@ -78,7 +79,7 @@ class Change:
     Attributes:
         near: estimate from before the change.
         scans: how many of the latest scans are surely from after it.
-        far: the labels have left what ought to be in view: the new calibration may be anywhere.
+        far: objects no longer meet their labels at all: the new calibration may be anywhere.
     """
 
     near: Point
@@ -87,11 +88,11 @@ class Change:
 
 
 class ChangeDetector:
-    """Compares frames with estimates that were made before them.
+    """Test of new frames against the estimate that was made before them.
 
     From the first frame past the threshold on, the estimate from before the frames compared is kept as the
     reference, and all frames since are compared with it: the running estimate uses them, and would follow a
-    step before enough is seen of it.
+        step before it is detected.
 
     Attributes:
         statistic: of the latest frames.
@@ -124,7 +125,7 @@ class ChangeDetector:
         self._moving: set[int] = set()
 
     def restart(self) -> None:
-        """Forget the frames: the calibration is estimated anew."""
+        """Forget the frames: the calibration is estimated again."""
         self.statistic.restart()
         self.scans.clear()
         self._before.clear()
@@ -140,11 +141,11 @@ class ChangeDetector:
         self._start_scan, self._recheck_after = scan, self._first_recheck
         self.start_unconfirmed = self.config.enabled
 
-    def check_start(self, scans: Sequence[int], estimate: Estimate) -> str:
-        """In what way frames contradict the estimate that was made of them; empty where they do not.
+    def check_start(self, scans: Sequence[int], estimate: ComparedEstimate) -> str:
+        """How frames contradict the estimate that was made of them, in words; empty where they do not.
 
         Where the calibration changed among the frames of a start, or where the start was wrong, its estimate
-        lies between two or beside all, with a covariance that knows of neither.
+        is between two calibrations or at neither, with a covariance that does not show it.
 
         Args:
             scans: numbers of the scans in the estimate.
@@ -155,22 +156,20 @@ class ChangeDetector:
         if value <= self.start_threshold:
             return ""
         self.refused_starts += 1
-        return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated anew"
+        return f"frames of the start contradict each other (chi-square {value:.0f}): it is estimated again"
 
-    def recheck_start(self, scan: int, scans: Sequence[int], estimate: Estimate) -> None:
-        """The same when half as many frames again have come, and then each time after twice as many.
-
-        Labels that err for a while contradict a start as a step does, so it is no longer given up; but until
-        its frames agree, the status is not ``ok``.
+    def recheck_start(self, scan: int, scans: Sequence[int], estimate: ComparedEstimate) -> None:
+        """The same check with half as many further frames, and then after each doubling. Wrong labels
+        contradict a start as a change does, so the start is not given up; but until its frames agree, the
+        status is not ``ok``.
         """
         if self.start_unconfirmed and scan - self._start_scan >= self._recheck_after:
             self._recheck_after *= 2
             self._confirm_start(scans, estimate, self._moving, self.start_threshold)
 
-    def check_start_at_end(self, scans: Sequence[int], estimate: Estimate) -> None:
-        """At the end of a drive, the same of all frames in the graph for a start that no frame came after.
-
-        They are more, in more parts, than a start is made of: new frames' threshold holds.
+    def check_start_at_end(self, scans: Sequence[int], estimate: ComparedEstimate) -> None:
+        """At the end of a drive, the same check of all frames in the graph, for a start without later frames.
+        They are more than a start has, so the threshold for new frames applies.
         """
         self._confirm_start(scans, estimate, self.matcher.window.dynamics.recently_moving(), self.config.chi2)
 
@@ -179,12 +178,14 @@ class ChangeDetector:
         return scan - self._start_scan >= self.warm_up_scans or self.refused_starts >= _MAX_REFUSED_STARTS
 
     def _confirm_start(
-        self, scans: Sequence[int], estimate: Estimate, moving: Collection[int], threshold: float
+        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int], threshold: float
     ) -> None:
         if self.start_unconfirmed and self._disagreement(scans, estimate, moving) <= threshold:
             self.refused_starts, self.start_unconfirmed = 0, False
 
-    def _disagreement(self, scans: Sequence[int], estimate: Estimate, moving: Collection[int]) -> float:
+    def _disagreement(
+        self, scans: Sequence[int], estimate: ComparedEstimate, moving: Collection[int]
+    ) -> float:
         """Largest statistic of a part of the frames that an estimate was made of, against that estimate.
 
         The parts are its first ones, its last ones, and any few in a row.
@@ -205,7 +206,9 @@ class ChangeDetector:
 
     # ------------------------------------------------------------------ new frames
 
-    def check(self, waiting: Sequence[int], matches: Mapping[int, int], estimate: Estimate) -> float | None:
+    def check(
+        self, waiting: Sequence[int], matches: Mapping[int, int], estimate: ComparedEstimate
+    ) -> float | None:
         """The statistic of the latest frames with some new ones; None while there are too few.
 
         Args:
@@ -223,7 +226,7 @@ class ChangeDetector:
         new = [scan for scan in waiting if scan not in self.scans]
         if not new:
             return None
-        # 1. Scans that have an image: does what ought to be in view meet its labels?
+        # 1. Of scans with an image: do the objects in view meet its labels?
         views = self.matcher.in_view(estimate.point, new, self._moving)
         self._note_unmatched(views, matches)
         if not views:
@@ -234,7 +237,7 @@ class ChangeDetector:
         against = self.reference or self._before[-1]
         scores = self.matcher.linearized_at(against.point, list(views), _KERNEL, self._moving)
         value = self.statistic.add(scores, against.covariance, estimate.model)
-        # 3. Keep a reference, or give it up.
+        # 3. Keep the reference, or discard it.
         if self.statistic.exceeded > self.max_pending:
             self.confirmation.unreliable |= self.matcher.objects_of(self.scans) - self._moving
             self.restart()
@@ -242,13 +245,13 @@ class ChangeDetector:
             self.reference = None
         elif self.reference is None:
             self.reference = self._before[0]
-        # 4. Which steps would they have shown?
+        # 4. Note which steps of the calibration they would have shown.
         if value is not None and not self.statistic.exceeded and not self.far:
             self._confirm(estimate)
         return value
 
-    def change(self, estimate: Estimate) -> Change | None:
-        """The change that the frames so far make certain; what they only suggest is noted.
+    def change(self, estimate: ComparedEstimate) -> Change | None:
+        """The change that is certain from the frames so far; one that is only suspected is noted.
 
         Args:
             estimate: the running one.
@@ -266,7 +269,7 @@ class ChangeDetector:
 
     @property
     def lost(self) -> bool:
-        """Whether the image's labels have left what ought to be in view, of two objects or more."""
+        """Whether two objects or more in view do not meet the image's labels at all."""
         objects = frozenset[int]().union(*(tracks for unmet, tracks in self._unmatched if unmet))
         return self._is_unmatched(_LOST_FRAMES) and len(objects) > 1
 
@@ -293,7 +296,7 @@ class ChangeDetector:
         latest = [unmet for unmet, _ in self._unmatched][-frames:]
         return len(latest) == frames and sum(latest) >= frames - 1
 
-    def _confirm(self, estimate: Estimate) -> None:
+    def _confirm(self, estimate: ComparedEstimate) -> None:
         """The latest frames agree with the estimate: note which steps they would have shown."""
         comparison = self.statistic.latest
         if unreliable := self.confirmation.unreliable:
@@ -308,23 +311,23 @@ class ChangeDetector:
             tried = steps(estimate.point.cTl, DETECTABLE_TURN_RAD, DETECTABLE_OFFSET_S)
             self.confirmation.add(self.statistic.detectable(comparison, tried))
 
-    def _contradicted(self, reference: Reference, estimate: Estimate) -> bool:
+    def _contradicted(self, reference: Reference, estimate: ComparedEstimate) -> bool:
         """Whether all frames since the reference contradict it.
 
         They must do so with any one object left out, too. Where a single object contradicts, its labels may
-        err for a while: with one in view, or one that weighs far more than the others, it must do so for
-        longer and much more clearly.
+        be wrong: with one object in view, or one of dominant weight, it must do so for longer and far above
+            the threshold.
         """
         scans = [scan for scan in self.scans if scan >= reference.scan]
         pairs = self.matcher.pairs_at(reference.point, scans, _KERNEL)
-        against = Estimate(reference.point, reference.covariance, estimate.model)
+        against = ComparedEstimate(reference.point, reference.covariance, estimate.model)
 
         def value(*without: int) -> float:
             return self._value(
                 self.matcher.linearized(pairs, reference.point, {*without, *self._moving}), against
             )
 
-        # A step shows more clearly with every frame; labels whose errors last do not.
+        # The statistic of a step grows with every frame; that of lasting errors of labels does not.
         more = len(scans) / (FRAMES + CONFIRMATIONS)
         whole, threshold = value(), self.config.chi2 * max(1.0, more)
         if more >= 1.0 and whole > _SINGLE_OBJECT_FACTOR * threshold:
@@ -333,5 +336,5 @@ class ChangeDetector:
         objects = self.matcher.objects_of(scans) - self._moving
         return whole > least and all(value(track) > least for track in objects)
 
-    def _value(self, scores: Collection[LinearizedPair], estimate: Estimate) -> float:
+    def _value(self, scores: Collection[LinearizedPair], estimate: ComparedEstimate) -> float:
         return self.statistic.normalized(self.statistic.compare(scores, estimate.covariance, estimate.model))

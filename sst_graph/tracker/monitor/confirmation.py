@@ -1,4 +1,4 @@
-"""When new frames last confirmed the estimate: they agreed with it, and would have shown a step."""
+"""Confirmation: time since new frames agreed with the estimate that would have shown a change."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ threshold; under the wide kernel a turn of 1 degree looks like this one [rad].""
 DETECTABLE_OFFSET_S = 0.01
 """The same of a jump of the clock [s]."""
 _MAX_TURN_AGE_S = 1.0
-"""An estimate is unconfirmed where nothing has confirmed for longer where the camera looks [s] ..."""
+"""An estimate is unconfirmed where the camera's orientation was not confirmed for longer [s]."""
 _MAX_OFFSET_AGE_S = 3.0
-"""... or the time offset, in motion [s]; chosen on streets 820 to 829 of ``benchmarks/tracker_steps.py``."""
+"""An estimate is unconfirmed where the time offset was not confirmed for longer, in motion [s]; chosen on
+streets 820 to 829 of ``benchmarks/tracker_steps.py``."""
 
 
 @dataclass
 class Confirmation:
-    """For how long nothing has confirmed the estimate.
+    """Time since the estimate was last confirmed.
 
     Attributes:
-        turn_s: seconds since a frame last confirmed where the camera looks.
+        turn_s: seconds since a frame last confirmed the camera's orientation.
         offset_s: seconds in motion since one last confirmed the time offset; at rest nothing can.
         unreliable: tracks of objects that contradicted the estimate until they were given up; they confirm
             nothing until others have: the estimate has followed them, whether they were right or not.
@@ -42,12 +43,12 @@ class Confirmation:
         return self.turn_s > _MAX_TURN_AGE_S or self.offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
-        """A start confirms all."""
+        """A start confirms everything."""
         self.turn_s = self.offset_s = 0.0
         self.unreliable.clear()
 
     def wait(self, seconds: float, moving: bool) -> None:
-        """Time passes."""
+        """Let time pass."""
         self.turn_s += seconds
         self.offset_s += seconds if moving else 0.0
 

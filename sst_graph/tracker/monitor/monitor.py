@@ -1,4 +1,4 @@
-"""What watches a running estimate."""
+"""Monitoring of a running estimate."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Monitor:
         self.adoption.restart()
 
     def restart(self) -> None:
-        """The calibration is estimated anew."""
+        """The calibration is estimated again."""
         self.changes.restart()
         self.adoption.restart()
 
@@ -51,7 +51,7 @@ class Monitor:
                 return chi2, Restart(near, change.scans, "the calibration has changed", True, chi2)
             self.changes.refused_starts += 1
             near = Guess(estimate.point.cTl, estimate.point.offset_s)
-            why = "new frames contradict the start: it is estimated anew"
+            why = "new frames contradict the start: it is estimated again"
             return chi2, Restart(near, change.scans, why)
         if matches.new:
             cost = partial(self.matcher.cost, chosen=matches.new)
@@ -59,11 +59,11 @@ class Monitor:
         return chi2, None
 
     def recheck_start(self, scan: int, estimate: OnlineEstimate) -> None:
-        """Now and then: do the frames since the start agree with it?"""
+        """At times: check the start against the frames since."""
         assert estimate.smoother is not None
         self.changes.recheck_start(scan, list(estimate.smoother.entries), estimate.for_comparison())
 
     def check_start_at_end(self, estimate: OnlineEstimate) -> None:
-        """At the end of a drive: do the frames of a start that no frame came after agree with it?"""
+        """At the end of a drive: check a start without later frames against its own frames."""
         assert estimate.smoother is not None
         self.changes.check_start_at_end(list(estimate.smoother.entries), estimate.for_comparison())

@@ -17,14 +17,16 @@ from sst_graph.tracker.window.gaussian import Point
 FloatArray = NDArray[np.float64]
 
 FRAMES = 4
-"""New frames that are compared together: fewer hardly show a turn, more delay the alarm."""
+"""New frames that are compared together: with fewer a turn hardly shows, with more the alarm is later."""
 CONFIRMATIONS = 3
 """Frames in a row past the threshold that make a change certain."""
 _LEAST_INFORMATION = 1.0
 """Added to the score's variance [1/rad^2, 1/m^2, 1/s^2, 1/px^2]: at standstill the score of the time offset
-is rounding over rounding, and frames that determine a direction worse than 1 rad, m, s or px do not count."""
+is a quotient of rounding errors, and frames that determine a direction worse than 1 rad, m, s or px do not
+count."""
 _USUAL_FRAMES = 300
-"""Quiet frames from which the usual size of the statistic is taken: real labels err more than the model."""
+"""Quiet frames from which the usual size of the statistic is taken: errors of real labels are larger than the
+model's."""
 _LEAST_USUAL_FRAMES = 10
 """Quiet frames before the statistic is scaled by its usual size."""
 
@@ -59,7 +61,7 @@ class EstimateCovariance:
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ComparedEstimate:
     """An estimate that frames are compared with.
 
     Attributes:
@@ -113,7 +115,7 @@ class Comparison:
             H[:, own] += score.information.information[:n]
             g += score.information.vector[:n]
         core = [score.scores.columns(slice(n)) for score in scores]
-        # Without biases of the objects, for these frames may be of few: no less than independent matches.
+        # A few frames do not determine the objects' biases; at least the variance of independent matches.
         least = replace(model, match=max(1.0, model.match))
         M = total(n, core, [np.arange(n)] * len(core)).variance(least)
         return cls(g, H, M + _LEAST_INFORMATION * np.eye(n), covariance.with_objects(places, object_sigma_px))

@@ -1,4 +1,4 @@
-"""How a tracker comes to its first estimate, and to the one after an alarm: some work with each frame."""
+"""Initialization of the tracker, and after an alarm: some work with each frame."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ NUMERICAL_ERRORS = (
     ArithmeticError,
     np.linalg.LinAlgError,
 )
-"""Errors that numbers alone may lead to; others are errors of the program."""
+"""Errors that may come from the data; all others are errors of the program."""
 
 _WORK_PER_FRAME = 48
 """Work on a start with each frame, in units of 1 to 4 ms: the estimate comes when all is done, some frames
-later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal answers."""
+later, and no frame takes long for it. Work is counted, not timed, so that equal frames give equal results."""
 _RESTART_SCANS = 8
 """Scans that the start after an alarm is made of: fewer than a first one, for it begins near an estimate."""
 _MAX_ATTEMPTS = 2
-"""Failed attempts near the last estimate after an alarm; then the search looks all around it."""
+"""Failed attempts near the last estimate after an alarm; then all of the surroundings are searched."""
 _SUPPORT_WORK, _MATCH_WORK = 2, 1
 """To check the lower edges of a scan, and to match one, in units of work."""
 
@@ -51,7 +51,7 @@ def searched_scans(config: TrackerConfig) -> int:
 
 @dataclass(frozen=True)
 class Restart:
-    """Why, and from where, the calibration is to be estimated anew.
+    """Why, and from where, the calibration is to be estimated again.
 
     Attributes:
         guess: where the new start begins.
@@ -78,9 +78,8 @@ class Initialization:
 
 
 class _Run:
-    """A first estimate as far as it has come.
-
-    It cannot be rolled back; what it has done beyond the work that was asked for is not given out before.
+    """A first estimate that is being computed. A failed frame does not roll it back: its result is returned
+    only once the requested work has reached the work done.
     """
 
     rolls_back = False
@@ -91,7 +90,7 @@ class _Run:
         self._answer: Point | Exception | None = None
 
     def until(self, work: int | None) -> Point | None:
-        """The answer, if it takes no more work than this in all (None: any).
+        """The estimate, if it takes no more work than this in all (None: any).
 
         Raises:
             EstimationError: it has none; or another of :data:`NUMERICAL_ERRORS`.
@@ -111,13 +110,13 @@ class _Run:
 
 
 class Search:
-    """A batch solution of some scans, under way.
+    """A batch solution of some scans that is being computed.
 
     Attributes:
         drive: the scans and images that it is made of, as they were when it began.
         numbers: of the scans.
         guess: where it begins.
-        work: how much of it was asked for.
+        work: work requested so far.
     """
 
     def __init__(self, drive: Drive, numbers: Sequence[int], guess: Guess, config: TrackerConfig) -> None:
@@ -126,7 +125,7 @@ class Search:
         self._run: _Run | None = None
 
     def advance(self, work: int | None) -> Point | None:
-        """Some more work (None: all that is left); the estimate, once it is there.
+        """Do more work (None: all that is left); the estimate, once it is complete.
 
         Raises:
             EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
@@ -138,7 +137,7 @@ class Search:
         return self._run.until(None if work is None else self.work)
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but how far it has come, which follows from the work."""
+        """All but the running computation, which follows from the work."""
         return {**vars(self), "_run": None}
 
 
@@ -177,13 +176,13 @@ class InitialGraph:
 
 
 class Initializer:
-    """When a start is tried, and from where.
+    """Attempts at a first estimate.
 
     Attributes:
         guess: where it begins.
         waited: scans since the last attempt, or those kept at the restart.
         attempts: how many have failed.
-        alarmed: an alarm went before, and no estimate has been found since.
+        alarmed: there was an alarm, and no estimate since.
         search: the batch solution that is under way.
         graph: the graph that is being made at a solution.
         work_per_frame: done with each frame; None: all with one, which takes seconds.
@@ -213,7 +212,7 @@ class Initializer:
         return _RESTART_SCANS if self.alarmed else self.config.start_scans
 
     def work(self, matcher: WindowMatcher) -> Initialization | None:
-        """What is done with a scan that has come; an estimate, once it is there.
+        """Do the work of one scan; the first estimate, once it is complete.
 
         Raises:
             EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
@@ -229,7 +228,7 @@ class Initializer:
         return None if self.graph is None else self._made(matcher, self.work_per_frame)
 
     def finish(self, matcher: WindowMatcher) -> Initialization | None:
-        """All that is left to do, at the end of a drive; None where too few scans have come.
+        """Complete the initialization at the end of a drive; None where there are too few scans.
 
         Raises:
             EstimationError: none was found; or another of :data:`NUMERICAL_ERRORS`.
@@ -298,13 +297,13 @@ class Initializer:
         return Initialization(smoother, Uncertainty.of(smoother), len(initial.chosen))
 
     def catch_up(self) -> None:
-        """Do again what a search that was stored had done."""
+        """Repeat the work that a stored search had done."""
         if self.search is not None:
             with suppress(*NUMERICAL_ERRORS):
                 self.search.advance(0)
 
     def failed(self) -> None:
-        """An attempt has failed; after some, the search looks all around the guess."""
+        """An attempt has failed; after some, all of the surroundings of the guess are searched."""
         self.attempts += 1
         self.search = self.graph = None
         if self.attempts >= _MAX_ATTEMPTS:

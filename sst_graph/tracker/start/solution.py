@@ -42,7 +42,7 @@ from sst_graph.types import SemanticClass
 _OTHER_BASIN_RAD = float(np.radians(2.0))
 """Poses that are turned by more are in different basins of convergence."""
 _LEAST_PAIRS_SHARE = 0.7
-"""Share of the pairs that the first solution must still match: below it, the solution has run off in time."""
+"""Share of the pairs that the first solution must still match: below it, its time offset has diverged."""
 _LEAST_GAIN = 0.1
 """By which fraction of the cost a solution must be better than another one to be preferred to it, where their
 costs hardly differ: one whose offset was searched, or one of another basin."""
@@ -77,13 +77,13 @@ class _Solved:
     cost: float
     point: Point
 
-    def turned_from(self, other: _Solved) -> bool:
-        """Whether the two are poses of different basins."""
+    def in_other_basin_than(self, other: _Solved) -> bool:
+        """Whether the two are in different basins of convergence."""
         return _turn_rad(self.point.cTl, other.point.cTl) > _OTHER_BASIN_RAD
 
 
 class _NotConverged(EstimationError):
-    """A solution that still moved when its iterations ended; where it was by then."""
+    """A solution that did not converge, and the point that it reached."""
 
     def __init__(self, message: str, reached: _Solved) -> None:
         super().__init__(message)
@@ -98,19 +98,19 @@ def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> S
     them better by a tenth, and within a solution a step of the offset is damped.
 
     Raises:
-        EstimationError: too little to see, an ambiguous start, no solution that converged, or one that
+        EstimationError: too few matches, an ambiguous start, no solution that converged, or one that
             explains the labels less well than another that did not converge.
     """
     searched = guess.search or guess.cTl is None
     reach = config.calibration.search.time_offset_s if guess.search else 0.0
     # 1. Candidates, with time offsets around the guess's.
     starts = yield from _starts(drive, guess, config, reach)
-    # 2. Their poses with the guess's time offset; then as they are.
-    held = [State(start.cTl, (guess.offset_s,)) for start in _of_other_basins(starts)]
-    # After a search they are near.
+    # 2. Solutions from their poses with the guess's time offset, and from the candidates as they are.
+    held = [State(start.cTl, (guess.offset_s,)) for start in _one_of_each_basin(starts)]
+    # After a search the starts are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
-    ways = [held, starts] if reach > 0.0 else [starts]
-    solved, failed = yield from _all_of([_best(drive, way, kernels_px, config) for way in ways])
+    families = [held, starts] if reach > 0.0 else [starts]
+    solved, failed = yield from _all_of([_best(drive, each, kernels_px, config) for each in families])
     if not solved:
         raise failed[-1]
     best, *others = solved
@@ -121,8 +121,8 @@ def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> S
     return best.point
 
 
-def _of_other_basins(starts: Sequence[State]) -> list[State]:
-    """The starts that are not in the basin of one before."""
+def _one_of_each_basin(starts: Sequence[State]) -> list[State]:
+    """One start of each basin of convergence: those in the basin of an earlier one are left out."""
     chosen: list[State] = []
     for start in starts:
         if all(_turn_rad(start.cTl, other.cTl) > _OTHER_BASIN_RAD for other in chosen):
@@ -134,19 +134,19 @@ def _turn_rad(one: gtsam.Pose3, other: gtsam.Pose3) -> float:
     return float(np.linalg.norm(gtsam.Rot3.Logmap(one.between(other).rotation())))
 
 
-def _all_of(ways: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
-    """The solutions, and why there are no others."""
+def _all_of(attempts: Sequence[Stepwise[_Solved]]) -> Stepwise[tuple[list[_Solved], list[EstimationError]]]:
+    """The solutions, and the errors of those that failed."""
     solved, failed = [], []
-    for way in ways:
+    for attempt in attempts:
         try:
-            solved.append((yield from way))
+            solved.append((yield from attempt))
         except EstimationError as error:
             failed.append(error)
     return solved, failed
 
 
 def _not_converged(failed: Sequence[EstimationError]) -> list[_Solved]:
-    """Where those were that only did not converge."""
+    """The points that solutions without convergence reached."""
     return [error.reached for error in failed if isinstance(error, _NotConverged)]
 
 
@@ -156,7 +156,7 @@ def _check_not_converged(best: _Solved, failed: Sequence[EstimationError]) -> No
     At a steady speed the time offset may move along with the translation without end.
     """
     for other in _not_converged(failed):
-        if best.turned_from(other) and other.cost < (1.0 - _LEAST_GAIN) * best.cost:
+        if best.in_other_basin_than(other) and other.cost < (1.0 - _LEAST_GAIN) * best.cost:
             raise EstimationError(
                 f"another pose explains the labels better (cost {other.cost:.3f} against {best.cost:.3f} a "
                 "point), but has not converged"
@@ -179,7 +179,7 @@ def _best(
     best, *others = sorted(solved, key=lambda solution: solution.cost)
     _check_not_converged(best, failed)
     for other in others:
-        if best.turned_from(other) and best.cost > (1.0 - _LEAST_GAIN) * other.cost:
+        if best.in_other_basin_than(other) and best.cost > (1.0 - _LEAST_GAIN) * other.cost:
             raise EstimationError(
                 f"two poses explain the labels alike (cost {best.cost:.3f} and {other.cost:.3f} a point)"
             )
@@ -220,7 +220,7 @@ def _solution(
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
     parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    cTl, offset_s = state.cTl, state.offset_s(0)
+    cTl, offset_s = state.cTl, state.time_offset_s(0)
     point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
@@ -228,7 +228,7 @@ def _solution(
     if explained(solution) < MIN_EXPLAINED:
         share = f"{100.0 * explained(solution):.0f} %"
         raise EstimationError(f"only {share} of the boundary points in view meet a contour under it")
-    _check_pairs(drive, start.offset_s(0), len(solution.pairs), state.offset_s(0), config)
+    _check_pairs(drive, start.time_offset_s(0), len(solution.pairs), state.time_offset_s(0), config)
     return _Solved(_cost(drive, point, config), point)
 
 
@@ -243,7 +243,7 @@ def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
 
 
 def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, config: TrackerConfig) -> None:
-    """Refuse a solution that has run off in time: it leaves pairs behind, or the searched offsets."""
+    """Refuse a solution whose time offset has diverged: it loses pairs, or leaves the searched range."""
     seen = [
         pair
         for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, start_s, drive.image_period_s)

@@ -1,7 +1,7 @@
 """A tracker on disk: one npz file, written whole or not at all, arrays and JSON only.
 
-What is read is compared with its checksum, with the classes of the estimators, and with what a tracker can
-answer; a file that fails any of it is refused as a whole.
+On reading, the checksum and the classes of the objects are checked, and the tracker must give its estimate; a
+file that fails any check is refused as a whole.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from sst_graph.files import atomic_write_in_steps
 from sst_graph.files.checked_values import checked_camera
 from sst_graph.files.object_store import Block, Blocks, Node, class_name, lay_out, restored, stored
 from sst_graph.files.reading import FileKind, parse_json, read_file
-from sst_graph.tracker.answer import current
+from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.storage.resume import Setup, check_inputs, check_setup
 from sst_graph.types import NO_PICTURE, CameraImage
 
@@ -154,7 +154,7 @@ class Saver:
 
 
 def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
-    """Build iSAM2 and the odometry's map anew from what a checkpoint holds.
+    """Build iSAM2 and the odometry's map again from what a checkpoint holds.
 
     The estimate stays; from here on this tracker and one loaded from a checkpoint of it go on alike.
 
@@ -168,7 +168,7 @@ def consolidate(tracker: Tracker, laid_out: Container[int] = ()) -> None:
 
 
 def _lasting(tracker: Tracker) -> Iterator[object]:
-    """What never changes of what a tracker holds, most of it; the rest of that is small."""
+    """The immutable parts of a tracker, which are most of it."""
     yield from (features for _, features in tracker.inputs.window.scans)
     yield from tracker.inputs.window.images
     if tracker.estimate.smoother is not None:
@@ -278,7 +278,8 @@ def _tracker(document: dict[str, Any], data: memoryview, path: str | Path) -> Tr
 
 
 def _check_tracker(tracker: Tracker, path: str | Path) -> None:
-    """Require a tracker that answers and accepts its last frame once more: its parts are consistent.
+    """Require a tracker that gives its estimate and accepts its last frame once more: its parts are
+    consistent.
 
     Raises:
         CheckpointError: it does not, whatever it raises; a file may hold any contradiction.
@@ -287,13 +288,13 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
         checked_camera(tracker.inputs.camera, "camera")
         check_inputs(tracker)
         tracker.initializer.catch_up()
-        current(tracker).to_dict()
+        current_update(tracker).to_dict()
         consolidate(tracker)
         _again(tracker)
-        current(tracker).to_dict()
+        current_update(tracker).to_dict()
         stored(tracker)
     except Exception as error:
-        found = f"a tracker that does not answer ({type(error).__name__}: {error})"
+        found = f"a tracker that gives no estimate ({type(error).__name__}: {error})"
         raise CheckpointError(path, found, "all of a tracker") from error
 
 

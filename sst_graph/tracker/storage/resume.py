@@ -154,7 +154,7 @@ class _DriveComparison:
             self._others.append(f"another {_sensor(data)} of {data.stamp_ns} ns")
 
     def difference(self) -> str:
-        """What frames were other, or missing; empty where none was."""
+        """Frames that differ or are missing, in words; empty where none does."""
         missing = [f"no {sensor} of {stamp_ns} ns" for sensor, stamp_ns in self._digests]
         return next(iter([*self._others, *missing]), "")
 

@@ -1,4 +1,4 @@
-"""The state of an object and of all that it holds, to be restored where an update fails half way."""
+"""Snapshot of an object and all that it holds, restored where an update fails."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Snapshot:
     Lists, dictionaries, sets, deques and the package's own objects are recorded, one level each, wherever
     they are reached from; :meth:`restore` puts their contents back into the very same objects. All else
     (arrays, poses, iSAM2, frozen dataclasses) must never change in place, only be replaced. Objects of a
-    class whose ``rolls_back`` is False stay as they have become.
+    class whose ``rolls_back`` is False are not restored.
     """
 
     def __init__(self, root: object) -> None:

@@ -17,7 +17,7 @@ from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, GraphConfig, PairMatches
-from sst_graph.graph.nuisances import columns_beside
+from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
 from sst_graph.tracker.sums.object_sums import ObjectInformation
@@ -40,7 +40,7 @@ class LinearizedPair:
         information: Gaussian on [extrinsic, offset, biases, parameters, and the biases of the objects it
             sees]; behind these it may hold parameters of assumptions.
         observed: the same with the robust loss's second derivatives in place of the weights (observed
-            information): how the gradient of matches that are kept follows an estimate that moves on.
+            information): the derivative of the gradient of kept matches by the estimate.
         scores: sums of the matches' scores, in the columns of the Gaussian, what it holds included.
         residuals: of the matches, by side.
         matches: number of matches.
@@ -101,7 +101,7 @@ def linearize_pair(
 
     Args:
         tracks: number of the track of each (class, object) of the scan.
-        share: factor that the weights of all matches carry beside their own.
+        share: factor on the weights of all matches.
         by_object: keep the matches object by object, too.
         held: assumptions whose parameters are held behind the unknowns.
     """
@@ -119,7 +119,7 @@ def linearize_pair(
     curved = min(max(curvature / weight, _LEAST_CURVATURE), 1.0)
     observed, _ = _without_twist(point, curved * H + motion, g)
     known = np.array([*range(n), *range(m, m + 6)])
-    J = J - JV @ gain  # as the estimate follows a residual, the twist following the estimate
+    J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
     track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     own, frame = roots / np.sqrt(share), np.zeros(len(r), np.intp)
@@ -138,7 +138,8 @@ def linearize_pair(
 
 
 def _with_share(scores: ScoreSums, share: float) -> ScoreSums:
-    """Scores of matches whose weights carry a common share: errors are those of their own weights."""
+    """Scores of matches whose weights are multiplied by a common factor; the errors are those of the original
+    weights."""
     return replace(scores, independent=share * scores.independent)
 
 
@@ -153,7 +154,7 @@ def _by_static_objects(pair: PairMatches, point: Point, A: FloatArray, motion: F
 
 def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian, FloatArray]:
     """The Gaussian on the unknowns and what is held, from information and vector over these and the twist;
-    (6, n) how the twist's optimum follows them, with the sign changed."""
+    (6, n) minus the derivative of the twist's optimum by them."""
     n = len(H) - 6
     gain = np.asarray(np.linalg.solve(H[n:, n:], np.column_stack([H[n:, :n], g[n:]])), np.float64)
     information = H[:n, :n] - H[:n, n:] @ gain[:, :n]
@@ -170,7 +171,7 @@ def _tracks_of(
 
 
 def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> FloatArray:
-    """(m,) the robust loss's second derivatives, each weighted as its match is beside the kernel."""
+    """(m,) the robust loss's second derivatives, each multiplied by its match's own weight."""
     r, parts, start = unweighted(weighted, root), [], 0
     for matches in pair.matches.values():
         some = slice(start, start + len(matches))
@@ -205,7 +206,7 @@ def _rows(
             block[:, place] = pair.terms[c][name] * J[:, 13]
         if held:
             assert pair.scene is not None
-            own = columns_beside(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
+            own = columns_of_jacobian(J, alignment, pair.scene, pair.pair.base_tau_s, at, held)
             block[:, point.size :] = own
         blocks.append(block)
         twists.append(J[:, 7:13])

@@ -123,7 +123,7 @@ class ObjectSums:
         self.closed = T @ self.closed @ T.T
 
     def close(self, seen: Container[int], information: FloatArray, naive: FloatArray, point: Point) -> None:
-        """Forget the objects that are not ``seen`` any more, but not what leaving them out would change.
+        """Drop the objects that are not ``seen`` any more, but keep their jackknife steps in the sums.
 
         Args:
             information, naive: (n, n) of everything, and its inverse.
@@ -141,7 +141,7 @@ class ObjectSums:
         self.weight2 += sum(own.weight**2 for own in gone.values())
 
     def spread(self, window: Sequence[ObjectInformation], naive: FloatArray, point: Point) -> ObjectSpread:
-        """How the estimate varies with the objects.
+        """The spread of the estimate over the objects.
 
         Args:
             window: objects of the frames beside those added.

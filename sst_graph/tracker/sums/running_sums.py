@@ -1,4 +1,4 @@
-"""The sums of the cluster-robust covariance, frame by frame: they stay small however long the drive.
+"""The sums of the cluster-robust covariance, frame by frame; their size does not grow with the drive.
 
 A frame that leaves the window is added to them and forgotten; sides that were not seen lately are closed.
 """
@@ -111,8 +111,8 @@ class RunningSums:
 
         Args:
             window: pairs beside those added.
-            columns: of their unknowns, and of what they hold where that is asked for.
-            with_held: over what is held, too.
+            columns: of their unknowns, and of the held parameters where ``with_held``.
+            with_held: over the held parameters, too.
         """
         n = self.size + self.held if with_held else self.size
         past = self.scores.columns(slice(n))

@@ -1,4 +1,4 @@
-"""What the window's graph is made of: matched pairs, and epochs that share one calibration."""
+"""Parts of the window's graph: matched pairs, and epochs with one calibration each."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ class EpochSums:
         self.sums.add(pair, columns, scan, by_object=False)
 
     def retired(self, start_ns: int, model: ErrorModel) -> RetiredEpoch:
-        """What is kept of the epoch: its objects' biases marginalized out."""
+        """The epoch without its objects' biases, which are marginalized out."""
         H = self.information.information
         variance = H + self.sums.excess([], [], model)
         excess = composed(variance, None, self.sums.weight_curvature_ratio()) - H

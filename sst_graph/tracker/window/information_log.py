@@ -28,7 +28,7 @@ class InformationLog:
         self._last: FloatArray | None = None
 
     def restart(self) -> None:
-        """A new calibration begins: its first scan has gained no known number of bits."""
+        """A new calibration begins; the information of its first scan is not known."""
         self._last = None
 
     def add(self, scan: int, covariance: FloatArray) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.assumptions import held_at_zero
 from sst_graph.batch.lower_edges import LowerEdgeSupport, lower_edge_support
-from sst_graph.drive.preparation import Drive, outline_size, outlines
+from sst_graph.drive.preparation import Drive, boundaries_of, boundary_count
 from sst_graph.drive.trajectory import GrowingTrack
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.building import PairMatches, Tracks, associate
@@ -28,7 +28,7 @@ from sst_graph.types import SemanticClass
 _MIN_MATCHES = 8
 """Fewest matches of a scan that enters the graph: fewer hardly determine anything."""
 _SMOOTHED = 12
-"""So many of the latest motions are smoothed anew with every scan."""
+"""So many of the latest motions are smoothed again with every scan."""
 
 
 class WindowMatcher:
@@ -46,7 +46,7 @@ class WindowMatcher:
         self._last: tuple[Point, dict[int, PairMatches]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """All but what it keeps for the present frame."""
+        """All but the cache for the present frame."""
         return {**vars(self), "_twists": None, "_last": None}
 
     def check_lower_edges(self, point: Point) -> None:
@@ -117,7 +117,7 @@ class WindowMatcher:
     def in_view(
         self, point: Point, chosen: Collection[int], without: Collection[int]
     ) -> dict[int, dict[int, int]]:
-        """How many boundary points of each object of scans that have an image ought to be seen in it.
+        """How many boundary points of each object of scans that have an image should be visible in it.
 
         Args:
             without: tracks of objects that do not count.
@@ -132,7 +132,7 @@ class WindowMatcher:
         ):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
-            for c, points in outlines(part.scans[pair.scan], self.graph.lower_edges).items():
+            for c, points in boundaries_of(part.scans[pair.scan], self.graph.lower_edges).items():
                 if c in contours:
                     cPs = points.lPs @ point.cTl.rotation().matrix().T + point.cTl.translation()
                     inside = points.objects[part.camera.in_image(part.camera.project(cPs))]
@@ -166,13 +166,13 @@ class WindowMatcher:
         return replace(pair, matches=matches, tracks=own, terms=terms)
 
     def cost(self, point: Point, chosen: Collection[int]) -> float | None:
-        """Mean cost of the boundary points of some scans at a point; None where none can be seen."""
+        """Mean cost of the boundary points of some scans at a point; None where none is in view."""
         if self._last is not None and self._last[0] is point:
             pairs = {number: pair for number, pair in self._last[1].items() if number in chosen}
         else:
             pairs, _ = self._pairs(point, chosen, self.kernel)
         scans, below = dict(self.window.scans), self.graph.lower_edges
-        counted = [(pair, outline_size(scans[number], below)) for number, pair in pairs.items()]
+        counted = [(pair, boundary_count(scans[number], below)) for number, pair in pairs.items()]
         return mean_cost(counted, point, self.classes, self.kernel)
 
     def _pairs(

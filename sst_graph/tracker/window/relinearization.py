@@ -21,9 +21,9 @@ from sst_graph.tracker.window.smoother import WindowSmoother
 _CONVERGED_SIGMAS = 0.02
 """A step of matching and solving that is shorter, in standard deviations, has converged."""
 _INNER = 2
-"""Steps of the optimisation on frozen matches, as in the batch: the next matches move it anyway."""
+"""Steps of the optimisation on frozen matches, as in the batch: the next matches change it anyway."""
 SCANS = 5
-"""Scans matched with each frame while the window is matched anew: more make these frames slower."""
+"""Scans matched with each frame while the window is matched again: more make these frames slower."""
 _PASSES = 2
 """How often a running tracker matches the whole window when it relinearizes."""
 
@@ -33,7 +33,7 @@ class RelinearizationSchedule:
     """When a running tracker relinearizes its window: each time it has seen twice as many scans, and before
     scans first leave.
 
-    An estimate by few scans moves on, and their matches were made where it no longer is.
+    An estimate from few scans moves, and their matches were made at earlier estimates.
 
     Attributes:
         first: number of the first scan.
@@ -58,19 +58,19 @@ class RelinearizationSchedule:
 def relinearize_window(
     smoother: WindowSmoother,
     matcher: WindowMatcher,
-    kernel_px: Sequence[float],
+    kernels_px: Sequence[float],
     most: int,
     alive: Container[int],
     share: float = 1.0,
 ) -> bool:
     """Match all scans, solve, and again under the next kernel; then under the last until it converges.
 
-    Matches made frame by frame hold the estimate within a standard deviation or two of where the batch
-    would end. Where matches come and go in turn, so that the estimate goes round in a circle, the steps
-    are shortened and end in the middle of it, as the batch's do.
+    Matches made frame by frame keep the estimate within one or two standard deviations of the batch's. Where
+    some matches appear and disappear in turn, the estimate oscillates, and the steps are shortened as in the
+    batch (:mod:`sst_graph.graph.convergence`).
 
     Args:
-        kernel_px: scales of the robust kernel, one a step.
+        kernels_px: scales of the robust kernel, one a step.
         most: further steps under the last one.
         alive: tracks of objects that may be seen again.
         share: factor on the weights of all matches.
@@ -82,12 +82,12 @@ def relinearize_window(
         EstimationError: an update fails; what the steps before it reached stays.
     """
     at = smoother.point
-    for i in range(len(kernel_px) + most):
-        kernel = RobustKernel("geman_mcclure", kernel_px[min(i, len(kernel_px) - 1)])
+    for i in range(len(kernels_px) + most):
+        kernel = RobustKernel("geman_mcclure", kernels_px[min(i, len(kernels_px) - 1)])
         found, missing = matcher.match(at, None, kernel, share)
         smoother.update(found, missing, 0, alive)
         smoother.optimize(_INNER)
-        last = i + 1 - len(kernel_px)
+        last = i + 1 - len(kernels_px)
         left = smoother.point.core().local(at.core())
         n = len(left)
         if (
@@ -103,13 +103,12 @@ def relinearize_window(
 
 
 class WindowRelinearization:
-    """The whole window of a running tracker matched again, some scans with each frame.
-
-    First the support of the lower edges is counted; then each scan is matched, the oldest first, at the
-    estimate as it is by then, and all once more.
+    """Relinearization of a running tracker's window, some scans with each frame. First the support of the
+    lower edges is counted; then each scan is matched at the present estimate, the oldest first, in two
+    passes.
 
     Attributes:
-        below: support of the lower edges so far; None when it is known.
+        support: of the lower edges so far; None when it is complete.
         passes: how often all are still to be matched.
         done: scans that were counted, or matched, in this pass.
     """
@@ -118,7 +117,7 @@ class WindowRelinearization:
         self._matcher = matcher
         self.passes = _PASSES
         never = matcher.config.calibration.lower_edges == "never"
-        self.below = None if never else LowerEdgeSupport()
+        self.support = None if never else LowerEdgeSupport()
         self.done: set[int] = set()
 
     @property
@@ -136,12 +135,12 @@ class WindowRelinearization:
         # The newest is matched as it comes.
         self.done.update(numbers[-1:])
         waiting = [number for number in numbers if number not in self.done]
-        counting, below = self.below is not None, self.below
+        counting, support = self.support is not None, self.support
         # To count the support is to match twice.
         most = max(1, SCANS - fewer)
         some = waiting[: (most + 1) // 2 if counting else most]
-        if below is not None:
-            self.below = below.plus(self._matcher.lower_edge_support(point, some))
+        if support is not None:
+            self.support = support.plus(self._matcher.lower_edge_support(point, some))
         self.done.update(some)
         if len(some) == len(waiting):
             self._next()
@@ -150,8 +149,8 @@ class WindowRelinearization:
     def _next(self) -> None:
         """All scans have been matched."""
         self.done.clear()
-        if self.below is None:
+        if self.support is None:
             self.passes -= 1
         else:
-            self._matcher.set_lower_edges(self.below)
-            self.below = None
+            self._matcher.set_lower_edges(self.support)
+            self.support = None

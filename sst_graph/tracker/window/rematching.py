@@ -1,4 +1,4 @@
-"""Which scans of the window are matched again with a frame."""
+"""Selection of the scans that are matched again with a frame."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _FRESH_SIGMAS = 0.02
 """A scan is matched once more before it leaves the window if the estimate has moved farther since."""
 
 _IN_TURN = 1
-"""Scans matched anew with each frame besides the newest, the most outdated first: each costs as much as the
+"""Scans matched again with each frame besides the newest, the most outdated first: each costs as much as the
 newest."""
 _MOST_IN_TURN = 4
-"""As many while the estimate moves."""
+"""Most scans matched again while the estimate moves."""
 _STALE_SIGMAS = 0.3
 """Matches are outdated where the estimate has moved farther since, in standard deviations."""
 

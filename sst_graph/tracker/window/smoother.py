@@ -1,4 +1,4 @@
-"""iSAM2 over a window of pairs that are matched anew; what leaves it stays as one linear factor."""
+"""iSAM2 over a window of pairs; pairs that leave it are kept as one linear factor."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class WindowSmoother:
 
         Args:
             found: new matches by scan.
-            dropped: scans that no longer have a match: they leave, and nothing of them stays.
+            dropped: scans that no longer have a match: they are removed, and not added to ``past``.
             first_scan: the window's first scan.
             alive: tracks of objects that may be seen again; the biases of all others are marginalized out
                 as soon as no pair of the window sees them.
@@ -240,7 +240,7 @@ class WindowSmoother:
     def _linearized(
         self, values: gtsam.Values, graph: gtsam.NonlinearFactorGraph | None = None
     ) -> tuple[gtsam.ISAM2, list[int]]:
-        """A fresh iSAM2 of all factors (made anew where None) at some values, and the factors' indices."""
+        """A fresh iSAM2 of all factors (made again where None) at some values, and the factors' indices."""
         isam = gtsam.ISAM2(_parameters(self.graph.estimate))
         whole = self._whole() if graph is None else graph
         return isam, list(isam.update(whole, values).getNewFactorsIndices())
@@ -345,7 +345,7 @@ class WindowSmoother:
         """(n, n) variance of the score of past and window beyond that of independent matches.
 
         Args:
-            with_held: over what ``past`` holds, too.
+            with_held: over the held parameters of ``past``, too.
         """
         window, point = [entry.linear for entry in self.entries.values()], self.past.point
         held = self.past.held if with_held else 0

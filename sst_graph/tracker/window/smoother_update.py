@@ -83,7 +83,7 @@ class SmootherUpdate:
 
     def run(self) -> None:
         """Prepare all changes, update the copy of iSAM2, read the estimate."""
-        # 1. Pairs and objects that leave, pairs that are matched anew, new ones.
+        # 1. Pairs and objects that leave, pairs that are matched again, new ones.
         self._retire()
         self._insert_objects()
         self._add_pairs()
@@ -165,7 +165,7 @@ class SmootherUpdate:
         self.sums.objects.close(kept, information, scaled_inverse(information), point)
 
     def _add_pairs(self) -> None:
-        """New pairs, and those matched anew in the place of the old."""
+        """New pairs, and those matched again in the place of the old."""
         smoother = self._smoother
         for scan, new in sorted(self._found.items()):
             known = self.entries.get(scan)

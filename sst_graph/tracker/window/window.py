@@ -1,4 +1,4 @@
-"""The last scans, images and motions: what the tracker can still match anew."""
+"""The last scans, images and motions, which the tracker can still match."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Window:
 
     Attributes:
         size: most scans, but while nothing may leave.
-        sampled: latest scans of which the sample of labelled points is kept: a search looks at no others.
+        sampled: latest scans of which the sample of labelled points is kept: the search uses no others.
         growing: no scan leaves; afterwards two leave with each that comes, until ``size`` are left.
         tracks: track of each (class, object) of a scan, by the scan's number.
         dynamics: which objects are dynamic.
@@ -163,7 +163,7 @@ class Window:
 
         Args:
             margin_ns: how far from a scan of the window, or behind the newest image, an image may lie.
-            most: of all; beyond it the oldest go, whatever they lie near. Two always stay.
+            most: of all; beyond it the oldest go, whatever scan they are near. Two always stay.
         """
         if not self.images:
             return

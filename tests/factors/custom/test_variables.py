@@ -38,7 +38,7 @@ def bench(make_scene):
 def test_an_offset_may_be_a_vector_or_a_double(bench, name):
     factor = bench.makers()[name](E, D)
     vector, double = bench.values(), bench.values(float(bench.offset_s))
-    # one factor on both by turns: the type is looked up anew where it changes
+    # one factor on both by turns: the type is looked up again where it changes
     for values in (double, vector, double):
         assert factor.error(values) == pytest.approx(factor.error(vector), rel=1e-12)
         np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""From what a method found to a result: status, reasons, versions; the same for every method."""
+"""From the estimate of any method to a calibration result: status, reasons, versions."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ PACKAGES = ("sst-graph", "gtsam", "numpy", "scipy", "small_gicp")
 
 @dataclass(frozen=True)
 class Guess:
-    """What is known at first: an extrinsic, or None, and a time offset [s]."""
+    """Initial guess: an extrinsic, or None, and a time offset [s]."""
 
     cTl: gtsam.Pose3 | None
     offset_s: float = 0.0
@@ -58,17 +58,17 @@ class DriveCovariance:
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What a method found.
+class MethodEstimate:
+    """The estimate of a method, and what it reports.
 
     Attributes:
         cTl, offset_s: the estimate.
         covariance: (7, 7), see :class:`~sst_graph.result.CalibrationResult`.
         frames: that took part.
         reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
-        remarks: what else was missing, for the reader.
+        remarks: notes for the reader that do not change the status.
         by_static_objects: (7, 7) covariance by static objects alone, and by motion where always used.
-        drive_offsets: an offset for each drive, where one each was asked for.
+        drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
     """
@@ -86,42 +86,44 @@ class Answer:
 
 
 def result_of(
-    answer: Answer, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+    estimate: MethodEstimate, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
-    """The result: unobservable where the covariance says so, not_converged where the answer may be wrong."""
+    """The result: not_converged where there is a reason, unobservable where a direction exceeds the
+    limits."""
     advice = MOTION if config.method == "motion" else SILHOUETTES
-    weak = _weak_directions(answer, config.observability, advice)
-    wrong = (*answer.reasons, *(_jumps(drives) if config.check_stamps else ()))
+    weak = _weak_directions(estimate, config.observability, advice)
+    wrong = (*estimate.reasons, *(_jumps(drives) if config.check_stamps else ()))
     status: Status = "not_converged" if wrong else "unobservable" if weak else "ok"
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(
-        T_camera_lidar=answer.cTl,
-        time_offset_s=answer.offset_s,
-        covariance=answer.covariance,
+        T_camera_lidar=estimate.cTl,
+        time_offset_s=estimate.offset_s,
+        covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
-        reasons=(*wrong, *answer.remarks, *sentences),
+        reasons=(*wrong, *estimate.remarks, *sentences),
         weak_directions=weak,
-        frames_used=answer.frames,
-        drive_offsets=answer.drive_offsets,
+        frames_used=estimate.frames,
+        drive_offsets=estimate.drive_offsets,
         method=config.method,
         config=to_dict(config),
         initial=guess.cTl,
         initial_offset_s=guess.offset_s,
-        diagnostics={**answer.diagnostics, **sweeps_of(drives)},
+        diagnostics={**estimate.diagnostics, **sweeps_of(drives)},
         versions=_versions(),
     )
 
 
 def _weak_directions(
-    answer: Answer, limits: ObservabilityConfig, advice: Advice
+    estimate: MethodEstimate, limits: ObservabilityConfig, advice: Advice
 ) -> tuple[WeakDirection, ...]:
-    """What is not known; where drives have an offset each, of each drive's, named by the drive."""
-    if not answer.by_drive:
-        return open_directions(answer.covariance, answer.by_static_objects, answer.cTl, limits, advice)
+    """Directions beyond the limits; where drives have an offset each, those of each drive, named by the
+    drive."""
+    if not estimate.by_drive:
+        return open_directions(estimate.covariance, estimate.by_static_objects, estimate.cTl, limits, advice)
     found: list[WeakDirection] = []
-    for number, known in enumerate(answer.by_drive):
-        for weak in open_directions(known.covariance, known.by_static_objects, answer.cTl, limits, advice):
+    for number, known in enumerate(estimate.by_drive):
+        for weak in open_directions(known.covariance, known.by_static_objects, estimate.cTl, limits, advice):
             if involves_offset(weak):
                 found.append(replace(weak, sentence=f"drive {known.drive!r}: {weak.sentence}"))
             elif number == 0:  # of the extrinsic alone, which all drives share
@@ -130,7 +132,7 @@ def _weak_directions(
 
 
 def sweeps_of(drives: Sequence[Drive]) -> dict[str, Any]:
-    """What was decided of the sweeps, by name of the drive, as an entry of the diagnostics."""
+    """Decisions about the sweeps by name of the drive, as an entry of the diagnostics."""
     found = {drive.name: drive.sweep.to_dict() for drive in drives if drive.sweep is not None}
     return {SWEEP_KEY: found} if found else {}
 
@@ -159,18 +161,19 @@ def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[Frame
 
 def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray) -> tuple[DriveOffset, ...]:
     """Each drive's time offset, where they have one each; covariance: (n, n) of extrinsic and offsets."""
-    if len(state.offsets_s) == 1:
+    if len(state.time_offsets_s) == 1:
         return ()
     sigmas = np.sqrt(np.diag(covariance))
     return tuple(
-        DriveOffset(drive.name, state.offset_s(i), float(sigmas[6 + i])) for i, drive in enumerate(drives)
+        DriveOffset(drive.name, state.time_offset_s(i), float(sigmas[6 + i]))
+        for i, drive in enumerate(drives)
     )
 
 
-def no_answer(
+def guess_as_result(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, reason: str
 ) -> CalibrationResult:
-    """What is known when no estimate could be made: the guess, with sigmas that say so."""
+    """The result where no estimate could be made: the guess, with large sigmas."""
     sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
     return CalibrationResult(
         T_camera_lidar=guess.cTl or gtsam.Pose3(),

@@ -43,7 +43,8 @@ def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]])
     # With one frame, lower edges have been checked; the newest scan is matched as it comes.
     assert len(tracker.estimate.relinearization.done) == (SCANS + 1) // 2 + 1
     assert (
-        tracker.estimate.relinearization.below is not None and tracker.estimate.relinearization.below.narrow
+        tracker.estimate.relinearization.support is not None
+        and tracker.estimate.relinearization.support.narrow
     )
 
 

@@ -1,4 +1,4 @@
-"""The tracker's state as its answer to a frame."""
+"""The tracker's present state as a TrackUpdate."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 
-def answer(
+def make_update(
     tracker: Tracker, stamp_ns: int, reason: str = "", *, chi2: float | None = None, alarm: bool = False
 ) -> TrackUpdate:
-    """The present estimate and what is known of it.
+    """The present estimate, its covariance and status, as an update.
 
     Args:
         stamp_ns: of the scan or image that was added.
@@ -57,13 +57,13 @@ def answer(
     )
 
 
-def current(tracker: Tracker, last: TrackUpdate | None = None) -> TrackUpdate:
+def current_update(tracker: Tracker, last: TrackUpdate | None = None) -> TrackUpdate:
     """The present estimate, without a frame.
 
     Args:
-        last: answer to the last frame; what it holds of that frame stays.
+        last: update of the last frame; its fields about that frame are kept.
     """
-    update = answer(tracker, tracker.inputs.window.last_stamp_ns or 0)
+    update = make_update(tracker, tracker.inputs.window.last_stamp_ns or 0)
     if last is None:
         return update
     of_frame = ["stamp_ns", "refused", "chi2", "alarm", "adopted"]

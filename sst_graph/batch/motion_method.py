@@ -1,4 +1,4 @@
-"""``--method motion``: the hand-eye solution as an answer of ``calibrate``."""
+"""``--method motion``: the hand-eye solution as a method of ``calibrate``."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 
-from sst_graph.batch.answer import Answer, Guess
 from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
 from sst_graph.inspect.gained import KEY, pair_gains, to_document
 from sst_graph.result import FrameId
 
 
-def answer_motion(
+def motion_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
-) -> Answer:
+) -> MethodEstimate:
     """LiDAR odometry against visual odometry; labels only leave out what may move.
 
     Raises:
@@ -28,9 +28,9 @@ def answer_motion(
     pairs = [term.pair for term in best.terms]
     frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)
     gained = pair_gains(best.terms, frames, best.state)
-    return Answer(
+    return MethodEstimate(
         best.state.cTl,
-        best.state.offsets_s[0],
+        best.state.time_offsets_s[0],
         best.covariance,
         frames,
         reasons=_reasons(solutions),
