@@ -17,6 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.edge_matching import SIDES
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
@@ -28,6 +30,8 @@ shares, so from the residuals alone the sigmas of a short drive would be far too
 rough within a side, it is also rough as a whole: hence fractions of a match's variance."""
 _LEAST_MATCH = 0.05
 """Least variance of a match's own error: only simulations have residuals of almost zero."""
+_LEAST_FREEDOM = 0.25
+"""Least share of the sides' spread that is taken to be left."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class SideResiduals:
     """Whitened residuals, summed over the matches of one side of an object in one frame; k such sums.
 
     Attributes:
-        sides: (k,) number of the side, the same in all frames.
+        sides: (k,) number of the side, the same in all frames; ``side // SIDES`` is its object.
         means: (k,) weighted mean.
         weights, weights2: (k,) sums of the weights and of their squares.
         within: (k,) weighted sum of squares around the mean.
@@ -97,12 +101,21 @@ def fit_error_model(residuals: SideResiduals) -> ErrorModel:
     v = 1.0 / (match / count + side_frame)
     side_means, total, _ = _means(means, v, sides)
     side = spread_beyond(side_means, 1.0 / total, np.zeros(len(names), dtype=np.intp), centre=0.0)
+    side /= freedom_of_sides(len(names), len(np.unique(names // SIDES)))
     return with_floors(side, side_frame, match)
 
 
 def with_floors(side: float, side_frame: float, match: float) -> ErrorModel:
     """The error model with each variance at its least or above."""
     return ErrorModel(max(side, _SIDE * match), max(side_frame, _SIDE_FRAME * match), match)
+
+
+def freedom_of_sides(sides: int, objects: int) -> float:
+    """Share of the variance of sides that is left in their residuals.
+
+    The pose and a mask bias of each object are fitted to the same sides and swallow the rest.
+    """
+    return max((sides - objects - 6) / max(sides, 1), _LEAST_FREEDOM)
 
 
 def spread_beyond(

@@ -14,6 +14,7 @@ from sst_graph.covariance.cluster_robust import steps_without_objects
 from sst_graph.covariance.error_model import (
     ErrorModel,
     fit_error_model,
+    freedom_of_sides,
     spread_beyond,
     with_floors,
 )
@@ -37,12 +38,17 @@ def random_table(seed: int, m: int = 40, n: int = 8) -> MatchTable:
 
 
 def drawn_table(model: ErrorModel, seed: int) -> MatchTable:
-    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model."""
+    """300 sides, 6 frames of each, 12 matches a frame, with residuals drawn from the model.
+
+    A pose and a mask bias of each object (of three sides) have been fitted to them.
+    """
     rng = np.random.default_rng(seed)
     frames = np.repeat(np.arange(1800), 12)
     sides = frames // 6
+    fitted = np.column_stack([np.repeat(np.eye(100), 3, axis=0), rng.normal(size=(300, 6))])
+    errors = rng.normal(0.0, np.sqrt(model.side), 300)
     r = (
-        rng.normal(0.0, np.sqrt(model.side), 300)[sides]
+        (errors - fitted @ np.linalg.lstsq(fitted, errors)[0])[sides]
         + rng.normal(0.0, np.sqrt(model.side_frame), 1800)[frames]
         + rng.normal(0.0, np.sqrt(model.match), len(frames))
     )
@@ -131,6 +137,11 @@ def test_fitted_variances_are_those_drawn() -> None:
     assert np.mean([f.match for f in fitted]) == pytest.approx(model.match, rel=0.03)
     assert np.mean([f.side_frame for f in fitted]) == pytest.approx(model.side_frame, rel=0.08)
     assert np.mean([f.side for f in fitted]) == pytest.approx(model.side, rel=0.12)
+
+
+def test_what_the_fit_swallows() -> None:
+    assert freedom_of_sides(300, 100) == pytest.approx(194 / 300)
+    assert freedom_of_sides(12, 7) == freedom_of_sides(0, 0) == 0.25
 
 
 def test_floors() -> None:
