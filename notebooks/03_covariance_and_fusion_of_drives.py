@@ -25,10 +25,10 @@ from sst_graph.simulator import SimulationConfig, simulate, write_drive
 
 folder = Path(tempfile.mkdtemp()) / "drive"
 street = SimulationConfig(
-    seed=2, frames=30, width=621, height=188, azimuth_limit_deg=60.0, time_offset_s=0.05, vehicle_density=0.2
+    seed=2, frames=44, width=621, height=188, azimuth_limit_deg=60.0, time_offset_s=0.05, vehicle_density=0.2
 )
 write_drive(simulate(street), folder)
-parts = [sst_graph.open_source(folder, frames=frames) for frames in ("0:15", "15:30")]
+parts = [sst_graph.open_source(folder, frames=frames) for frames in ("0:22", "22:44")]
 truth = parts[0].truth
 
 # %%

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +14,13 @@ from sst_graph import Tracker, TrackerConfig
 from sst_graph.tracker.window.relinearization import SCANS
 from sst_graph.types import Frame
 
+STREET = dataclasses.replace(TRACKED_STREET, frames=40)
 CONFIG = TrackerConfig(start_scans=8, window=18)
 
 
 def _begun() -> tuple[bytes, int]:
     """Checkpoint of a tracker one frame into a relinearization of its window, and the frames it has seen."""
-    street = simulated(TRACKED_STREET)
+    street = simulated(STREET)
     tracker = tracker_from_truth(street, CONFIG)
     for k, frame in enumerate(street):
         under_way = tracker.estimate.relinearization is not None
@@ -29,12 +31,13 @@ def _begun() -> tuple[bytes, int]:
 
 
 @pytest.fixture(scope="module")
-def begun(frames: list[Frame], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
+def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     """The checkpoint, and the frames to come."""
-    content, seen = stored(("begun", TRACKED_STREET, CONFIG), _begun)
+    content, seen = stored(("begun", STREET, CONFIG), _begun)
     path = tmp_path_factory.mktemp("tracker") / "settling.npz"
     path.write_bytes(content)
-    return path, frames[seen:]
+    street = simulated(STREET)
+    return path, [street[k] for k in range(seen, len(street))]
 
 
 def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]]) -> None:
