@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 _BY_LABELS = ("joint", "paper", "semalign", "track")
 _BY_MOTION = ("motion",)
+_NO_SEARCH = ("paper", "semalign")
+"""Methods that start from a given pose alone."""
 METHODS = ("joint", "motion", "paper", "semalign", "track")
 
 
@@ -51,5 +53,6 @@ def _missing(method: str, content: Content) -> list[str]:
         if both and not content.point_classes & content.mask_classes:
             found.append("a class that points and masks both have")
     if not content.nominal:
-        found.append("a nominal extrinsic (--init none does without)")
+        without = "--init FILE gives a start" if method in _NO_SEARCH else "--init none does without"
+        found.append(f"a nominal extrinsic ({without})")
     return found

@@ -141,7 +141,8 @@ def test_without_masks_nothing_is_labelled_and_motion_is_estimated(
     truth = prepare_drive(drive, [SemanticClass.VEHICLE])
     assert len(prepared.lidar_motions) == len(truth.lidar_motions) == len(drive) - 1
     for found, true in zip(prepared.lidar_motions, truth.lidar_motions, strict=True):
-        assert found.aTb.equals(true.aTb, 1e-6)
+        # Odometry of labelled scans leaves vehicles that may move out.
+        assert found.aTb.equals(true.aTb, 5e-3)
 
 
 def test_the_sweep_is_decided_by_scans_between_images(tmp_path: Path) -> None:
