@@ -52,7 +52,9 @@ class Messages:
         number = {"seq": 0} if self.ros1 else {}
         return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **number)
 
-    def image(self, stamp_ns: int, pixels: NDArray[np.uint8], encoding: str = "bgr8", padding: int = 0) -> Any:
+    def image(
+        self, stamp_ns: int, pixels: NDArray[np.uint8], encoding: str = "bgr8", padding: int = 0
+    ) -> Any:
         """pixels: (h, w) or (h, w, channels); padding: bytes behind each row."""
         height, width = pixels.shape[:2]
         rows = pixels.reshape(height, -1)
@@ -149,7 +151,9 @@ class BagWriter:
         if topic not in self.connections:
             self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.messages.types)
         types = self.messages.types
-        data = types.serialize_ros1(message, name) if self.messages.ros1 else types.serialize_cdr(message, name)
+        data = (
+            types.serialize_ros1(message, name) if self.messages.ros1 else types.serialize_cdr(message, name)
+        )
         self.writer.write(self.connections[topic], received_ns, bytes(data))
 
 

@@ -128,7 +128,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         description=f"{text[0].upper()}{text[1:]}: p_camera = T_camera_lidar . p_lidar (camera: x right, "
         f"y down, z forward), {SIGN}. Several drives share one extrinsic.",
     )
-    calibrate.add_argument("data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder, or a bag")
+    calibrate.add_argument(
+        "data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder, or a bag"
+    )
     _add_source_options(calibrate)
     calibrate.add_argument(
         "--method",
@@ -394,7 +396,9 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
         "forward (default), the turn begins or ends; no data separate it from a time offset",
     )
     bag = command.add_argument_group("bags (docs/ros.md)")
-    bag.add_argument("--image-topic", metavar="TOPIC", help="Image or CompressedImage, where there are several")
+    bag.add_argument(
+        "--image-topic", metavar="TOPIC", help="Image or CompressedImage, where there are several"
+    )
     bag.add_argument("--cloud-topic", metavar="TOPIC", help="PointCloud2, where there are several")
     bag.add_argument(
         "--info-topic", metavar="TOPIC", help="CameraInfo (default: camera_info beside the images)"

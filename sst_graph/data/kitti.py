@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
 from sst_graph.data.arrays import read_labels, read_offsets, read_points
 from sst_graph.data.calib import read_calibration
-from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
+from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
 from sst_graph.data.kitti_truth import drive_truth
 from sst_graph.data.scan_order import rings_from_order
@@ -160,7 +160,10 @@ class KittiSource:
             scan=SensorFacts(_folder(self.files.scans), self.stamps_ns[with_scan]),
             image=SensorFacts(_folder(images), self.stamps_ns[with_image]),
             nominal="by calib.txt",
-            notes=("scans and images have the same stamps, those of times.txt", *([missing] if missing else [])),
+            notes=(
+                "scans and images have the same stamps, those of times.txt",
+                *([missing] if missing else []),
+            ),
         )
 
     def _scan(self, index: int) -> Scan | None:

@@ -107,7 +107,9 @@ class Loader:
         default = SourceOptions()
         for name in self.unused:
             if (value := getattr(options, name)) != getattr(default, name):
-                raise ConfigError(f"--{name.replace('_', '-')} {value}: means nothing for {path} ({self.layout})")
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} {value}: means nothing for {path} ({self.layout})"
+                )
         return self.open(path, options)
 
 
@@ -149,7 +151,9 @@ def find_loader(name: str) -> Loader:
     except Exception as error:  # a package of others may fail in any way
         raise ConfigError(f"loader {name!r} of {entry.value}: {type(error).__name__}: {error}") from error
     if not isinstance(loader, Loader):
-        raise ConfigError(f"loader {name!r} of {entry.value}: found a {type(loader).__name__}, expected a Loader")
+        raise ConfigError(
+            f"loader {name!r} of {entry.value}: found a {type(loader).__name__}, expected a Loader"
+        )
     return loader
 
 

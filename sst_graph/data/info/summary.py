@@ -120,7 +120,9 @@ def drive_info(source: Source) -> DriveInfo:
     facts = source.facts() if isinstance(source, FactsReader) else None
     scan_sensor = _sensor(facts.scan if facts else None, scans, len(source))
     image_sensor = _sensor(facts.image if facts else None, images, len(source))
-    facts = facts or SourceFacts(SensorFacts("", np.zeros(0, np.int64)), SensorFacts("", np.zeros(0, np.int64)))
+    facts = facts or SourceFacts(
+        SensorFacts("", np.zeros(0, np.int64)), SensorFacts("", np.zeros(0, np.int64))
+    )
     of_scans, of_images = _scan_info(scans), _image_info(images)
     content = Content(
         scans=scan_sensor.count if scans else 0,

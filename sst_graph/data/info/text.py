@@ -19,9 +19,12 @@ def info_text(info: DriveInfo) -> str:
 def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
     yield "drive", f"{info.name}: {info.frames} frames"
     c = info.camera
-    yield "camera", (
-        f"{c['model']}, {c['width']}x{c['height']} px, fx {c['fx']:.2f}, fy {c['fy']:.2f}, "
-        f"cx {c['cx']:.2f}, cy {c['cy']:.2f} px"
+    yield (
+        "camera",
+        (
+            f"{c['model']}, {c['width']}x{c['height']} px, fx {c['fx']:.2f}, fy {c['fy']:.2f}, "
+            f"cx {c['cx']:.2f}, cy {c['cy']:.2f} px"
+        ),
     )
     for name, sensor in (("images", info.image_sensor), ("scans", info.scan_sensor)):
         yield name, _sensor(sensor)

@@ -39,9 +39,7 @@ def camera_model(message: Any, image_topic: str, size: Size, place: str) -> Came
     Raises:
         DataError: no calibration, one of another size, or images that are distorted.
     """
-    K, D, R, P = (
-        np.asarray(_field(message, name), np.float64) for name in ("K", "D", "R", "P")
-    )
+    K, D, R, P = (np.asarray(_field(message, name), np.float64) for name in ("K", "D", "R", "P"))
     _check_size(message, size, place)
     rectified = "rect" in image_topic and "unrect" not in image_topic
     matrix = P.reshape(3, 4)[:, :3] if rectified else K.reshape(3, 3)

@@ -255,7 +255,9 @@ def open_ros(path: Path, options: SourceOptions) -> RosSource:
     )
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
-    return RosSource(printable(path.stem if path.is_file() else path.name), drive, frames, 0, options)[first:last]
+    return RosSource(printable(path.stem if path.is_file() else path.name), drive, frames, 0, options)[
+        first:last
+    ]
 
 
 def _frames(index: BagIndex) -> tuple[FramePlaces, ...]:
@@ -276,7 +278,9 @@ def _frames(index: BagIndex) -> tuple[FramePlaces, ...]:
 def _size(bag: Bag, topics: Topics, index: BagIndex) -> tuple[int, int]:
     """Width and height of the first image [px]."""
     first, type_name = index.images[0], topics.image.type
-    height, width = picture_of(_read(bag, topics, index, first, type_name), type_name, _place(bag, first)).shape[:2]
+    height, width = picture_of(
+        _read(bag, topics, index, first, type_name), type_name, _place(bag, first)
+    ).shape[:2]
     return width, height
 
 

@@ -71,7 +71,9 @@ def _one(
         return _named(path, topics, name, types, option)
     fitting = [topic for topic in topics.values() if topic.type in types]
     plain = {topic.name for topic in fitting if topic.type == IMAGE}
-    fitting = [topic for topic in fitting if topic.name.removesuffix("/compressed") not in plain - {topic.name}]
+    fitting = [
+        topic for topic in fitting if topic.name.removesuffix("/compressed") not in plain - {topic.name}
+    ]
     fitting = [topic for topic in fitting if not topic.name.endswith("/compressedDepth")]
     if len(fitting) == 1:
         return fitting[0]
@@ -94,12 +96,12 @@ def _namespace(image: str) -> str:
     return image.removesuffix("/compressed").rpartition("/")[0]
 
 
-def _named(
-    path: Path, topics: Mapping[str, Topic], name: str, types: tuple[str, ...], option: str
-) -> Topic:
+def _named(path: Path, topics: Mapping[str, Topic], name: str, types: tuple[str, ...], option: str) -> Topic:
     topic = topics.get(name)
     if topic is None:
-        raise DataError(path, f"no message of {name} ({option}); there are {listed(topics.values())}", "a topic")
+        raise DataError(
+            path, f"no message of {name} ({option}); there are {listed(topics.values())}", "a topic"
+        )
     if topic.type not in types:
         raise DataError(path, f"{option} {name} of {topic.type}", " or ".join(types))
     return topic

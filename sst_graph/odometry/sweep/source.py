@@ -8,7 +8,14 @@ from typing import Any
 
 import gtsam
 
-from sst_graph.data.frame_parts import AheadReader, image_at, image_positions, number_at, scan_at, scan_positions
+from sst_graph.data.frame_parts import (
+    AheadReader,
+    image_at,
+    image_positions,
+    number_at,
+    scan_at,
+    scan_positions,
+)
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep

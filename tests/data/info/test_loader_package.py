@@ -60,7 +60,9 @@ def test_an_entry_point_that_fails_says_which(
     install(tmp_path / "site", monkeypatch, "gone = absent_module:LOADER", "odd = sst_graph_npz:open_npz")
     with pytest.raises(ConfigError, match="'gone' of absent_module:LOADER: ModuleNotFoundError"):
         open_source(drive, loader="gone")
-    with pytest.raises(ConfigError, match="'odd' of sst_graph_npz:open_npz: found a function, expected a Loader"):
+    with pytest.raises(
+        ConfigError, match="'odd' of sst_graph_npz:open_npz: found a function, expected a Loader"
+    ):
         open_source(drive, loader="odd")
 
 

@@ -14,7 +14,9 @@ pytest.importorskip("rosbags")
 from bags import EPOCH_NS, KINDS, MASK, Kind, bag_of, files_of
 
 from sst_graph.batch import calibrate
+from sst_graph.cli.pictures import overlay, telling_positions
 from sst_graph.data import KittiSource, RosSource, open_source
+from sst_graph.data.frame_parts import RecentReader
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.simulator import SimulationConfig
@@ -127,6 +129,11 @@ def test_images_stamped_later_change_the_time_offset_alone(drive: KittiSource, t
     sigmas = np.sqrt(np.diag(from_drive.covariance))
     assert (np.abs(difference) < 0.5 * sigmas[:6]).all()
     assert abs(from_bag.time_offset_s + 0.04 - from_drive.time_offset_s) < 0.5 * sigmas[6]
+    # Pictures show a scan with the image of its instant, though no frame holds both.
+    reader = RecentReader(source)
+    (position,) = telling_positions(reader, from_bag, 1)
+    assert source.frames[position].image is None
+    assert overlay(reader, position, from_bag, None).shape == (188, 621, 3)
 
 
 def test_without_masks_nothing_is_labelled_and_motion_is_estimated(

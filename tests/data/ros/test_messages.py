@@ -48,7 +48,9 @@ def test_bayer_patterns_give_the_colour_of_the_scene(pattern: str) -> None:
     colour = {"b": 40, "g": 120, "r": 220}
     tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
     message = MAKE.image(STAMP_NS, np.tile(tile, (8, 8)), f"bayer_{pattern}8")
-    np.testing.assert_array_equal(picture_of(message, IMAGE, "here")[4:-4, 4:-4], np.full((8, 8, 3), (40, 120, 220)))
+    np.testing.assert_array_equal(
+        picture_of(message, IMAGE, "here")[4:-4, 4:-4], np.full((8, 8, 3), (40, 120, 220))
+    )
 
 
 def test_compressed_pictures_and_masks() -> None:
@@ -67,7 +69,10 @@ def test_compressed_pictures_and_masks() -> None:
 @pytest.mark.parametrize(
     ("message", "words"),
     [
-        (MAKE.image(STAMP_NS, np.zeros((4, 8), np.uint8), "mono16"), "'mono16', expected one of mono8.*8 bits"),
+        (
+            MAKE.image(STAMP_NS, np.zeros((4, 8), np.uint8), "mono16"),
+            "'mono16', expected one of mono8.*8 bits",
+        ),
         (MAKE.image(STAMP_NS, BGR[:, :4].copy(), "rgba8"), "12, expected 4x6 px of 4 bytes"),
         (MAKE.compressed(STAMP_NS, b"x", "16UC1; compressedDepth png"), "compressedDepth"),
     ],
@@ -176,7 +181,9 @@ def test_labels_are_read_where_they_are_asked_for() -> None:
 
 
 def test_clouds_that_are_not_understood() -> None:
-    with pytest.raises(DataError, match="fields range, azimuth without x, y, z, expected a cloud with x, y, z"):
+    with pytest.raises(
+        DataError, match="fields range, azimuth without x, y, z, expected a cloud with x, y, z"
+    ):
         read(np.zeros(3, [("range", "<f4"), ("azimuth", "<f4")]))
     message = MAKE.cloud(STAMP_NS, table())
     message.data = message.data[:-1]
