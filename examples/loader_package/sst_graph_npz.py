@@ -1,4 +1,4 @@
-"""Drives of 000000.npz, ...: each with stamp_ns, points (n, 3), pixels (h, w, 3), K (3, 3). The whole package."""
+"""Drives of 000000.npz, ...: each with stamp_ns, points (n, 3), pixels (h, w, 3) and K (3, 3)."""
 
 from dataclasses import dataclass
 from pathlib import Path

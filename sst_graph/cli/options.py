@@ -406,7 +406,7 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     bag.add_argument(
         "--mask-topic",
         metavar="TOPIC",
-        help="semantic masks with the stamps of their images; the field label of the clouds is then read, too",
+        help="masks with the stamps of their images; the field label of the clouds is then read, too",
     )
     bag.add_argument(
         "--stamps",

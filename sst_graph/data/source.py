@@ -40,7 +40,7 @@ class SourceOptions:
             way, seen from above; their times follow from their azimuths.
         sweep_start_deg: for these, the azimuth at which a turn begins, counter-clockwise from forward [deg].
         sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
-        image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera's model,
+        image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera model,
             or None for the only ones there.
         mask_topic: of a bag: topic of semantic masks with the stamps of their images. With it the labels in
             the cloud are read, too. None: no labels.
@@ -192,7 +192,8 @@ def open_source(
 
     Args:
         path: root of the data set, the folder of one sequence, or a bag.
-        loader: a registered format, one that an installed package adds, or "auto" for the one that recognizes the path.
+        loader: a registered format, one that an installed package adds, or "auto" for the one that recognizes
+            the path.
         frames: "A:B" (scan indices A..B-1; either may be left out) or a slice.
         options: the other fields of :class:`SourceOptions`.
 

@@ -54,8 +54,16 @@ class SensorInfo:
 
 @dataclass(frozen=True)
 class ScanInfo:
-    """Scans that were looked at: points (median), points left out, share of scans with labels, share of points
-    with a label, the classes, whether points have times and how far these reach [s], laser numbers (0: none)."""
+    """Scans that were looked at.
+
+    Attributes:
+        points: of a scan, the median.
+        left_out: points that were NaN or inf, of all of them.
+        labelled_scans, labelled_points: share of scans with labels, of points with a label.
+        classes: that can be aligned.
+        time_span_s: from the first to the last point of a scan; None where points have no times.
+        rings: laser numbers in a scan; 0 where they are not known.
+    """
 
     points: int
     left_out: int
@@ -68,8 +76,13 @@ class ScanInfo:
 
 @dataclass(frozen=True)
 class ImageInfo:
-    """Images that were looked at: share with a picture, share with a mask, share of pixels with a label, the
-    classes."""
+    """Images that were looked at.
+
+    Attributes:
+        pictures, masks: share of images with a picture, with a mask.
+        labelled_pixels: share of pixels with a label.
+        classes: that can be aligned.
+    """
 
     pictures: float
     masks: float

@@ -15,7 +15,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 """NumPy's names of sensor_msgs/PointField datatypes."""
 
 TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
-"""Fields with the time of a point. Ouster: t; Livox: offset_time; Velodyne: time; Hesai, RoboSense: timestamp."""
+"""Fields with the time of a point: of Ouster, Livox, Velodyne, Hesai and RoboSense, Livox's driver 2."""
 RING_FIELDS = ("ring", "channel")
 
 _ABSOLUTE_S, _ABSOLUTE_NS = 1e6, 1e15

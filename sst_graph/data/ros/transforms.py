@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from itertools import pairwise
 from typing import Any
 
 import gtsam
@@ -35,13 +36,13 @@ class Transforms:
         if path is None:
             return None, f"no chain of transforms from {parent!r} to {child!r}"
         pose = gtsam.Pose3()
-        for first, second in zip(path, path[1:], strict=False):
+        for first, second in pairwise(path):
             edge = (first, second) if (first, second) in self._poses else (second, first)
             if edge in self._moving:
                 return None, f"the transform from {edge[0]!r} to {edge[1]!r} is not constant"
-            if twice := sorted(p for p, c in self._poses if c == edge[1]):
-                if len(twice) > 1:
-                    return None, f"{edge[1]!r} has several parents: {', '.join(twice)}"
+            parents = sorted(p for p, c in self._poses if c == edge[1])
+            if len(parents) > 1:
+                return None, f"{edge[1]!r} has several parents: {', '.join(parents)}"
             step = self._poses[edge]
             pose = pose * (step if edge == (first, second) else step.inverse())
         return pose, f"by transforms {' - '.join(path)}"
