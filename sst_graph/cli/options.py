@@ -67,6 +67,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_inspect,
         _add_overlay,
         _add_export,
+        _add_info,
         _add_settings_command,
         _add_experiment,
     ):
@@ -127,7 +128,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         description=f"{text[0].upper()}{text[1:]}: p_camera = T_camera_lidar . p_lidar (camera: x right, "
         f"y down, z forward), {SIGN}. Several drives share one extrinsic.",
     )
-    calibrate.add_argument("data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder")
+    calibrate.add_argument(
+        "data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder, or a bag"
+    )
     _add_source_options(calibrate)
     calibrate.add_argument(
         "--method",
@@ -178,7 +181,7 @@ def _add_estimate(command: _Parser) -> None:
 def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "calibrate frame by frame: one line of JSON a frame on stdout"
     track = commands.add_parser("track", help=text, description=text)
-    track.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder")
+    track.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
     _add_source_options(track)
     track.add_argument(
         "--init",
@@ -306,6 +309,15 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     return export
 
 
+def _add_info(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "what a drive holds: sensors, rates, stamps, gaps, labels, and what is missing for which method"
+    info = commands.add_parser("info", help=text, description=text)
+    info.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
+    _add_source_options(info)
+    info.add_argument("--json", action="store_true", help="print JSON (units in the names)")
+    return info
+
+
 def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "list the settings of calibrate and track: default, unit, range, and when to change them"
     settings = commands.add_parser("settings", help=text, description=text)
@@ -351,6 +363,11 @@ SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
     "sweep": "auto",
     "sweep_start_deg": 180.0,
     "sweep_stamp": "forward",
+    "image_topic": None,
+    "cloud_topic": None,
+    "info_topic": None,
+    "mask_topic": None,
+    "stamps": "header",
 }
 """How a drive is read where neither the command line nor a result says it. The parser leaves these options
 None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
@@ -359,7 +376,7 @@ None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
 def _add_source_options(command: argparse.ArgumentParser) -> None:
     """How a drive is read."""
     source = command.add_argument_group("data")
-    source.add_argument("--loader", help="format of the drives: auto (default) or kitti")
+    source.add_argument("--loader", help="format: auto (default), kitti, ros, or one of an installed package")
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
     source.add_argument("--camera", help=f"camera folder (default {SOURCE_DEFAULTS['camera']})")
@@ -389,6 +406,24 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
         choices=("forward", "start", "end"),
         help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
         "forward (default), the turn begins or ends; no data separate it from a time offset",
+    )
+    bag = command.add_argument_group("bags (docs/ros.md)")
+    bag.add_argument(
+        "--image-topic", metavar="TOPIC", help="Image or CompressedImage, where there are several"
+    )
+    bag.add_argument("--cloud-topic", metavar="TOPIC", help="PointCloud2, where there are several")
+    bag.add_argument(
+        "--info-topic", metavar="TOPIC", help="CameraInfo (default: camera_info beside the images)"
+    )
+    bag.add_argument(
+        "--mask-topic",
+        metavar="TOPIC",
+        help="masks with the stamps of their images; the field label of the clouds is then read, too",
+    )
+    bag.add_argument(
+        "--stamps",
+        choices=("header", "received"),
+        help="stamps of the headers (default), or the times of recording, where headers have none",
     )
 
 

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import itertools
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.frame_parts import RecentReader
+from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Frame, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
 from sst_graph.viz import Placement, draw_overlay, stacked
 
 FloatArray = NDArray[np.float64]
@@ -48,10 +51,11 @@ def overlay(
     c_twist = camera_twist(drive, position, result.T_camera_lidar)
     frame, other_image = _at_true_time(drive, position, offset_s)
     caption = "after (image closest in time)" if other_image else "after"
+    own = _whole(drive, drive.frame(position), 0.0)
     after = draw_overlay(frame, camera, result.T_camera_lidar, offset_s, c_twist, caption)
     if before is None:
         return after
-    start = drive.frame(position), camera, before.cTl, before.time_offset_s, c_twist, before.caption
+    start = own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
     return stacked(draw_overlay(*start), after)
 
 
@@ -64,9 +68,11 @@ def png(picture: NDArray[np.uint8]) -> bytes:
 def _at_true_time(drive: RecentReader, position: int, offset_s: float) -> tuple[Frame, bool]:
     """The frame, with the image that shows the instant of its scan best, and whether that is another one."""
     frame = drive.frame(position)
+    if frame.scan is None or frame.image is None:
+        return _whole(drive, frame, offset_s), False
     neighbour = drive.scan(position - 1 if position else min(1, len(drive) - 1))
     scan, image = frame.scan, frame.image
-    if scan is None or image is None or neighbour is None or neighbour.stamp_ns == scan.stamp_ns:
+    if neighbour is None or neighbour.stamp_ns == scan.stamp_ns:
         return frame, False
     period_s = abs(scan.stamp_ns - neighbour.stamp_ns) * 1e-9
     guess = position - round(offset_s / period_s)
@@ -76,12 +82,47 @@ def _at_true_time(drive: RecentReader, position: int, offset_s: float) -> tuple[
     return replace(frame, image=best), best.stamp_ns != image.stamp_ns
 
 
+def _whole(drive: RecentReader, frame: Frame, offset_s: float) -> Frame:
+    """The frame; a part that it lacks is that of the source's frames of the other sensor closest in time.
+
+    Where a source's frames may have both, nothing is added.
+    """
+    apart = hasattr(drive.source, "image_positions")
+    images, scans = image_positions(drive.source), scan_positions(drive.source)
+    if frame.scan is not None and frame.image is None and apart:
+        return replace(
+            frame, image=_closest(drive.image, images, frame.scan.stamp_ns - round(offset_s * 1e9))
+        )
+    if frame.image is not None and frame.scan is None and apart:
+        return replace(frame, scan=_closest(drive.scan, scans, frame.image.stamp_ns + round(offset_s * 1e9)))
+    return frame
+
+
+T = TypeVar("T", Scan, CameraImage)
+
+
+def _closest(at: Callable[[int], T | None], positions: Sequence[int], stamp_ns: int) -> T | None:
+    """What is closest in time to a stamp, by bisection of positions whose stamps rise."""
+
+    def stamp(position: int) -> int:
+        found = at(position)
+        return stamp_ns if found is None else found.stamp_ns
+
+    after = bisect_left(positions, stamp_ns, key=stamp)
+    nearby = (at(position) for position in positions[max(0, after - 1) : after + 1])
+    return min(
+        (one for one in nearby if one is not None), key=lambda o: abs(o.stamp_ns - stamp_ns), default=None
+    )
+
+
 def camera_twist(drive: RecentReader, position: int, cTl: gtsam.Pose3) -> FloatArray | None:
     """(6,) twist of the camera [rad/s, m/s] at a frame, by LiDAR odometry over it and its neighbours.
 
     None where the motion is unknown.
     """
-    around = map(drive.scan, range(max(0, position - 1), min(len(drive), position + 2)))
+    positions = scan_positions(drive.source)
+    at = bisect_left(positions, position)
+    around = map(drive.scan, positions[max(0, at - 1) : at + 2])
     motions = lidar_odometry(scan for scan in around if scan is not None)
     l_twists = [motion.mean_twist for motion in motions if motion.ok]
     if not l_twists:
@@ -97,7 +138,8 @@ def telling_positions(drive: RecentReader, result: CalibrationResult, count: int
         few = np.unique(np.linspace(0, len(part) - 1, 4).round().astype(np.int64)) if len(part) else part
         positions = [position_of(drive, int(index)) for index in part[few]]
         richest = sorted(positions, key=lambda position: -_vehicle_points(drive.scan(position)))
-        whole = (p for p in richest if drive.scan(p) is not None and drive.image(p) is not None)
+        frames = ((p, _whole(drive, drive.frame(p), 0.0)) for p in richest)
+        whole = (p for p, frame in frames if frame.scan is not None and frame.image is not None)
         chosen += list(itertools.islice(whole, 1))
     return chosen
 

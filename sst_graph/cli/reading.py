@@ -19,10 +19,10 @@ from sst_graph.errors import ConfigError, SstGraphError
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 
-PAIRING = ("image_shift", "camera")
+PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps")
 """Options without which a result means something else: they may not be contradicted."""
 
-MEASUREMENT = ("cloud", "sweep")
+MEASUREMENT = ("cloud", "sweep", "cloud_topic", "mask_topic")
 """Options that change what is measured; another choice is allowed, and said."""
 
 OF_ONE_DRIVE = ("sequence", "frames")

@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 from sst_graph.data.kitti import KITTI_LOADER, KittiSource
+from sst_graph.data.ros import ROS_LOADER, RosSource
 from sst_graph.data.source import Loader, SourceOptions, loader_names, open_source, register_loader
 
 register_loader("kitti", KITTI_LOADER)
+register_loader("ros", ROS_LOADER)
 
-__all__ = ["KittiSource", "Loader", "SourceOptions", "loader_names", "open_source", "register_loader"]
+__all__ = [
+    "KittiSource",
+    "Loader",
+    "RosSource",
+    "SourceOptions",
+    "loader_names",
+    "open_source",
+    "register_loader",
+]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import Protocol, runtime_checkable
 
@@ -39,6 +40,18 @@ def scan_at(source: Source, position: int) -> Scan | None:
 def image_at(source: Source, position: int) -> CameraImage | None:
     """Image of the frame at a position."""
     return source.read_image(position) if isinstance(source, SeparateReader) else source[position].image
+
+
+def scan_positions(source: Source) -> Sequence[int]:
+    """Positions of frames that may have a scan: those that the source names, else all."""
+    named: Sequence[int] | None = getattr(source, "scan_positions", None)
+    return range(len(source)) if named is None else named
+
+
+def image_positions(source: Source) -> Sequence[int]:
+    """Positions of frames that may have an image: those that the source names, else all."""
+    named: Sequence[int] | None = getattr(source, "image_positions", None)
+    return range(len(source)) if named is None else named
 
 
 _FRAMES, _SCANS = 24, 48

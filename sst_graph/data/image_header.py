@@ -16,7 +16,7 @@ _STANDALONE = {0x01, *range(0xD0, 0xD8)}
 _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
 
-def image_size(data: bytes, path: Path) -> tuple[int, int]:
+def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
     """Width and height [px] that a PNG or JPEG file declares.
 
     Raises:
@@ -33,7 +33,7 @@ def image_size(data: bytes, path: Path) -> tuple[int, int]:
     return width, height
 
 
-def check_whole(data: bytes, path: Path) -> None:
+def check_whole(data: bytes, path: str | Path) -> None:
     """Find truncation and damage that decoders pass over in silence, leaving grey areas.
 
     Raises:
@@ -45,14 +45,14 @@ def check_whole(data: bytes, path: Path) -> None:
         _check_jpeg_end(data, path)
 
 
-def _png_size(data: bytes, path: Path) -> tuple[int, int]:
+def _png_size(data: bytes, path: str | Path) -> tuple[int, int]:
     if len(data) < 33 or data[12:16] != b"IHDR":
         raise DataError(path, f"a PNG file truncated at byte {len(data)}", "its header IHDR")
     width, height = struct.unpack_from(">II", data, 16)
     return width, height
 
 
-def _jpeg_size(data: bytes, path: Path) -> tuple[int, int]:
+def _jpeg_size(data: bytes, path: str | Path) -> tuple[int, int]:
     for marker, start, end in _jpeg_segments(data):
         if marker in _START_OF_FRAME and end - start >= 5:
             height, width = struct.unpack_from(">HH", data, start + 1)
@@ -83,14 +83,14 @@ def _jpeg_segments(data: bytes) -> list[tuple[int, int, int]]:
     return segments
 
 
-def _check_jpeg_end(data: bytes, path: Path) -> None:
+def _check_jpeg_end(data: bytes, path: str | Path) -> None:
     """An end of image behind the first scan: a preview in the header has one of its own."""
     scans = [start for marker, start, _ in _jpeg_segments(data) if marker == _START_OF_SCAN]
     if not scans or data.find(bytes((0xFF, _END_OF_IMAGE)), scans[0]) < 0:
         raise DataError(path, "a truncated JPEG file", "an end-of-image marker")
 
 
-def _check_png_chunks(data: bytes, path: Path) -> None:
+def _check_png_chunks(data: bytes, path: str | Path) -> None:
     at = len(PNG)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)

@@ -55,6 +55,25 @@ def read_picture(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     return _decode(path, flags, size).astype(np.uint8, copy=False)
 
 
+def decoded_picture(data: bytes, place: str | Path) -> NDArray[np.uint8]:
+    """Picture (h, w, 3) uint8 BGR of the bytes of a PNG or JPEG file; ``place`` is named in errors.
+
+    Raises:
+        DataError: truncated or damaged.
+    """
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    return _decoded(data, flags, place, None).astype(np.uint8, copy=False)
+
+
+def decoded_mask(data: bytes, place: str | Path) -> NDArray[np.uint8]:
+    """Mask (h, w) uint8 of the bytes of a PNG file; ``place`` is named in errors.
+
+    Raises:
+        DataError: as :func:`read_mask`.
+    """
+    return _as_mask(_one_channel(_decoded(data, cv2.IMREAD_UNCHANGED, place, None), place), place)
+
+
 def read_mask(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     """Mask (h, w) uint8 of a PNG file; several channels or 16 bits only where nothing is lost.
 
@@ -65,10 +84,13 @@ def read_mask(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
         DataError: a missing, truncated or damaged file, one of another size, channels that differ (a
             coloured mask), values that do not fit into 8 bits.
     """
-    mask = _single_channel(path, size)
+    return _as_mask(_single_channel(path, size), path)
+
+
+def _as_mask(mask: NDArray[Any], place: str | Path) -> NDArray[np.uint8]:
     if mask.dtype != np.uint8:
         if int(mask.max(initial=0)) > 255:
-            raise DataError(path, f"{mask.dtype} values up to {mask.max()}", "8-bit class numbers")
+            raise DataError(place, f"{mask.dtype} values up to {mask.max()}", "8-bit class numbers")
         mask = mask.astype(np.uint8)
     return mask
 
@@ -88,17 +110,23 @@ def read_instances(path: Path, size: Size | None = None) -> NDArray[np.uint16]:
 
 
 def _single_channel(path: Path, size: Size | None) -> NDArray[Any]:
-    image = _decode(path, cv2.IMREAD_UNCHANGED, size)
+    return _one_channel(_decode(path, cv2.IMREAD_UNCHANGED, size), path)
+
+
+def _one_channel(image: NDArray[Any], place: str | Path) -> NDArray[Any]:
     if image.ndim == 3:
         channels = image[:, :, :3]
         if (channels != channels[:, :, :1]).any():
-            raise DataError(path, f"{image.shape[2]} channels that differ", "one channel of class numbers")
+            raise DataError(place, f"{image.shape[2]} channels that differ", "one channel of class numbers")
         image = channels[:, :, 0]
     return np.ascontiguousarray(image)
 
 
 def _decode(path: Path, flags: int, size: Size | None) -> NDArray[Any]:
-    data = read_file(path, IMAGE)
+    return _decoded(read_file(path, IMAGE), flags, path, size)
+
+
+def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> NDArray[Any]:
     width, height = _checked_size(data, path, size)
     check_whole(data, path)
     with decoder_output() as complaints:
@@ -125,7 +153,7 @@ def _tells_damage(line: str) -> bool:
     return line.startswith(("libpng", "Corrupt", "Premature", "Inconsistent")) and _PADDING not in line
 
 
-def _checked_size(data: bytes, path: Path, expected: Size | None) -> Size:
+def _checked_size(data: bytes, path: str | Path, expected: Size | None) -> Size:
     width, height = image_size(data, path)
     if expected is not None and (width, height) != expected:
         wanted = f"{expected[0]}x{expected[1]} px, as the first image"

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import overload
@@ -25,6 +25,7 @@ from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, 
 from sst_graph.data.arrays import read_labels, read_offsets, read_points
 from sst_graph.data.calib import read_calibration
 from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
+from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
 from sst_graph.data.kitti_truth import drive_truth
 from sst_graph.data.scan_order import rings_from_order
@@ -148,6 +149,22 @@ class KittiSource:
     def read_image(self, position: int) -> CameraImage | None:
         """Image of the frame at a position, without instances; errors as of the frame."""
         return self._image(self.indices[position])
+
+    def facts(self) -> SourceFacts:
+        """Folders and stamps."""
+        shift, images = self.options.image_shift, self.files.images or self.files.masks
+        with_scan = [k for k in self.indices if k in self.files.scans]
+        with_image = [k for k in self.indices if k + shift in self.files.image_numbers]
+        missing = self.files.missing()
+        return SourceFacts(
+            scan=SensorFacts(_folder(self.files.scans), self.stamps_ns[with_scan]),
+            image=SensorFacts(_folder(images), self.stamps_ns[with_image]),
+            nominal="by calib.txt",
+            notes=(
+                "scans and images have the same stamps, those of times.txt",
+                *([missing] if missing else []),
+            ),
+        )
 
     def _scan(self, index: int) -> Scan | None:
         path = self.files.scans.get(index)
@@ -281,6 +298,10 @@ def _encoding(files: KittiFiles, options: SourceOptions, size: tuple[int, int]) 
     paths = list(files.masks.values())
     chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
     return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
+
+
+def _folder(files: Mapping[int, Path]) -> str:
+    return printable(next(iter(files.values())).parent) if files else ""
 
 
 def _name(folder: Path) -> str:

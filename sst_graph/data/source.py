@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Literal, TypedDict, Unpack, get_args
 
@@ -13,10 +14,12 @@ from sst_graph.types import Source
 
 Sweep = Literal["auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"]
 LabelEncoding = Literal["auto", "ids", "trainids"]
+Stamps = Literal["header", "received"]
 
 SWEEPS: tuple[Sweep, ...] = get_args(Sweep)
 TURNS = {"clockwise": -1.0, "azimuth": -1.0, "counterclockwise": 1.0}
 """Share of the sweep in the points, as :class:`~sst_graph.sweep_timing.SweepTiming` counts it."""
+STAMPS: tuple[Stamps, ...] = get_args(Stamps)
 LABEL_ENCODINGS: tuple[LabelEncoding, ...] = ("auto", "ids", "trainids")
 
 
@@ -37,6 +40,12 @@ class SourceOptions:
             way, seen from above; their times follow from their azimuths.
         sweep_start_deg: for these, the azimuth at which a turn begins, counter-clockwise from forward [deg].
         sweep_stamp: the instant that a scan's stamp names where times follow from azimuths.
+        image_topic, cloud_topic, info_topic: of a bag: topics of the camera, the LiDAR and the camera model,
+            or None for the only ones there.
+        mask_topic: of a bag: topic of semantic masks with the stamps of their images. With it the labels in
+            the cloud are read, too. None: no labels.
+        stamps: of a bag: "header" as the sensors' drivers stamp, or "received" by the recorder, for drivers
+            that leave the header's stamp at zero.
     """
 
     sequence: str | None = None
@@ -48,6 +57,11 @@ class SourceOptions:
     sweep: Sweep = "auto"
     sweep_start_deg: float = 180.0
     sweep_stamp: SweepStamp = "forward"
+    image_topic: str | None = None
+    cloud_topic: str | None = None
+    info_topic: str | None = None
+    mask_topic: str | None = None
+    stamps: Stamps = "header"
 
     def __post_init__(self) -> None:
         if self.label_encoding not in LABEL_ENCODINGS:
@@ -56,10 +70,16 @@ class SourceOptions:
             raise ConfigError(f"sweep {self.sweep!r}: expected one of {SWEEPS}")
         if self.sweep_stamp not in get_args(SweepStamp):
             raise ConfigError(f"sweep stamp {self.sweep_stamp!r}: expected one of {get_args(SweepStamp)}")
+        if self.stamps not in STAMPS:
+            raise ConfigError(f"stamps {self.stamps!r}: expected one of {STAMPS}")
         if not -360.0 <= self.sweep_start_deg <= 360.0:
             raise ConfigError(f"sweep start {self.sweep_start_deg} deg: expected -360 to 360")
         if self.frames is not None:
             _check_frames(self.frames)
+
+
+BAG_OPTIONS = ("image_topic", "cloud_topic", "info_topic", "mask_topic", "stamps")
+"""Options that only bags have."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +90,31 @@ class Loader:
         recognizes: whether a path looks like this format.
         open: opens it.
         layout: what the format looks like on disk, for errors.
+        unused: options (fields of :class:`SourceOptions`) that mean nothing here and are refused if given.
     """
 
     recognizes: Callable[[Path], bool]
     open: Callable[[Path, SourceOptions], Source]
     layout: str
+    unused: tuple[str, ...] = BAG_OPTIONS
 
+    def opened(self, path: Path, options: SourceOptions) -> Source:
+        """The drive at ``path``.
+
+        Raises:
+            ConfigError, DataError: an option or the data cannot be used.
+        """
+        default = SourceOptions()
+        for name in self.unused:
+            if (value := getattr(options, name)) != getattr(default, name):
+                raise ConfigError(
+                    f"--{name.replace('_', '-')} {value}: means nothing for {path} ({self.layout})"
+                )
+        return self.open(path, options)
+
+
+ENTRY_POINTS = "sst_graph.loaders"
+"""Group of the entry points by which packages add loaders; each names a :class:`Loader`."""
 
 _LOADERS: dict[str, Loader] = {}
 
@@ -92,8 +131,36 @@ def register_loader(name: str, loader: Loader) -> None:
 
 
 def loader_names() -> tuple[str, ...]:
-    """Names of the registered formats."""
-    return tuple(_LOADERS)
+    """Names of the registered formats, then of those that installed packages add."""
+    return (*_LOADERS, *_added())
+
+
+def find_loader(name: str) -> Loader:
+    """The format registered, or added by an installed package, under ``name``.
+
+    Raises:
+        ConfigError: there is none, or its package cannot be used.
+    """
+    if name in _LOADERS:
+        return _LOADERS[name]
+    entry = _added().get(name)
+    if entry is None:
+        raise ConfigError(f"loader {name!r}: expected one of auto, {', '.join(loader_names())}")
+    try:
+        loader = entry.load()
+    except Exception as error:  # a package of others may fail in any way
+        raise ConfigError(f"loader {name!r} of {entry.value}: {type(error).__name__}: {error}") from error
+    if not isinstance(loader, Loader):
+        raise ConfigError(
+            f"loader {name!r} of {entry.value}: found a {type(loader).__name__}, expected a Loader"
+        )
+    return loader
+
+
+def _added() -> dict[str, EntryPoint]:
+    """Loaders of installed packages by name; the names of our own are not replaced."""
+    found = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    return {name: found[name] for name in sorted(found) if name not in _LOADERS and name != "auto"}
 
 
 class ReadOptions(TypedDict, total=False):
@@ -107,6 +174,11 @@ class ReadOptions(TypedDict, total=False):
     sweep: Sweep
     sweep_start_deg: float
     sweep_stamp: SweepStamp
+    image_topic: str | None
+    cloud_topic: str | None
+    info_topic: str | None
+    mask_topic: str | None
+    stamps: Stamps
 
 
 def open_source(
@@ -119,8 +191,9 @@ def open_source(
     """Open a drive; each frame is read when it is accessed.
 
     Args:
-        path: root of the data set, or the folder of one sequence.
-        loader: a registered format, or "auto" for the one that recognizes the path.
+        path: root of the data set, the folder of one sequence, or a bag.
+        loader: a registered format, one that an installed package adds, or "auto" for the one that recognizes
+            the path.
         frames: "A:B" (scan indices A..B-1; either may be left out) or a slice.
         options: the other fields of :class:`SourceOptions`.
 
@@ -131,15 +204,16 @@ def open_source(
     chosen = SourceOptions(frames=parse_frames(frames) if isinstance(frames, str) else frames, **options)
     path = Path(path)
     if loader != "auto":
-        if loader not in _LOADERS:
-            raise ConfigError(f"loader {loader!r}: expected one of auto, {', '.join(_LOADERS)}")
-        return _LOADERS[loader].open(path, chosen)
-    if not path.is_dir():
-        raise DataError(path, "no folder" if not path.exists() else "a file", "the folder of a drive")
-    for candidate in _LOADERS.values():
+        return find_loader(loader).opened(path, chosen)
+    if not path.exists():
+        raise DataError(path, "no file or folder", "a drive")
+    layouts = []
+    for name in loader_names():
+        candidate = find_loader(name)
         if candidate.recognizes(path):
-            return candidate.open(path, chosen)
-    raise DataError(path, "no layout that is known", "; or ".join(c.layout for c in _LOADERS.values()))
+            return candidate.opened(path, chosen)
+        layouts.append(candidate.layout)
+    raise DataError(path, "no layout that is known", "; or ".join(layouts))
 
 
 def parse_frames(text: str) -> slice:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import gtsam
 
-from sst_graph.data.frame_parts import AheadReader, image_at, number_at, scan_at
+from sst_graph.data.frame_parts import (
+    AheadReader,
+    image_at,
+    image_positions,
+    number_at,
+    scan_at,
+    scan_positions,
+)
 from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep
@@ -54,6 +61,16 @@ class SweptSource:
     def truth_is_reference(self) -> bool:
         """Whether it is a reference only."""
         return bool(getattr(self.source, "truth_is_reference", False))
+
+    @property
+    def scan_positions(self) -> Sequence[int]:
+        """Positions of frames that may have a scan."""
+        return scan_positions(self.source)
+
+    @property
+    def image_positions(self) -> Sequence[int]:
+        """Positions of frames that may have an image."""
+        return image_positions(self.source)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -114,7 +131,11 @@ def with_sweep(source: Source, decide: bool = True) -> SweptSource:
                 return SweptSource(source, given, ahead)
             break
     stamp: SweepStamp = getattr(source, "sweep_stamp", "forward")
-    return SweptSource(source, decide_sweep(ahead.look, len(source), stamp), ahead)
+    # Where frames have one sensor each, scans follow one another at positions that do not.
+    positions = scan_positions(source)
+    decision = decide_sweep(lambda k: ahead.look(positions[k]), len(positions), stamp)
+    frames = tuple(positions[k] for k in decision.frames)
+    return SweptSource(source, replace(decision, frames=frames), ahead)
 
 
 def with_sweep_of(source: Source, diagnostics: Mapping[str, Any]) -> SweptSource:

@@ -1,0 +1,58 @@
+"""What the methods of calibration need of a drive, and what of it is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+_BY_LABELS = ("joint", "paper", "semalign", "track")
+_BY_MOTION = ("motion",)
+_NO_SEARCH = ("paper", "semalign")
+"""Methods that start from a given pose alone."""
+METHODS = ("joint", "motion", "paper", "semalign", "track")
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a drive was found to hold.
+
+    Attributes:
+        scans, images: their numbers.
+        pictures: whether images have pictures, not masks alone.
+        point_classes, mask_classes: names of the classes on each side that can be aligned.
+        nominal: whether there is a nominal extrinsic.
+    """
+
+    scans: int
+    images: int
+    pictures: bool
+    point_classes: frozenset[str]
+    mask_classes: frozenset[str]
+    nominal: bool
+
+
+def missing_for(content: Content) -> dict[str, tuple[str, ...]]:
+    """For each method what it lacks, in words; nothing where it can be used."""
+    return {method: tuple(_missing(method, content)) for method in METHODS}
+
+
+def _missing(method: str, content: Content) -> list[str]:
+    fewest = 2 if method in _BY_MOTION else 1
+    found = []
+    if content.scans < fewest:
+        found.append("scans")
+    if content.images < fewest:
+        found.append("images")
+    if method in (*_BY_MOTION, "paper") and content.images and not content.pictures:
+        found.append("pictures")
+    if method in _BY_LABELS:
+        if content.scans and not content.point_classes:
+            found.append("labels of points")
+        if content.images and not content.mask_classes:
+            found.append("semantic masks of images")
+        both = content.point_classes and content.mask_classes
+        if both and not content.point_classes & content.mask_classes:
+            found.append("a class that points and masks both have")
+    if not content.nominal:
+        without = "--init FILE gives a start" if method in _NO_SEARCH else "--init none does without"
+        found.append(f"a nominal extrinsic ({without})")
+    return found

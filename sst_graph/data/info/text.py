@@ -1,0 +1,81 @@
+"""The summary of a drive in lines of text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from sst_graph.data.info.summary import DriveInfo, ImageInfo, ScanInfo, SensorInfo
+
+_WIDTH = 12
+_GAPS = 3
+"""Gaps that are named; all are counted."""
+
+
+def info_text(info: DriveInfo) -> str:
+    """The summary, one fact a line."""
+    return "\n".join(f"{name:<{_WIDTH}} {words}".rstrip() for name, words in _lines(info))
+
+
+def _lines(info: DriveInfo) -> Iterator[tuple[str, str]]:
+    yield "drive", f"{info.name}: {info.frames} frames"
+    c = info.camera
+    yield (
+        "camera",
+        (
+            f"{c['model']}, {c['width']}x{c['height']} px, fx {c['fx']:.2f}, fy {c['fy']:.2f}, "
+            f"cx {c['cx']:.2f}, cy {c['cy']:.2f} px"
+        ),
+    )
+    for name, sensor in (("images", info.image_sensor), ("scans", info.scan_sensor)):
+        yield name, _sensor(sensor)
+        for gap in sorted(sensor.gaps, key=lambda one: -one.seconds)[:_GAPS]:
+            yield "", f"gap of {gap.seconds:.3f} s after {_stamp(gap.from_ns)}"
+    if info.images is not None:
+        yield "labels", _masks(info.images)
+    if info.scans is not None:
+        yield "" if info.images is not None else "labels", _points(info.scans)
+        yield "points", _cloud(info.scans)
+    given = "yes" if info.nominal else "none"
+    yield "nominal", f"{given}, {info.nominal_reason}" if info.nominal_reason else given
+    for note in info.notes:
+        yield "note", note
+    for method, missing in info.missing.items():
+        yield method, f"missing: {', '.join(missing)}" if missing else "nothing is missing"
+
+
+def _sensor(sensor: SensorInfo) -> str:
+    parts = [f"{sensor.count} in {sensor.place}" if sensor.place else f"{sensor.count}"]
+    if sensor.rate_hz is not None:
+        parts.append(f"{sensor.rate_hz:.2f} Hz")
+    if sensor.first_ns is not None and sensor.last_ns is not None:
+        parts.append(f"{_stamp(sensor.first_ns)} to {_stamp(sensor.last_ns)}")
+    if sensor.gap_count is not None:
+        parts.append(f"{sensor.gap_count} gaps")
+    return ", ".join(parts)
+
+
+def _masks(images: ImageInfo) -> str:
+    if not images.masks:
+        return "no masks"
+    share, pixels = round(100 * images.masks), round(100 * images.labelled_pixels)
+    return f"masks of {share} % of the images, {pixels} % of all pixels: {', '.join(images.classes)}"
+
+
+def _points(scans: ScanInfo) -> str:
+    if not scans.labelled_scans:
+        return "no labels of points"
+    share, points = round(100 * scans.labelled_scans), round(100 * scans.labelled_points)
+    return f"labels in {share} % of the scans, {points} % of all points: {', '.join(scans.classes)}"
+
+
+def _cloud(scans: ScanInfo) -> str:
+    times = "no times of points" if scans.time_span_s is None else f"times over {scans.time_span_s:.4f} s"
+    rings = f"{scans.rings} rings" if scans.rings else "no rings"
+    left_out = f", {scans.left_out} left out" if scans.left_out else ""
+    return f"{scans.points} a scan{left_out}, {times}, {rings}"
+
+
+def _stamp(stamp_ns: int) -> str:
+    """Seconds with all nine decimals, exact."""
+    seconds, nanoseconds = divmod(abs(stamp_ns), 1_000_000_000)
+    return f"{'-' if stamp_ns < 0 else ''}{seconds}.{nanoseconds:09d} s"

@@ -1,0 +1,158 @@
+"""Points, laser numbers, times and labels of sensor_msgs/PointCloud2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.arrays import MAX_COORDINATE_M, MAX_POINTS
+from sst_graph.errors import DataError
+
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""NumPy's names of sensor_msgs/PointField datatypes."""
+
+TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
+"""Fields with the time of a point: of Ouster, Livox, Velodyne, Hesai and RoboSense, Livox's driver 2."""
+RING_FIELDS = ("ring", "channel")
+
+_ABSOLUTE_S, _ABSOLUTE_NS = 1e6, 1e15
+"""Times beyond these are counted from the epoch, in seconds or nanoseconds (Livox's driver 2)."""
+_FARTHEST_S = 1.0
+"""Points are measured within this of the scan's stamp."""
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points of a message; those that are NaN, inf or at the origin are left out.
+
+    Attributes:
+        points: (n, 3) float32, frame of the LiDAR [m].
+        rings: (n,) uint16 laser number, or None.
+        offsets_s: (n,) float32 time after the header's stamp [s], or None.
+        labels: (n,) uint32 as SemanticKITTI has them, instance in the high 16 bits, or None.
+        left_out: number of points left out.
+    """
+
+    points: NDArray[np.float32]
+    rings: NDArray[np.uint16] | None
+    offsets_s: NDArray[np.float32] | None
+    labels: NDArray[np.uint32] | None
+    left_out: int
+
+
+def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels: bool = False) -> Cloud:
+    """The cloud of a message.
+
+    Args:
+        stamp_ns: the header's stamp.
+        times: read the times of the points, where the message has them.
+        labels: read the fields ``label`` and ``instance``, where the message has them.
+
+    Raises:
+        DataError: no x, y, z; fewer bytes than points; times that are no times of this scan.
+    """
+    table = _table(message, place)
+    points = np.stack([_floats(table, axis) for axis in "xyz"], axis=1).astype(np.float32)
+    # Drivers give NaN or the origin for beams without a return.
+    used = np.isfinite(points).all(axis=1) & (points != 0.0).any(axis=1)
+    table, points = table[used], np.ascontiguousarray(points[used])
+    if len(points) and float(np.abs(points).max()) > MAX_COORDINATE_M:
+        found = f"a coordinate of {float(np.abs(points).max()):.3g} m"
+        raise DataError(place, found, f"at most {MAX_COORDINATE_M:g} m")
+    return Cloud(
+        points,
+        _rings(table),
+        _offsets(table, stamp_ns, place) if times else None,
+        _labels(table) if labels else None,
+        int(len(used) - used.sum()),
+    )
+
+
+def _table(message: Any, place: str) -> NDArray[Any]:
+    """The points as a table (n,) of named columns."""
+    fields = {field.name: field for field in message.fields if int(field.datatype) in _TYPES and field.name}
+    if missing := [axis for axis in "xyz" if axis not in fields]:
+        found = f"fields {', '.join(fields) or 'none'} without {', '.join(missing)}"
+        raise DataError(place, found, "a cloud with x, y, z")
+    order, step = ">" if message.is_bigendian else "<", int(message.point_step)
+    width, height, row = int(message.width), int(message.height), int(message.row_step)
+    ends = [field.offset + np.dtype(_TYPES[int(field.datatype)]).itemsize for field in fields.values()]
+    if step < max(ends) or not 0 <= width * height <= MAX_POINTS:
+        found = f"{width}x{height} points of {step} bytes"
+        raise DataError(place, found, f"at least {max(ends)} bytes a point, at most {MAX_POINTS} points")
+    row = max(row, width * step) if height > 1 else width * step
+    data = np.asarray(message.data, np.uint8)
+    if len(data) < row * (height - 1) + width * step:
+        raise DataError(place, f"{len(data)} bytes", f"{width}x{height} points of {step} bytes")
+    if row == width * step:
+        packed = np.ascontiguousarray(data[: height * row])
+    else:
+        padded = np.zeros(row * height, np.uint8)
+        padded[: min(len(data), len(padded))] = data[: len(padded)]
+        packed = np.ascontiguousarray(padded.reshape(height, row)[:, : width * step])
+    table = np.dtype(
+        {
+            "names": list(fields),
+            "formats": [order + _TYPES[int(field.datatype)] for field in fields.values()],
+            "offsets": [int(field.offset) for field in fields.values()],
+            "itemsize": step,
+        }
+    )
+    return np.asarray(packed.reshape(-1).view(table))
+
+
+def _floats(table: NDArray[Any], name: str) -> NDArray[np.float64]:
+    return np.asarray(table[name], np.float64)
+
+
+def _names(table: NDArray[Any]) -> tuple[str, ...]:
+    return table.dtype.names or ()
+
+
+def _rings(table: NDArray[Any]) -> NDArray[np.uint16] | None:
+    for name in RING_FIELDS:
+        if name in _names(table) and table[name].dtype.kind in "iu":
+            return np.asarray(table[name]).astype(np.uint16)
+    return None
+
+
+def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float32] | None:
+    """Times after the stamp [s]: whole numbers are ns; floats are s, relative or since the epoch."""
+    name = next((name for name in TIME_FIELDS if name in _names(table)), None)
+    if name is None or not len(table):
+        return None
+    values = table[name]
+    if values.dtype.kind in "iu":
+        whole = values.astype(np.int64)
+        relative = whole - stamp_ns if int(np.abs(whole).max()) > _ABSOLUTE_NS else whole
+        seconds = relative * 1e-9
+    else:
+        seconds = _relative(values.astype(np.float64), stamp_ns)
+    worst = float(np.abs(seconds).max())
+    if not worst <= _FARTHEST_S:
+        found = f"field {name!r} with times up to {worst:.6g} s from the header's stamp"
+        expected = "times within 1 s of it (--sweep compensated reads the cloud without them)"
+        raise DataError(place, found, expected)
+    return np.asarray(seconds, np.float32)
+
+
+def _relative(times: NDArray[np.float64], stamp_ns: int) -> NDArray[np.float64]:
+    largest = float(np.abs(times).max())
+    if largest > _ABSOLUTE_NS:
+        return (times - float(stamp_ns)) * 1e-9
+    if largest > _ABSOLUTE_S:
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        return (times - float(seconds)) - nanoseconds * 1e-9
+    return times
+
+
+def _labels(table: NDArray[Any]) -> NDArray[np.uint32] | None:
+    if "label" not in _names(table) or table["label"].dtype.kind not in "iu":
+        return None
+    labels = table["label"].astype(np.uint32)
+    if "instance" in _names(table) and table["instance"].dtype.kind in "iu":
+        labels = (labels & np.uint32(0xFFFF)) | (table["instance"].astype(np.uint32) << np.uint32(16))
+    return labels

@@ -1,0 +1,91 @@
+"""Pictures and masks of sensor_msgs/Image and CompressedImage."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.images import MAX_PIXELS, decoded_mask, decoded_picture
+from sst_graph.data.ros.topics import COMPRESSED
+from sst_graph.errors import DataError
+
+_CHANNELS = {
+    "mono8": 1, "8UC1": 1, "rgb8": 3, "bgr8": 3, "8UC3": 3, "rgba8": 4, "bgra8": 4, "8UC4": 4,
+    "bayer_rggb8": 1, "bayer_bggr8": 1, "bayer_gbrg8": 1, "bayer_grbg8": 1,
+    "yuv422": 2, "uyvy": 2, "yuv422_yuy2": 2, "yuyv": 2,
+}  # fmt: skip
+"""Bytes a pixel of each encoding (sensor_msgs/image_encodings.h)."""
+
+_TO_BGR = {
+    "mono8": cv2.COLOR_GRAY2BGR,
+    "8UC1": cv2.COLOR_GRAY2BGR,
+    "rgb8": cv2.COLOR_RGB2BGR,
+    "rgba8": cv2.COLOR_RGBA2BGR,
+    "bgra8": cv2.COLOR_BGRA2BGR,
+    "8UC4": cv2.COLOR_BGRA2BGR,
+    # OpenCV names a Bayer pattern by its second row and column, ROS by its first (as cv_bridge has it).
+    "bayer_rggb8": cv2.COLOR_BayerBG2BGR,
+    "bayer_bggr8": cv2.COLOR_BayerRG2BGR,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2BGR,
+    "bayer_grbg8": cv2.COLOR_BayerGB2BGR,
+    "yuv422": cv2.COLOR_YUV2BGR_UYVY,
+    "uyvy": cv2.COLOR_YUV2BGR_UYVY,
+    "yuv422_yuy2": cv2.COLOR_YUV2BGR_YUY2,
+    "yuyv": cv2.COLOR_YUV2BGR_YUY2,
+}
+"""Conversions of OpenCV; what is not here is BGR already."""
+
+
+def picture_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
+    """Picture (h, w, 3) uint8 BGR of a message.
+
+    Raises:
+        DataError: an encoding that is not understood, or fewer bytes than the picture has.
+    """
+    if type_name == COMPRESSED:
+        _check_compressed(message, place)
+        return decoded_picture(bytes(message.data), place)
+    rows = _rows(message, place)
+    code = _TO_BGR.get(message.encoding)
+    return np.ascontiguousarray(rows) if code is None else np.asarray(cv2.cvtColor(rows, code), np.uint8)
+
+
+def mask_of(message: Any, type_name: str, place: str) -> NDArray[np.uint8]:
+    """Mask (h, w) uint8 of a message: mono8, or a PNG of one channel.
+
+    Raises:
+        DataError: another encoding, or fewer bytes than the mask has.
+    """
+    if type_name == COMPRESSED:
+        _check_compressed(message, place)
+        return decoded_mask(bytes(message.data), place)
+    if message.encoding not in ("mono8", "8UC1"):
+        raise DataError(place, f"a mask in encoding {message.encoding!r}", "mono8 with Cityscapes numbers")
+    return np.ascontiguousarray(_rows(message, place))
+
+
+def _rows(message: Any, place: str) -> NDArray[np.uint8]:
+    """Pixels (h, w) or (h, w, channels) without the padding of the rows."""
+    encoding, height, width = str(message.encoding), int(message.height), int(message.width)
+    if encoding not in _CHANNELS:
+        hint = ", convert it to 8 bits" if "16" in encoding or "32" in encoding else ""
+        raise DataError(place, f"encoding {encoding!r}", f"one of {', '.join(_CHANNELS)}{hint}")
+    if not 0 < height * width <= MAX_PIXELS:
+        raise DataError(place, f"{width}x{height} px", f"1 to {MAX_PIXELS} pixels")
+    channels, step = _CHANNELS[encoding], int(message.step) or width * _CHANNELS[encoding]
+    data = np.asarray(message.data, np.uint8)
+    if step < width * channels or len(data) < step * (height - 1) + width * channels:
+        found = f"{len(data)} bytes in rows of {step}"
+        raise DataError(place, found, f"{width}x{height} px of {channels} bytes ({encoding})")
+    padded = np.zeros(step * height, np.uint8)
+    padded[: min(len(data), len(padded))] = data[: len(padded)]
+    rows = padded.reshape(height, step)[:, : width * channels]
+    return rows if channels == 1 else rows.reshape(height, width, channels)
+
+
+def _check_compressed(message: Any, place: str) -> None:
+    if "compressedDepth" in message.format:
+        raise DataError(place, f"format {message.format!r}", "a JPEG or PNG picture")

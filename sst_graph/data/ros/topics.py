@@ -1,0 +1,115 @@
+"""Which topics of a bag hold the image, the cloud, the camera's model, the masks and the transforms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sst_graph.data.ros.bag import TF_MESSAGE, Topic
+from sst_graph.data.source import SourceOptions
+from sst_graph.errors import DataError
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CLOUD, INFO = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
+
+_TRANSFORMS = (TF_MESSAGE, "tf/msg/tfMessage")
+_LISTED = 12
+"""Topics that an error lists at most."""
+
+
+@dataclass(frozen=True)
+class Topics:
+    """Topics that a drive is read from.
+
+    Attributes:
+        image, cloud, info: of the camera, the LiDAR and the camera's model.
+        mask: of the semantic masks, or None.
+        transforms: names of those with TFMessage.
+    """
+
+    image: Topic
+    cloud: Topic
+    info: Topic
+    mask: Topic | None
+    transforms: tuple[str, ...]
+
+    @property
+    def sensors(self) -> frozenset[str]:
+        """Names of the topics that frames are read from."""
+        return frozenset(one.name for one in (self.image, self.cloud, self.mask) if one is not None)
+
+
+def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOptions) -> Topics:
+    """The topics that the options name; where they name none, the only one of its type.
+
+    The model of a camera is that beside its images: "/camera/camera_info" for "/camera/image_raw". Of images
+    with a compressed copy the plain ones are taken.
+
+    Raises:
+        DataError: none or several fit; the topics of the bag are listed.
+    """
+    filled = {name: topic for name, topic in topics.items() if topic.count}
+    mask = None
+    if options.mask_topic is not None:
+        mask = _named(path, filled, options.mask_topic, (IMAGE, COMPRESSED), "--mask-topic")
+    images = {n: t for n, t in filled.items() if mask is None or n != mask.name}
+    image = _one(path, images, options.image_topic, (IMAGE, COMPRESSED), "--image-topic")
+    return Topics(
+        image=image,
+        cloud=_one(path, filled, options.cloud_topic, (CLOUD,), "--cloud-topic"),
+        info=_info(path, filled, options.info_topic, image),
+        mask=mask,
+        transforms=tuple(name for name, topic in filled.items() if topic.type in _TRANSFORMS),
+    )
+
+
+def _one(
+    path: Path, topics: Mapping[str, Topic], name: str | None, types: tuple[str, ...], option: str
+) -> Topic:
+    if name is not None:
+        return _named(path, topics, name, types, option)
+    fitting = [topic for topic in topics.values() if topic.type in types]
+    plain = {topic.name for topic in fitting if topic.type == IMAGE}
+    fitting = [
+        topic for topic in fitting if topic.name.removesuffix("/compressed") not in plain - {topic.name}
+    ]
+    fitting = [topic for topic in fitting if not topic.name.endswith("/compressedDepth")]
+    if len(fitting) == 1:
+        return fitting[0]
+    what = " or ".join(types)
+    if not fitting:
+        raise DataError(path, f"no topic of {what} among {listed(topics.values())}", "one")
+    raise DataError(path, f"several topics of {what}: {listed(fitting)}", f"one, named by {option}")
+
+
+def _info(path: Path, topics: Mapping[str, Topic], name: str | None, image: Topic) -> Topic:
+    if name is None:
+        beside = topics.get(_namespace(image.name) + "/camera_info")
+        if beside is not None and beside.type == INFO:
+            return beside
+    return _one(path, topics, name, (INFO,), "--info-topic")
+
+
+def _namespace(image: str) -> str:
+    """Namespace of a camera by the name of its images: "/front" of "/front/image_raw/compressed"."""
+    return image.removesuffix("/compressed").rpartition("/")[0]
+
+
+def _named(path: Path, topics: Mapping[str, Topic], name: str, types: tuple[str, ...], option: str) -> Topic:
+    topic = topics.get(name)
+    if topic is None:
+        raise DataError(
+            path, f"no message of {name} ({option}); there are {listed(topics.values())}", "a topic"
+        )
+    if topic.type not in types:
+        raise DataError(path, f"{option} {name} of {topic.type}", " or ".join(types))
+    return topic
+
+
+def listed(topics: Iterable[Topic]) -> str:
+    """Topics with type and number of messages, in one line."""
+    ordered = list(topics)
+    words = [f"{one.name} ({one.type.replace('/msg/', '/')}, {one.count})" for one in ordered[:_LISTED]]
+    more = len(ordered) - _LISTED
+    return ", ".join(words + [f"and {more} more"] * (more > 0)) or "no topic with messages"

@@ -1,0 +1,78 @@
+"""Transforms of /tf and /tf_static, and the pose of one frame in another where they determine it."""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+
+_SAME = 1e-6
+"""Transforms that differ by less [m, and in the elements of the rotation] are the same."""
+
+
+class Transforms:
+    """Poses of child frames in parent frames, as they are published over a drive."""
+
+    def __init__(self) -> None:
+        self._poses: dict[tuple[str, str], gtsam.Pose3] = {}
+        self._moving: set[tuple[str, str]] = set()
+
+    def add(self, message: Any) -> None:
+        """Take the transforms of a TFMessage."""
+        for one in message.transforms:
+            edge = _frame(one.header.frame_id), _frame(one.child_frame_id)
+            pose = _pose(one.transform)
+            known = self._poses.setdefault(edge, pose)
+            if not known.equals(pose, _SAME):
+                self._moving.add(edge)
+
+    def pose(self, parent: str, child: str) -> tuple[gtsam.Pose3 | None, str]:
+        """Pose of ``child`` in ``parent``, or None, and why: missing, moving or ambiguous."""
+        if parent == child:
+            return None, f"camera and LiDAR have the same frame, {parent!r}"
+        path = self._path(parent, child)
+        if path is None:
+            return None, f"no chain of transforms from {parent!r} to {child!r}"
+        pose = gtsam.Pose3()
+        for first, second in pairwise(path):
+            edge = (first, second) if (first, second) in self._poses else (second, first)
+            if edge in self._moving:
+                return None, f"the transform from {edge[0]!r} to {edge[1]!r} is not constant"
+            parents = sorted(p for p, c in self._poses if c == edge[1])
+            if len(parents) > 1:
+                return None, f"{edge[1]!r} has several parents: {', '.join(parents)}"
+            step = self._poses[edge]
+            pose = pose * (step if edge == (first, second) else step.inverse())
+        return pose, f"by transforms {' - '.join(path)}"
+
+    def _path(self, start: str, end: str) -> list[str] | None:
+        """The shortest chain of frames."""
+        neighbours: dict[str, list[str]] = {}
+        for parent, child in self._poses:
+            neighbours.setdefault(parent, []).append(child)
+            neighbours.setdefault(child, []).append(parent)
+        before: dict[str, str | None] = {start: None}
+        waiting = deque([start])
+        while waiting:
+            frame = waiting.popleft()
+            if frame == end:
+                path = [frame]
+                while (previous := before[path[-1]]) is not None:
+                    path.append(previous)
+                return path[::-1]
+            for other in neighbours.get(frame, ()):
+                if other not in before:
+                    before[other] = frame
+                    waiting.append(other)
+        return None
+
+
+def _frame(name: str) -> str:
+    return str(name).lstrip("/")
+
+
+def _pose(transform: Any) -> gtsam.Pose3:
+    q, t = transform.rotation, transform.translation
+    return gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])

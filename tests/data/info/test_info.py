@@ -1,0 +1,65 @@
+"""The summary of a drive."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.data.info.facts import SensorFacts
+from sst_graph.data.info.methods import METHODS, Content, missing_for
+from sst_graph.data.info.summary import Gap, sensor_info
+
+EVERYTHING = Content(20, 20, True, frozenset({"vehicle", "pole"}), frozenset({"vehicle"}), True)
+
+
+def test_rate_and_gaps_by_the_median_interval() -> None:
+    stamps = np.array([0, 100, 200, 360, 460, 560, 700, 1200], np.int64) * 1_000_000
+    info = sensor_info(SensorFacts("here", stamps))
+    assert (info.count, info.rate_hz, info.gap_count) == (8, 10.0, 2)
+    assert (info.first_ns, info.last_ns) == (0, 1_200_000_000)
+    assert info.gaps == (Gap(200_000_000, 0.16), Gap(700_000_000, 0.5))
+    assert sensor_info(SensorFacts("", stamps[:1])).rate_hz is None
+    assert sensor_info(SensorFacts("", stamps[:0])).first_ns is None
+
+
+def test_what_is_missing_for_which_method() -> None:
+    assert missing_for(EVERYTHING) == {method: () for method in METHODS}
+    nothing = Content(20, 20, True, frozenset(), frozenset(), True)
+    labels = ("labels of points", "semantic masks of images")
+    assert missing_for(nothing) == {method: () if method == "motion" else labels for method in METHODS}
+    blind = Content(1, 20, False, frozenset({"pole"}), frozenset({"vehicle"}), False)
+    found = missing_for(blind)
+    assert found["motion"] == ("scans", "pictures", "a nominal extrinsic (--init none does without)")
+    assert found["joint"] == (
+        "a class that points and masks both have", "a nominal extrinsic (--init none does without)"
+    )  # fmt: skip
+    assert found["paper"][-1] == "a nominal extrinsic (--init FILE gives a start)"
+
+
+def test_text_and_json_of_a_drive(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(kitti_drive)]) == 0
+    lines = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines() if line[0] != " ")
+    assert lines["drive"] == "kitti/00: 5 frames"
+    assert lines["camera"] == "pinhole, 8x6 px, fx 700.00, fy 700.00, cx 4.00, cy 3.00 px"
+    assert lines["scans"].endswith("velodyne, 10.00 Hz, 0.000000000 s to 0.410000000 s, 0 gaps")
+    assert lines["points"] == "12 a scan, no times of points, no rings"
+    assert lines["nominal"] == "yes, by calib.txt" and lines["joint"] == "nothing is missing"
+    assert main(["info", str(kitti_drive), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scan_sensor"]["count"] == found["image_sensor"]["count"] == 5
+    assert found["images"]["masks"] == 1.0 and found["scans"]["classes"] == ["vehicle", "ground"]
+    assert found["missing"] == {method: [] for method in METHODS}
+
+
+def test_a_drive_without_labels(kitti_drive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for file in (kitti_drive / "labels").iterdir():
+        labels = np.zeros(12, "<u4")
+        labels.tofile(file)
+    assert main(["info", str(kitti_drive), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["scans"]["labelled_points"] == 0.0
+    assert found["missing"]["motion"] == [] and found["missing"]["track"] == ["labels of points"]

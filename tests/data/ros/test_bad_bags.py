@@ -1,0 +1,200 @@
+"""Bags that cannot be used: one clear line and exit code 2."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from bags import CLOUD, EPOCH_NS, IMAGE, INFO, KINDS, MASK, BagWriter, Kind, Messages, files_of, writing
+
+from sst_graph.cli import main
+from sst_graph.data import open_source
+from sst_graph.errors import MissingDependencyError
+from sst_graph.factors.camera import PinholeCamera
+
+CAMERA = PinholeCamera(30.0, 30.0, 16.0, 12.0, 32, 24)
+MAKE = Messages()
+PIXELS = np.full((24, 32, 3), 60, np.uint8)
+
+
+def cloud(stamp_ns: int, make: Messages = MAKE) -> Any:
+    points = np.zeros(20, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    points["x"] = np.arange(20) + 1.0
+    return make.cloud(stamp_ns, points)
+
+
+def fill(bag: BagWriter, leave_out: Sequence[str] = (), frames: int = 4, later_ns: int = 0) -> None:
+    """A tiny drive at 10 Hz."""
+    make = bag.messages
+    for k in range(frames):
+        stamp_ns = EPOCH_NS + k * 100_000_000
+        for topic, message in (
+            (INFO, make.info(CAMERA, stamp_ns)),
+            (IMAGE, make.image(stamp_ns + later_ns, PIXELS)),
+            (CLOUD, cloud(stamp_ns, make)),
+        ):
+            if topic not in leave_out:
+                bag.add(topic, message, stamp_ns)
+
+
+def made(tmp_path: Path, *changes: Callable[[BagWriter], None], kind: Kind = "mcap") -> Path:
+    path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
+    with writing(path, kind) as bag:
+        for change in changes:
+            change(bag)
+    return path
+
+
+def refused(capsys: pytest.CaptureFixture[str], path: Path, *options: str) -> str:
+    assert main(["info", str(path), *options]) == 2
+    out, err = capsys.readouterr()
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert out == "" and len(lines) == 1 and lines[0].startswith("sst-graph: error: ")
+    return lines[0]
+
+
+def test_a_topic_is_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = refused(capsys, made(tmp_path, lambda bag: fill(bag, [CLOUD])))
+    assert "no topic of sensor_msgs/msg/PointCloud2" in line
+    assert f"{IMAGE} (sensor_msgs/Image, 4)" in line and f"{INFO} (sensor_msgs/CameraInfo, 4)" in line
+
+
+def test_two_image_topics_are_listed_and_one_is_chosen(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def rear(bag: BagWriter) -> None:
+        bag.add("/rear/image", bag.messages.image(EPOCH_NS + 1, PIXELS), EPOCH_NS)
+
+    path = made(tmp_path, fill, rear)
+    line = refused(capsys, path)
+    assert "/front/image_rect (sensor_msgs/Image, 4), /rear/image (sensor_msgs/Image, 1)" in line
+    assert line.endswith("expected one, named by --image-topic")
+    assert main(["info", str(path), "--image-topic", "/rear/image"]) == 0
+    assert "1 in /rear/image" in capsys.readouterr().out
+
+
+def test_a_compressed_copy_is_no_second_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def copy(bag: BagWriter) -> None:
+        bag.add(f"{IMAGE}/compressed", bag.messages.compressed(EPOCH_NS, b"x"), EPOCH_NS)
+
+    assert main(["info", str(made(tmp_path, fill, copy))]) == 0
+    assert f"4 in {IMAGE}" in capsys.readouterr().out
+
+
+def test_a_named_topic_that_is_not_there_or_of_another_type(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    assert "no message of /masks (--mask-topic); there are" in refused(capsys, path, "--mask-topic", "/masks")
+    line = refused(capsys, path, "--cloud-topic", IMAGE)
+    assert f"--cloud-topic {IMAGE} of sensor_msgs/msg/Image, expected sensor_msgs/msg/PointCloud2" in line
+
+
+def test_an_encoding_that_is_not_understood(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def deep(bag: BagWriter) -> None:
+        bag.add(IMAGE, bag.messages.image(EPOCH_NS, np.zeros((24, 64), np.uint8), "mono16"), EPOCH_NS)
+
+    line = refused(capsys, made(tmp_path, lambda bag: fill(bag, [IMAGE]), deep))
+    assert "found encoding 'mono16', expected one of mono8" in line
+
+
+def test_fields_that_are_not_understood(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def polar(bag: BagWriter) -> None:
+        points = np.zeros(20, [("range", "<f4"), ("azimuth", "<f4")])
+        bag.add(CLOUD, bag.messages.cloud(EPOCH_NS, points), EPOCH_NS)
+
+    line = refused(capsys, made(tmp_path, lambda bag: fill(bag, [CLOUD]), polar))
+    assert "found fields range, azimuth without x, y, z, expected a cloud with x, y, z" in line
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.4, 0.9])
+def test_a_bag_cut_short(
+    kind: Kind, share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, lambda bag: fill(bag, frames=40), kind=kind)
+    file = path if kind == "ros1" else files_of(path, ".mcap" if kind == "mcap" else ".db3")[0]
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    line = refused(capsys, path)
+    assert str(path) in line and "cut short" in line
+
+
+def test_stamps_of_zero_and_the_times_of_recording(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unstamped(bag: BagWriter) -> None:
+        for k in range(4):
+            bag.add(IMAGE, bag.messages.image(0, PIXELS), EPOCH_NS + k * 50_000_000)
+
+    path = made(tmp_path, lambda bag: fill(bag, [IMAGE]), unstamped)
+    assert "4 of 4 messages with stamp 0" in refused(capsys, path)
+    stamps = [f.image.stamp_ns for f in open_source(path, stamps="received") if f.image is not None]
+    assert stamps == [EPOCH_NS + k * 50_000_000 for k in range(4)]
+
+
+def test_stamps_that_jump_back(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def back(bag: BagWriter) -> None:
+        stamp_ns = EPOCH_NS - 5_000_000_000
+        bag.add(IMAGE, bag.messages.image(stamp_ns, PIXELS), EPOCH_NS + 1_000_000_000)
+
+    assert "stamps that jump back by 5.300 s at message 4" in refused(capsys, made(tmp_path, fill, back))
+
+
+def test_messages_out_of_order_are_sorted_and_repeated_ones_left_out(tmp_path: Path) -> None:
+    def late(bag: BagWriter) -> None:
+        for stamp_ns in (EPOCH_NS + 150_000_000, EPOCH_NS + 300_000_000):
+            bag.add(IMAGE, bag.messages.image(stamp_ns, PIXELS), EPOCH_NS + 1_000_000_000)
+
+    source = open_source(made(tmp_path, fill, late))
+    stamps = [f.image.stamp_ns - EPOCH_NS for f in source if f.image is not None]
+    assert stamps == [0, 100_000_000, 150_000_000, 200_000_000, 300_000_000]
+
+
+def test_a_distorted_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def distorted(bag: BagWriter) -> None:
+        info = bag.messages.info(CAMERA, d=np.array([-0.2, 0.0, 0.0, 0.0, 0.0]))
+        bag.add("/raw/camera_info", info, EPOCH_NS)
+        bag.add("/raw/image", bag.messages.image(EPOCH_NS, PIXELS), EPOCH_NS)
+
+    path = made(tmp_path, distorted, lambda bag: fill(bag, [IMAGE, INFO]))
+    assert "expected rectified images" in refused(capsys, path)
+
+
+def test_masks_with_stamps_of_no_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def masks(bag: BagWriter) -> None:
+        bag.add(MASK, bag.messages.image(EPOCH_NS + 7, PIXELS[..., 0].copy(), "mono8"), EPOCH_NS)
+
+    line = refused(capsys, made(tmp_path, fill, masks), "--mask-topic", MASK)
+    assert f"masks at other stamps, such as {EPOCH_NS + 7} ns" in line
+
+
+def test_options_of_other_formats(
+    tmp_path: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = made(tmp_path, fill)
+    assert "--image-shift 1: means nothing for" in refused(capsys, path, "--image-shift", "1")
+    assert "--mask-topic /m: means nothing for" in refused(capsys, kitti_drive, "--mask-topic", "/m")
+    assert "the drive has frames 0:4" in refused(capsys, path, "--frames", "3:9")
+
+
+def test_what_is_no_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "notes.txt").write_text("no bag")
+    assert "found no layout that is known" in refused(capsys, tmp_path / "notes.txt")
+    assert "found no bag, expected a bag: PATH.bag" in refused(capsys, tmp_path, "--loader", "ros")
+    assert "no file or folder" in refused(capsys, tmp_path / "absent.mcap")
+
+
+def test_without_rosbags_the_message_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = made(tmp_path, fill)
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
+    with pytest.raises(MissingDependencyError, match=r"pip install 'sst-graph\[ros\]'"):
+        open_source(path)

@@ -1,0 +1,252 @@
+"""Messages of the sensors: encodings, fields, layouts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+
+pytest.importorskip("rosbags")
+
+from bags import CAMERA_FRAME, EPOCH_NS, LIDAR_FRAME, Messages, chain
+
+from sst_graph.data.ros.camera_info import camera_model
+from sst_graph.data.ros.clouds import Cloud, cloud_of
+from sst_graph.data.ros.images import mask_of, picture_of
+from sst_graph.data.ros.topics import COMPRESSED, IMAGE
+from sst_graph.data.ros.transforms import Transforms
+from sst_graph.errors import DataError
+from sst_graph.factors.camera import PinholeCamera
+
+MAKE = Messages()
+RNG = np.random.default_rng(4)
+BGR = RNG.integers(0, 255, (6, 10, 3), dtype=np.uint8)
+STAMP_NS = EPOCH_NS + 123_456_789
+CAMERA = PinholeCamera(700.0, 710.0, 320.0, 180.0, 640, 360)
+
+
+@pytest.mark.parametrize("padding", [0, 5])
+def test_colours_in_every_order(padding: int) -> None:
+    alpha = np.full((6, 10, 1), 9, np.uint8)
+    for encoding, pixels in {
+        "bgr8": BGR,
+        "rgb8": BGR[..., ::-1],
+        "bgra8": np.concatenate([BGR, alpha], axis=2),
+        "rgba8": np.concatenate([BGR[..., ::-1], alpha], axis=2),
+    }.items():
+        message = MAKE.image(STAMP_NS, np.ascontiguousarray(pixels), encoding, padding)
+        np.testing.assert_array_equal(picture_of(message, IMAGE, "here"), BGR)
+    grey = MAKE.image(STAMP_NS, BGR[..., 0].copy(), "mono8", padding)
+    np.testing.assert_array_equal(picture_of(grey, IMAGE, "here"), np.repeat(BGR[..., :1], 3, axis=2))
+
+
+@pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_patterns_give_the_colour_of_the_scene(pattern: str) -> None:
+    colour = {"b": 40, "g": 120, "r": 220}
+    tile = np.array([colour[letter] for letter in pattern], np.uint8).reshape(2, 2)
+    message = MAKE.image(STAMP_NS, np.tile(tile, (8, 8)), f"bayer_{pattern}8")
+    np.testing.assert_array_equal(
+        picture_of(message, IMAGE, "here")[4:-4, 4:-4], np.full((8, 8, 3), (40, 120, 220))
+    )
+
+
+def test_compressed_pictures_and_masks() -> None:
+    data = cv2.imencode(".png", BGR)[1].tobytes()
+    np.testing.assert_array_equal(picture_of(MAKE.compressed(STAMP_NS, data), COMPRESSED, "here"), BGR)
+    mask = np.arange(30, dtype=np.uint8).reshape(5, 6)
+    data = cv2.imencode(".png", mask)[1].tobytes()
+    np.testing.assert_array_equal(mask_of(MAKE.compressed(STAMP_NS, data), COMPRESSED, "here"), mask)
+    jpeg = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()
+    found = picture_of(MAKE.compressed(STAMP_NS, jpeg, "bgr8; jpeg compressed bgr8"), COMPRESSED, "here")
+    assert np.abs(found.astype(int) - 90).max() <= 2
+    with pytest.raises(DataError, match="truncated"):
+        picture_of(MAKE.compressed(STAMP_NS, jpeg[:-40], "jpeg"), COMPRESSED, "here")
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (
+            MAKE.image(STAMP_NS, np.zeros((4, 8), np.uint8), "mono16"),
+            "'mono16', expected one of mono8.*8 bits",
+        ),
+        (MAKE.image(STAMP_NS, BGR[:, :4].copy(), "rgba8"), "12, expected 4x6 px of 4 bytes"),
+        (MAKE.compressed(STAMP_NS, b"x", "16UC1; compressedDepth png"), "compressedDepth"),
+    ],
+)
+def test_pictures_that_are_not_understood(message: Any, words: str) -> None:
+    type_name = IMAGE if hasattr(message, "encoding") else COMPRESSED
+    with pytest.raises(DataError, match=words):
+        picture_of(message, type_name, "here")
+    with pytest.raises(DataError, match="mask in encoding 'bgr8'"):
+        mask_of(MAKE.image(STAMP_NS, BGR), IMAGE, "here")
+
+
+def table(count: int = 5, **columns: Any) -> np.ndarray[Any, Any]:
+    """x y z in 1, 2, 3, ... and other columns."""
+    dtype = [(axis, "<f4") for axis in "xyz"] + [(name, values.dtype) for name, values in columns.items()]
+    rows = np.zeros(count, dtype)
+    for k, axis in enumerate("xyz"):
+        rows[axis] = np.arange(count) + 1 + k
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+def read(rows: np.ndarray[Any, Any], big: bool = False, **options: bool) -> Cloud:
+    return cloud_of(MAKE.cloud(STAMP_NS, rows, big), STAMP_NS, "here", **options)
+
+
+SECONDS = np.array([0.0, 0.01, 0.025, 0.05, 0.0999])
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("t", (SECONDS * 1e9).round().astype("<u4")),  # Ouster
+        ("offset_time", (SECONDS * 1e9).round().astype("<u4")),  # Livox
+        ("time", SECONDS.astype("<f4")),  # Velodyne
+        ("timestamp", SECONDS.astype("<f8")),  # Hesai, relative
+        ("timestamp", 1_700_000_000.0 + (0.123456789 + SECONDS).astype("<f8")),  # Hesai, RoboSense
+        ("timestamp", (SECONDS * 1e9 + float(STAMP_NS)).astype("<f8")),  # Livox, driver 2
+        ("t", (SECONDS * 1e9).round().astype("<i8").astype("<u4")),
+    ],
+)
+def test_times_of_points(name: str, values: np.ndarray[Any, Any]) -> None:
+    cloud = read(table(**{name: values}))
+    assert cloud.offsets_s is not None and cloud.offsets_s.dtype == np.float32
+    np.testing.assert_allclose(cloud.offsets_s, SECONDS, atol=5e-7)
+    assert read(table(**{name: values}), times=False).offsets_s is None
+
+
+def test_times_before_the_stamp() -> None:
+    cloud = read(table(time=-SECONDS.astype("<f4")))
+    assert cloud.offsets_s is not None
+    np.testing.assert_allclose(cloud.offsets_s, -SECONDS, atol=1e-8)
+
+
+def test_times_of_another_clock_are_refused() -> None:
+    with pytest.raises(DataError, match=r"field 'timestamp' with times up to .*--sweep compensated"):
+        read(table(timestamp=SECONDS + 1_600_000_000.0))
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_padding_byte_order_and_rows(big: bool) -> None:
+    order = ">" if big else "<"
+    layout = np.dtype(
+        {
+            "names": ["z", "ring", "x", "y"],
+            "formats": [f"{order}f8", f"{order}u2", f"{order}f4", f"{order}f4"],
+            "offsets": [1, 11, 13, 20],
+            "itemsize": 37,
+        }
+    )
+    rows = np.zeros((3, 4), layout)
+    for k, name in enumerate("xyz"):
+        rows[name] = np.arange(12).reshape(3, 4) + 1 + 100 * k
+    rows["ring"] = np.arange(3)[:, None]
+    message = MAKE.cloud(STAMP_NS, rows, big)
+    expected = np.arange(12)[:, None] + np.array([1.0, 101.0, 201.0])
+    cloud = cloud_of(message, STAMP_NS, "here")
+    np.testing.assert_array_equal(cloud.points, expected)
+    assert cloud.rings is not None and cloud.rings.tolist() == [0] * 4 + [1] * 4 + [2] * 4
+    # The same with 6 bytes behind each row.
+    data = np.concatenate([message.data.reshape(3, -1), np.full((3, 6), 255, np.uint8)], axis=1)
+    message.data, message.row_step = data.ravel(), data.shape[1]
+    np.testing.assert_array_equal(cloud_of(message, STAMP_NS, "here").points, expected)
+
+
+def test_points_without_a_return_are_left_out_with_their_columns() -> None:
+    rows = table(ring=np.arange(5, dtype="<u2"), time=SECONDS.astype("<f4"))
+    rows["y"][1] = np.nan
+    rows["time"][1] = np.nan
+    for axis in "xyz":
+        rows[axis][3] = 0.0
+    cloud = read(rows)
+    assert cloud.left_out == 2 and len(cloud.points) == 3
+    assert cloud.rings is not None and cloud.rings.tolist() == [0, 2, 4]
+    assert cloud.offsets_s is not None and cloud.offsets_s[1] == np.float32(0.025)
+
+
+def test_labels_are_read_where_they_are_asked_for() -> None:
+    rows = table(label=np.full(5, 10, "<u2"), instance=np.arange(5, dtype="<u2"))
+    assert read(rows).labels is None
+    labels = read(rows, labels=True).labels
+    assert labels is not None and labels.tolist() == [10 | k << 16 for k in range(5)]
+    packed = read(table(label=np.full(5, 10 | 7 << 16, "<u4")), labels=True).labels
+    assert packed is not None and packed.tolist() == [10 | 7 << 16] * 5
+
+
+def test_clouds_that_are_not_understood() -> None:
+    with pytest.raises(
+        DataError, match="fields range, azimuth without x, y, z, expected a cloud with x, y, z"
+    ):
+        read(np.zeros(3, [("range", "<f4"), ("azimuth", "<f4")]))
+    message = MAKE.cloud(STAMP_NS, table())
+    message.data = message.data[:-1]
+    with pytest.raises(DataError, match="59 bytes, expected 5x1 points of 12 bytes"):
+        cloud_of(message, STAMP_NS, "here")
+    message.point_step = 8
+    with pytest.raises(DataError, match="at least 12 bytes a point"):
+        cloud_of(message, STAMP_NS, "here")
+
+
+def test_intrinsics_of_raw_and_rectified_images() -> None:
+    P = np.array([[650.0, 0, 300, -325], [0, 651, 170, 0], [0, 0, 1, 0]])
+    R = gtsam.Rot3.Ypr(0.01, -0.02, 0.005)
+    info = MAKE.info(CAMERA, p=P.ravel(), r=R.matrix().ravel())
+    raw = camera_model(info, "/cam/image_raw", (640, 360), "here")
+    assert raw.camera == CAMERA and raw.cRo.equals(gtsam.Rot3(), 1e-12)
+    rectified = camera_model(info, "/cam/image_rect_color", (640, 360), "here")
+    assert rectified.camera == PinholeCamera(650.0, 651.0, 300.0, 170.0, 640, 360)
+    assert rectified.cRo.equals(R, 1e-9)
+    ros1 = Messages(ros1=True).info(CAMERA)
+    assert camera_model(ros1, "/cam/image_raw", (640, 360), "here").camera == CAMERA
+
+
+def test_cameras_that_cannot_be_used() -> None:
+    distorted = MAKE.info(CAMERA, d=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
+    with pytest.raises(DataError, match=r"plumb_bob with D = \[-0.3.*expected rectified images"):
+        camera_model(distorted, "/cam/image_raw", (640, 360), "here")
+    assert camera_model(distorted, "/cam/image_rect", (640, 360), "here").camera == CAMERA
+    with pytest.raises(DataError, match="640x360 px, expected 320x180 px"):
+        camera_model(MAKE.info(CAMERA), "/cam/image_raw", (320, 180), "here")
+    with pytest.raises(DataError, match="K without a focal length"):
+        camera_model(MAKE.info(CAMERA, k=np.zeros(9)), "/cam/image_raw", (640, 360), "here")
+    with pytest.raises(DataError, match="binning"):
+        camera_model(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
+
+
+CTL = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.2, 1.0), np.array([0.1, -0.3, 0.2]))
+
+
+def transforms(*messages: Any) -> Transforms:
+    found = Transforms()
+    for message in messages:
+        found.add(message)
+    return found
+
+
+def test_a_chain_of_transforms_gives_the_pose_of_the_lidar_in_the_camera() -> None:
+    pose, words = transforms(MAKE.transforms(chain(CTL))).pose(CAMERA_FRAME, LIDAR_FRAME)
+    assert pose is not None and pose.equals(CTL, 1e-9)
+    assert words == f"by transforms {CAMERA_FRAME} - base_link - mast - {LIDAR_FRAME}"
+
+
+def test_chains_that_are_missing_moving_or_ambiguous_give_no_pose() -> None:
+    edges = chain(CTL)
+    whole = MAKE.transforms(edges)
+    moved = MAKE.transforms({("base_link", "mast"): gtsam.Pose3()})
+    second = MAKE.transforms({("roof", LIDAR_FRAME): gtsam.Pose3()})
+    part = MAKE.transforms({edge: pose for edge, pose in edges.items() if edge[1] != "mast"})
+    for found, words in (
+        (transforms(part), "no chain of transforms"),
+        (transforms(whole, moved), "from 'base_link' to 'mast' is not constant"),
+        (transforms(whole, second), "several parents: mast, roof"),
+    ):
+        pose, reason = found.pose(CAMERA_FRAME, LIDAR_FRAME)
+        assert pose is None and words in reason
+    assert transforms(whole, whole).pose(CAMERA_FRAME, LIDAR_FRAME)[0] is not None
