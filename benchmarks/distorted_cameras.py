@@ -1,8 +1,8 @@
 """Calibration through distorted lenses against a pinhole of the same place, field and resolution.
 
-Each street is driven through once a lens. Its images are rectified, and calibrated; so are the images that a pinhole
-with the rectified camera's intrinsics takes of the same street. The table has the median errors of both, and
-their ratio.
+Each street is driven through once a lens. Its images are rectified, and calibrated; so are the images that a
+pinhole with the rectified camera's intrinsics takes of the same street. The table has the median errors of
+both, and their ratio.
 
     python benchmarks/distorted_cameras.py --streets 4
 
@@ -59,7 +59,9 @@ def of_equal_pixels(rectification: Rectification) -> PinholeCamera:
     return PinholeCamera(fx, fy, cx - 0.5, cy - 0.5, int(scale * camera.width), int(scale * camera.height))
 
 
-def compare(lens: str, seeds: Sequence[int], options: argparse.Namespace) -> tuple[list[CalibrationErrors], ...]:
+def compare(
+    lens: str, seeds: Sequence[int], options: argparse.Namespace
+) -> tuple[list[CalibrationErrors], ...]:
     """Errors on each street through a lens, and of the pinhole in its place."""
     through, pinhole = [], []
     for seed in seeds:
@@ -86,7 +88,10 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--lens", nargs="*", default=["k1 = -0.3", "fisheye 190"])
     parser.add_argument(
-        "--pinhole", choices=("axis", "pixels"), default="axis", help="as fine as the lens at its axis, or on the whole"
+        "--pinhole",
+        choices=("axis", "pixels"),
+        default="axis",
+        help="as fine as the lens at its axis, or on the whole",
     )
     options = parser.parse_args()
     print("| lens | rotation [deg] | ATD [cm] | time offset [ms] | of the pinhole | ratio |")

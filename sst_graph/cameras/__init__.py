@@ -14,7 +14,7 @@ __all__ = [
     "CameraModel",
     "DoubleSphereCamera",
     "FisheyeCamera",
-    "RectifiedSource",
     "Rectification",
+    "RectifiedSource",
     "rectified_camera",
 ]

@@ -1,4 +1,4 @@
-"""Double sphere camera (Usenko, Demmel and Cremers, "The Double Sphere Camera Model", 3DV 2018), Kalibr's ``ds``.
+"""Double sphere camera (Usenko, Demmel and Cremers, "The Double Sphere Camera Model", 3DV 2018); Kalibr's ds.
 
 A point is projected on to a unit sphere, the sphere's centre is shifted by xi, it is projected on to a second
 sphere and from a centre shifted by alpha / (1 - alpha) on to the plane (eq. 40 to 52 of the paper).

@@ -88,5 +88,7 @@ class FisheyeCamera(CameraModel):
             theta = np.clip(theta - step, 0.0, self.largest_angle)
             if np.abs(step[valid]).max(initial=0.0) < 1e-16:
                 break
-        by_distance = np.where(distances > 0.0, np.sin(theta) / np.where(distances > 0.0, distances, 1.0), 0.0)
+        by_distance = np.where(
+            distances > 0.0, np.sin(theta) / np.where(distances > 0.0, distances, 1.0), 0.0
+        )
         return np.column_stack([xys * by_distance[:, None], np.cos(theta)]), valid

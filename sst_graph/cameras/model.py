@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,9 +83,9 @@ class CameraModel(ABC):
         """(n, 3) unit rays, and (n,) whether a ray of the valid field falls there."""
 
 
-def smallest_positive_root(coefficients: FloatArray) -> float:
+def smallest_positive_root(coefficients: NDArray[Any]) -> float:
     """Of a polynomial, the constant first; inf where there is none."""
-    used = np.trim_zeros(np.asarray(coefficients, np.float64), "b")
+    used = np.trim_zeros(np.array(coefficients, np.float64), "b")
     if len(used) < 2:
         return np.inf
     roots = np.polynomial.Polynomial(used).roots()

@@ -32,14 +32,14 @@ _BROWN_CONRADY = {
     "rational_polynomial": (8, 12, 14),
     "thin_prism": (12, 14),
 }
-"""Numbers of coefficients by the name of the distortion in ROS, Kalibr and OpenCV; 14 are with a tilted sensor."""
+"""Numbers of coefficients by the name of the distortion in ROS, Kalibr, OpenCV; 14: with a tilted sensor."""
 _FISHEYE = ("equidistant", "fisheye", "kannala_brandt", "kannala-brandt")
 _NONE = ("", "none", "pinhole")
 _KALIBR = "pinhole with none, radtan or equidistant, or ds"
 
 
 def camera_of(
-    intrinsics: PinholeCamera, distortion: str, coefficients: Sequence[float], place: str | Path
+    intrinsics: PinholeCamera, distortion: str, coefficients: Sequence[float] | FloatArray, place: str | Path
 ) -> CameraModel:
     """The model of a distortion's name and coefficients, in OpenCV's order.
 
@@ -50,7 +50,7 @@ def camera_of(
             go with the size of the image.
     """
     intrinsics = checked_camera(intrinsics, place)
-    values, name = tuple(map(float, coefficients)), distortion.lower()
+    values, name = tuple(float(value) for value in coefficients), distortion.lower()
     if not np.isfinite(values).all():
         raise DataError(place, f"distortion coefficients {values}", "finite numbers")
     if name in _FISHEYE:
@@ -79,8 +79,8 @@ def camera_from_camera_info(
     """Of a ROS 1 or ROS 2 ``sensor_msgs/CameraInfo`` by field, K D P or k d p: ``vars(message)``.
 
     Args:
-        rectified: the images are those of ``image_rect``: the pinhole of P. A calibration with these holds for
-            the camera's rectified frame.
+        rectified: the images are those of ``image_rect``: the pinhole of P. A calibration with these holds
+            for the camera's rectified frame.
 
     Raises:
         DataError: an uncalibrated camera, binning or a region of interest, another distortion model.
@@ -151,7 +151,8 @@ def _kalibr_camera(table: Table, place: str) -> KalibrCamera:
     if len(values) != own + 4:
         names = "[xi, alpha, fu, fv, pu, pv]" if own else "[fu, fv, pu, pv]"
         raise DataError(place, f"{len(values)} intrinsics of {kind}", names)
-    intrinsics = PinholeCamera(*map(float, values[own:]), width, height)
+    fx, fy, cx, cy = (float(value) for value in values[own:])
+    intrinsics = PinholeCamera(fx, fy, cx, cy, width, height)
     model: CameraModel
     if kind == "ds":
         if distortion != "none" or coefficients.any():
@@ -181,9 +182,7 @@ def camera_from_opencv(table: Table, place: str | Path = "camera file") -> Camer
         DataError: a value is missing, or the model is unknown.
     """
     K = _matrix(_either(table, "camera_matrix", "K", place), (3, 3), f"{place}: camera_matrix")
-    D = _numbers(
-        _either(table, "distortion_coefficients", "D", place), f"{place}: distortion_coefficients"
-    )
+    D = _numbers(_either(table, "distortion_coefficients", "D", place), f"{place}: distortion_coefficients")
     width, height = _whole(table, "image_width", place), _whole(table, "image_height", place)
     # OpenCV writes 5, 8, 12 or 14 coefficients, and no name of the model.
     usual = "equidistant" if int(table.get("fisheye_model", 0)) else _NAME_BY_LENGTH.get(len(D), "")
@@ -191,7 +190,13 @@ def camera_from_opencv(table: Table, place: str | Path = "camera file") -> Camer
     return camera_of(_pinhole(K, width, height, f"{place}: camera_matrix"), distortion, D, place)
 
 
-_NAME_BY_LENGTH = {4: "plumb_bob", 5: "plumb_bob", 8: "rational_polynomial", 12: "thin_prism", 14: "thin_prism"}
+_NAME_BY_LENGTH = {
+    4: "plumb_bob",
+    5: "plumb_bob",
+    8: "rational_polynomial",
+    12: "thin_prism",
+    14: "thin_prism",
+}
 
 
 def camera_from_kitti_raw(
@@ -235,14 +240,15 @@ def camera_from_nuscenes(
     """Of a record of nuScenes' or nuImages' ``calibrated_sensor``; nuScenes' images are undistorted.
 
     Raises:
-        DataError: the sensor is no camera, or has a distortion with more than five coefficients (nuImages' sixth is
-            another model's).
+        DataError: the sensor is no camera, or has a distortion with more than five coefficients (nuImages'
+            sixth is another model's).
     """
     values = calibrated_sensor.get("camera_intrinsic")
     if values is None or not len(values):
         raise DataError(place, "no camera_intrinsic", "the record of a camera")
     K = _matrix(values, (3, 3), f"{place}: camera_intrinsic")
-    D = _numbers(calibrated_sensor.get("camera_distortion") or (), f"{place}: camera_distortion")
+    given = calibrated_sensor.get("camera_distortion")
+    D = _numbers(() if given is None else given, f"{place}: camera_distortion")
     if len(D) == 6 and D[5] == 0.0:
         D = D[:5]
     distortion = "plumb_bob" if len(D) else "none"

@@ -21,7 +21,7 @@ from sst_graph.files.checked_values import checked_camera
 from sst_graph.types import CameraImage, SemanticClass
 
 FIELD_OF_VIEW_DEG = 110.0
-"""Widest default field of a rectified camera [deg]: a pinhole stretches the rim by 1 / cos^2, here 3 times."""
+"""Widest default field of a rectified camera [deg]: a pinhole stretches the rim by 1 / cos^2, here by 3."""
 WIDEST_DEG = 150.0
 """Widest field that can be asked for [deg]: the rim is stretched 15 times. More needs several pinholes."""
 _LEAST_SIDE_PX = 16
@@ -97,8 +97,8 @@ class Rectification:
         uvs, valid = model.project(rays.reshape(-1, 3))
         uvs = np.where(valid[:, None], uvs, -1.0)
         # All four neighbours of a bilinear look-up are on the image.
-        valid = (uvs >= 0.0).all(axis=1) & (uvs <= [model.width - 1, model.height - 1]).all(axis=1)
-        return uvs.reshape(*u.shape, 2), valid.reshape(u.shape)
+        inside = ((uvs >= 0.0) & (uvs <= [model.width - 1, model.height - 1])).all(axis=1)
+        return uvs.reshape(*u.shape, 2), np.asarray(inside).reshape(u.shape)
 
     @property
     def valid(self) -> BoolArray:
@@ -177,7 +177,7 @@ class Rectification:
         some, share = around[:, mixed], weights[:, mixed]
         votes = np.stack([np.where(some == one, share, 0.0).sum(axis=0) for one in some])
         chosen[mixed] = np.take_along_axis(some, votes.argmax(axis=0)[None], axis=0)[0]
-        return chosen
+        return np.asarray(chosen, np.uint32)
 
     def image(self, image: CameraImage) -> CameraImage:
         """The image as the pinhole would have taken it.
@@ -193,4 +193,6 @@ class Rectification:
     def _check(self, array: NDArray[Any], what: str) -> None:
         if array.shape[:2] != (self.model.height, self.model.width):
             found = f"a {what} of {array.shape[1]}x{array.shape[0]} px"
-            raise DataError("rectification", found, f"{self.model.width}x{self.model.height} px, the camera's")
+            raise DataError(
+                "rectification", found, f"{self.model.width}x{self.model.height} px, the camera's"
+            )

@@ -35,7 +35,7 @@ def parse_camera_yaml(text: str, place: str | Path) -> Mapping[str, Any]:
             "YAML files need PyYAML, which is not installed: pip install 'sst-graph[yaml]'"
         ) from error
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
         """Plain values, and OpenCV's matrices as tables."""
 
     def matrix(loader: Any, node: Any) -> Any:

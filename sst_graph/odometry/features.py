@@ -122,7 +122,7 @@ def trackable_area(image: CameraImage) -> NDArray[np.uint8]:
     if image.has_mask:
         table = np.zeros(256, np.uint8)
         table[list(UNTRACKED_CLASSES)] = 255
-        trackable -= _dilated(cv2.LUT(image.mask, table), _MASK_MARGIN_PX)
+        trackable -= _dilated(np.asarray(cv2.LUT(image.mask, table), np.uint8), _MASK_MARGIN_PX)
     if image.valid is not None:
         trackable[_dilated((~image.valid).view(np.uint8), _WINDOW_PX // 2) > 0] = 0
     return trackable

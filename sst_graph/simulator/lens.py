@@ -1,10 +1,10 @@
 """A simulated drive seen through a distorted lens.
 
-Pinholes in the place of the camera, :data:`FINER` times as fine, see all that the lens sees; each pixel of the lens
-takes the colour (bilinear) and the label (nearest) at its ray. Blur, noise and the network's mistakes are
-those of the lens's own pixels. A label's border is therefore rounded to the pinholes' pixels: an error with
-no bias of at most 1 / (2 FINER) of a pixel, 0.14 px rms, where the lens is as fine as at its axis; at 90 degrees
-from the axis of a fisheye it is about 1.6 times as large.
+Pinholes in the place of the camera, :data:`FINER` times as fine, see all that the lens sees; each of its
+pixels takes the colour (bilinear) and the label (nearest) at its ray. Blur, noise and the network's mistakes
+are those of the lens's own pixels. A label's border is therefore rounded to the pinholes' pixels: an error
+with no bias of at most 1 / (2 FINER) of a pixel, 0.14 px rms, where the lens is as fine as at its axis; at 90
+degrees from the axis of a fisheye it is about 1.6 times as large.
 """
 
 from __future__ import annotations
@@ -158,7 +158,9 @@ class LensDrive:
         uvs = slopes * focal
         first = np.floor(uvs.min(axis=0)) - 1.0
         width, height = (int(side) for side in np.ceil(uvs.max(axis=0)) - first + 2.0)
-        camera = PinholeCamera(float(focal[0]), float(focal[1]), -float(first[0]), -float(first[1]), width, height)
+        camera = PinholeCamera(
+            float(focal[0]), float(focal[1]), -float(first[0]), -float(first[1]), width, height
+        )
         return _Part(camera, cRv, mine, (uvs - first).astype(np.float32))
 
 

@@ -58,7 +58,7 @@ class View:
 
 
 def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
-    """(h, w, 3) float light of the faces (h, w) of ``mesh`` at depth z (h, w) [m]: BGR, without blur or noise."""
+    """(h, w, 3) float BGR light of faces (h, w) of ``mesh`` at depth z (h, w) [m], no blur or noise."""
     seen, index = compact(faces)
     if seen[0] < 0:
         # The sky borrows any face; it is painted over below.

@@ -82,12 +82,12 @@ def test_fisheye_beyond_the_image_plane() -> None:
 
 @pytest.mark.parametrize(("xi", "alpha"), SPHERES)
 def test_double_sphere_is_two_spheres_and_a_plane(xi: float, alpha: float) -> None:
-    """As the paper draws it: to the first sphere, from its centre's shift to the second, from alpha/(1 - alpha)
-    behind that to the plane."""
+    """As the paper draws it: to the first sphere, from its shifted centre to the second, then to the plane
+    from alpha/(1 - alpha) behind that."""
     cPs = points(85.0)
-    on_first = cPs / np.linalg.norm(cPs, axis=1)[:, None] + [0.0, 0.0, xi]
+    on_first = cPs / np.linalg.norm(cPs, axis=1)[:, None] + np.array([0.0, 0.0, xi])
     on_second = on_first / np.linalg.norm(on_first, axis=1)[:, None]
-    seen = on_second + [0.0, 0.0, alpha / (1.0 - alpha)]
+    seen = on_second + np.array([0.0, 0.0, alpha / (1.0 - alpha)])
     # The image plane's scale: fx stands for the paper's f_x, in units of 1 / (1 - alpha).
     known = seen[:, :2] / seen[:, 2:] / (1.0 - alpha) * [K.fx, K.fy] + [K.cx, K.cy]
     uvs, valid = DoubleSphereCamera(K, xi, alpha).project(cPs)
@@ -138,7 +138,7 @@ def test_the_radius_where_plumb_bob_turns_back() -> None:
     most = 1.0 / np.sqrt(0.9)
     assert model.largest_radius == pytest.approx(most, abs=1e-12)
     cPs = np.array([[most - 1e-6, 0.0, 1.0], [most + 1e-6, 0.0, 1.0], [2.0, 0.0, 1.0]])
-    uvs, valid = model.project(cPs)
+    _, valid = model.project(cPs)
     assert valid.tolist() == [True, False, False]
     rim = K.cx + K.fx * most * (1.0 - 0.3 * most**2)
     assert model.unproject(np.array([[rim - 1e-3, K.cy], [rim + 1e-3, K.cy]]))[1].tolist() == [True, False]

@@ -152,7 +152,11 @@ def test_a_kalibr_chain(tmp_path: Path) -> None:
     [
         ("camera_model: ds", "camera_model: omni", "cam2: found camera model 'omni', expected pinhole with"),
         ("camera_model: ds", "camera_model: eucm", "found camera model 'eucm'"),
-        ("distortion_model: radtan", "distortion_model: fov", "cam0: found pinhole with the distortion 'fov'"),
+        (
+            "distortion_model: radtan",
+            "distortion_model: fov",
+            "cam0: found pinhole with the distortion 'fov'",
+        ),
         ("[-0.2, 0.6, 700.0,", "[0.6, 700.0,", r"5 intrinsics of ds, expected \[xi, alpha, fu, fv, pu, pv\]"),
         ("[-0.2, 0.6,", "[-2.0, 0.6,", "cam2: found .* xi = -2"),
         ("resolution: [1280, 720]\n  rostopic: /cam0", "rostopic: /cam0", "no resolution"),

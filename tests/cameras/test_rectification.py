@@ -189,7 +189,10 @@ def test_no_corner_at_the_border_of_the_valid_region() -> None:
     radius = 200.0 * np.tan(np.deg2rad(25.0))
     distances = np.hypot(*(corners - 149.5).T)
     assert len(corners) > 20 and distances.max() < radius - 7.0
-    assert np.hypot(*(detect_corners(gray_of(image), np.full((300, 300), 255, np.uint8)) - 149.5).T).max() > radius
+    assert (
+        np.hypot(*(detect_corners(gray_of(image), np.full((300, 300), 255, np.uint8)) - 149.5).T).max()
+        > radius
+    )
     tracker = FeatureTracker()
     tracker.add(image)
     tracks = tracker.add(replace(image, stamp_ns=10**8))

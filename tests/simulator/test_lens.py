@@ -41,7 +41,7 @@ def lens(name: str) -> CameraModel:
 
 @pytest.mark.parametrize("name", ["barrel", "fisheye"])
 def test_points_of_vehicles_fall_on_their_mask(name: str) -> None:
-    """Exact labels, by the true extrinsic and the model; to the sides of the fisheye and behind 90 degrees too."""
+    """Exact labels, by the true extrinsic and the model; of the fisheye also far to its sides."""
     drive = simulate(replace(STREET, label_noise=0.0, beam_divergence_mrad=0.0))
     model = lens(name)
     frame = LensDrive(drive, model)[0]
@@ -53,7 +53,9 @@ def test_points_of_vehicles_fall_on_their_mask(name: str) -> None:
     uvs = uvs[model.intrinsics.in_image(uvs)]
     u, v = np.rint(uvs).astype(int).T
     vehicle = (frame.image.mask == SemanticClass.VEHICLE).astype(np.uint8)
-    border = cv2.distanceTransform(vehicle, cv2.DIST_L2, 5) + cv2.distanceTransform(1 - vehicle, cv2.DIST_L2, 5)
+    border = cv2.distanceTransform(vehicle, cv2.DIST_L2, 5) + cv2.distanceTransform(
+        1 - vehicle, cv2.DIST_L2, 5
+    )
     inner = border[v, u] > 2.0
     assert inner.sum() > 150
     assert vehicle[v, u][inner].mean() > 0.97
