@@ -118,12 +118,15 @@ class CameraImage(ByValue):
         mask: (h, w) uint8 of :class:`SemanticClass`; all IGNORE where there is no mask.
         pixels: (h, w, 3) uint8 BGR picture, or :data:`NO_PICTURE`.
         instances: (h, w) uint16 instance number (0: none), or None.
+        valid: (h, w) bool, False where the camera saw nothing (rectified from a lens that sees less), or None
+            where it saw everything. Its border is no edge of anything; the mask is IGNORE beyond it.
     """
 
     stamp_ns: int
     mask: NDArray[np.uint8]
     pixels: NDArray[np.uint8]
     instances: NDArray[np.uint16] | None = None
+    valid: NDArray[np.bool_] | None = None
 
     @property
     def has_mask(self) -> bool:

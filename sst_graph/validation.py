@@ -83,7 +83,12 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
     if image.instances is not None:
         instances = _array(image.instances, size, f"{place}: instances", "the camera's size")
         instances = _whole(instances, f"{place}: instances")
-    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances)
+    valid = image.valid
+    if valid is not None:
+        valid = _array(valid, size, f"{place}: valid", "the camera's size")
+        if valid.dtype != np.bool_:
+            raise DataError(f"{place}: valid", f"dtype {valid.dtype}", "bool")
+    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid)
 
 
 def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:

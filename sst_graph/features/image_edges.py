@@ -97,13 +97,19 @@ def contour_pixels(inside: NDArray[np.uint8]) -> list[NDArray[np.intp]]:
     return [outline[::_EVERY, 0].astype(np.intp) for outline in outlines]
 
 
-def find_picture_edges(inside: NDArray[np.uint8], distance: FloatMap, picture: Picture) -> PictureEdges:
+def find_picture_edges(
+    inside: NDArray[np.uint8],
+    distance: FloatMap,
+    picture: Picture,
+    unknown: NDArray[np.uint8] | None = None,
+) -> PictureEdges:
     """What the picture shows along the contours of a region.
 
     Args:
         inside: (h, w) 1 in the region, 0 elsewhere.
         distance: (h, w) signed distance to its contour, negative inside, lightly smoothed [px].
         picture: (h, w, 3) BGR.
+        unknown: (h, w) 1 where a contour is not the object's: it is not moved there.
     """
     along = _ALONG_PX // _EVERY
     pixels, own = _closed(contour_pixels(inside), 3 * along)
@@ -117,9 +123,14 @@ def find_picture_edges(inside: NDArray[np.uint8], distance: FloatMap, picture: P
     strongest = likely.max(axis=0)
     # At the image's border the object is cut: no edge of its own.
     cut = (pixels == 0).any(axis=1) | (pixels == np.array(inside.shape[::-1]) - 1).any(axis=1)
+    foreign = np.zeros(len(pixels), np.bool_)
+    if unknown is not None:
+        foreign = unknown[pixels[:, 1], pixels[:, 0]] > 0
+        cut |= foreign
     whole = own[~cut[own]]
     usual = np.median(strongest[whole]) if len(whole) else 0.0
     seen = ndimage.median_filter(strongest >= _MIN_SHARE * usual, size, mode="nearest")
+    shifts, seen = np.where(foreign, 0.0, shifts), seen & ~foreign
     return PictureEdges(shifts[own].astype(np.float32), np.asarray(seen[own], np.bool_))
 
 

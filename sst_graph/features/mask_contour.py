@@ -96,7 +96,7 @@ class ContourMap:
         ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
         unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.uint8)
         if edges is None and picture is not None and picture.shape[:2] == mask.shape:
-            edges = find_picture_edges(box, distance, picture[part])
+            edges = find_picture_edges(box, distance, picture[part], unknown)
         if edges is not None:
             shifts, unseen = edges.fields(box)
             distance -= shifts

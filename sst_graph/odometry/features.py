@@ -88,6 +88,8 @@ class FeatureTracker:
         static = np.full(len(uv_b), True)
         if image.has_mask:
             static = ~np.isin(image.mask[row, column], UNTRACKED_CLASSES)
+        if image.valid is not None:
+            static &= image.valid[row, column]
         return Tracks(image_a.stamp_ns, image.stamp_ns, uv_a[static], uv_b[static])
 
 
@@ -114,14 +116,22 @@ def detect_corners(gray: NDArray[np.uint8], trackable: NDArray[np.uint8]) -> NDA
 
 
 def trackable_area(image: CameraImage) -> NDArray[np.uint8]:
-    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask."""
-    if not image.has_mask:
-        return np.full(image.mask.shape, 255, np.uint8)
-    table = np.zeros(256, np.uint8)
-    table[list(UNTRACKED_CLASSES)] = 255
-    width = 2 * _MASK_MARGIN_PX + 1
-    barred = cv2.dilate(cv2.LUT(image.mask, table), np.ones((width, width), np.uint8))
-    return np.asarray(cv2.bitwise_not(barred), np.uint8)
+    """(h, w) 255 where a corner may be taken: off the untracked classes by a margin, or without a mask; and
+    where no Lucas-Kanade window leaves what the camera saw."""
+    trackable = np.full(image.mask.shape, 255, np.uint8)
+    if image.has_mask:
+        table = np.zeros(256, np.uint8)
+        table[list(UNTRACKED_CLASSES)] = 255
+        trackable -= _dilated(np.asarray(cv2.LUT(image.mask, table), np.uint8), _MASK_MARGIN_PX)
+    if image.valid is not None:
+        trackable[_dilated((~image.valid).view(np.uint8), _WINDOW_PX // 2) > 0] = 0
+    return trackable
+
+
+def _dilated(area: NDArray[np.uint8], margin_px: int) -> NDArray[np.uint8]:
+    """An area (h, w) with all that is this close to it."""
+    side = 2 * margin_px + 1
+    return np.asarray(cv2.dilate(area, np.ones((side, side), np.uint8)), np.uint8)
 
 
 def gray_of(image: CameraImage) -> NDArray[np.uint8]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -14,12 +15,12 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator.casting import cast_image
 from sst_graph.simulator.config import SimulationConfig
 from sst_graph.simulator.lidar import Lidar, make_lidar
-from sst_graph.simulator.render import Look, View, shade
+from sst_graph.simulator.render import Look, View, developed, shade
 from sst_graph.simulator.segmentation import noisy_mask, noisy_points
 from sst_graph.simulator.street import Street, build_street, is_instance
 from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
 from sst_graph.simulator.textures import Atlas, detail_atlas, material_atlas, sky_panorama
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan
 
 VIEW_RANGE_M = 140.0
 """Static things farther than this are not in the picture [m]."""
@@ -171,16 +172,33 @@ class SimulatedDrive:
 
     def _image(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint16]]:
         """Picture and labels of image ``index``."""
-        config, stamp_s = self.config, self.stamps_ns[index] * 1e-9
-        snapshot = self.street.snapshot(stamp_s + config.time_offset_s, VIEW_RANGE_M)
+        light, kinds, numbers = self.look_through(index, self.camera)
+        pixels = developed(light, np.random.default_rng([self.config.seed, 30, index]))
+        return pixels, *noisy_mask(kinds, numbers, self.config.label_noise, (self.config.seed, index))
+
+    def look_through(
+        self, index: int, camera: PinholeCamera, cRv: FloatArray | None = None
+    ) -> tuple[NDArray[Any], NDArray[np.uint8], NDArray[np.uint16]]:
+        """What a pinhole in the place of the camera sees at image ``index``, before blur, noise and mistakes.
+
+        Args:
+            cRv: (3, 3) rotation of that pinhole in the camera frame; the camera's own by default.
+
+        Returns:
+            (h, w, 3) float light, (h, w) kinds, (h, w) instances.
+        """
+        stamp_s = self.stamps_ns[index] * 1e-9
+        snapshot = self.street.snapshot(stamp_s + self.config.time_offset_s, VIEW_RANGE_M)
         pose = self.wTc(stamp_s)
-        view = View(self.camera, np.asarray(pose.rotation().matrix()), np.asarray(pose.translation()))
-        faces, depth = cast_image(view.to_camera(snapshot.mesh.triangles), self.camera)
-        rng = np.random.default_rng([config.seed, 30, index])
-        pixels = shade(view, snapshot.mesh, faces, depth, self.look, rng)
+        rotation = np.asarray(pose.rotation().matrix())
+        if cRv is not None:
+            rotation = rotation @ cRv
+        view = View(camera, rotation, np.asarray(pose.translation()))
+        faces, depth = cast_image(view.to_camera(snapshot.mesh.triangles), camera)
+        light = shade(view, snapshot.mesh, faces, depth, self.look)
         kinds = np.where(faces >= 0, snapshot.mesh.kinds[faces], np.uint8(Kind.SKY)).astype(np.uint8)
         numbers = np.where(is_instance(kinds), snapshot.instances[faces], 0).astype(np.uint16)
-        return pixels, *noisy_mask(kinds, numbers, config.label_noise, (config.seed, index))
+        return light, kinds, numbers
 
 
 @lru_cache(maxsize=2)

@@ -57,10 +57,8 @@ class View:
         return np.asarray((points - self.position) @ self.rotation)
 
 
-def shade(
-    view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look, rng: np.random.Generator
-) -> NDArray[np.uint8]:
-    """(h, w, 3) uint8 BGR picture of the faces (h, w) of ``mesh`` at depth z (h, w) [m]."""
+def shade(view: View, mesh: Mesh, faces: IndexArray, depth: FloatArray, look: Look) -> NDArray[Any]:
+    """(h, w, 3) float BGR light of faces (h, w) of ``mesh`` at depth z (h, w) [m], no blur or noise."""
     seen, index = compact(faces)
     if seen[0] < 0:
         # The sky borrows any face; it is painted over below.
@@ -76,7 +74,7 @@ def shade(
     sky = _sky(view, look)
     haze = np.where(ground, 1.0 - np.exp(-z / np.float32(HAZE_M)), 1.0).astype(np.float32)[:, :, None]
     colour += haze * (sky - colour)
-    return _developed(colour, rng)
+    return colour
 
 
 def _lighting(part: Mesh, look: Look) -> FloatArray:
@@ -145,7 +143,7 @@ def _sky(view: View, look: Look) -> NDArray[np.float32]:
     return np.asarray(full, np.float32)
 
 
-def _developed(colour: NDArray[Any], rng: np.random.Generator) -> NDArray[np.uint8]:
+def developed(colour: NDArray[Any], rng: np.random.Generator) -> NDArray[np.uint8]:
     """Lens blur, exposure and sensor noise, then 8 bits."""
     blurred: NDArray[Any] = cv2.GaussianBlur(colour, (0, 0), 0.55)
     blurred *= float(rng.normal(1.0, 0.01))

@@ -1,0 +1,20 @@
+"""Cameras with distortion, read from the formats of others, and rectified to a pinhole (docs/cameras.md)."""
+
+from __future__ import annotations
+
+from sst_graph.cameras.brown_conrady import BrownConradyCamera
+from sst_graph.cameras.double_sphere import DoubleSphereCamera
+from sst_graph.cameras.fisheye import FisheyeCamera
+from sst_graph.cameras.model import CameraModel
+from sst_graph.cameras.rectification import Rectification, rectified_camera
+from sst_graph.cameras.source import RectifiedSource
+
+__all__ = [
+    "BrownConradyCamera",
+    "CameraModel",
+    "DoubleSphereCamera",
+    "FisheyeCamera",
+    "Rectification",
+    "RectifiedSource",
+    "rectified_camera",
+]
