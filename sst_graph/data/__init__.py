@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sst_graph.data.kitti import KITTI_LOADER, KittiSource
+from sst_graph.data.kitti.odometry import KITTI_LOADER, KittiSource
 from sst_graph.data.source import Loader, SourceOptions, loader_names, open_source, register_loader
 
 register_loader("kitti", KITTI_LOADER)

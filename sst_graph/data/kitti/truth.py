@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from sst_graph.data.calib import KittiCalibration, pose_from
+from sst_graph.data.kitti.calib import KittiCalibration, pose_from
 from sst_graph.errors import DataError
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.reading import GROUND_TRUTH, read_json
