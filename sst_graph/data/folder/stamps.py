@@ -93,7 +93,7 @@ def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
     stamps: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = [word.strip().strip('"') for word in line.split(",")]
-        if not any(words) or (number == 1 and len(words) == 2 and not _WHOLE.fullmatch(words[1])):
+        if not any(words) or (number == 1 and len(words) == 2 and words[1][:1].isalpha()):
             continue
         if len(words) != 2 or not _WHOLE.fullmatch(words[1]):
             raise DataError(f"{table}:{number}", f"{line!r:.80}", "name,stamp_ns")
