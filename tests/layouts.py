@@ -52,7 +52,11 @@ def write_raw_calibration(
     } | lines
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "calib_cam_to_cam.txt").write_text("".join(f"{k}: {v}\n" for k, v in cam.items() if v))
-    velo = {"calib_time": "15-Mar-2012 11:37:16", "R": row(c0Tl.rotation().matrix()), "T": row(c0Tl.translation())}
+    velo = {
+        "calib_time": "15-Mar-2012 11:37:16",
+        "R": row(c0Tl.rotation().matrix()),
+        "T": row(c0Tl.translation()),
+    }
     (folder / "calib_velo_to_cam.txt").write_text("".join(f"{k}: {v}\n" for k, v in velo.items()))
 
 
@@ -130,7 +134,13 @@ def as_nuscenes(odometry: Path, root: Path) -> Path:
     assert source.nominal is not None
     eTc = eTl * source.nominal.inverse()
     tables = root / "v1.0-mini"
-    for name in ("v1.0-mini", "samples/LIDAR_TOP", "samples/CAM_FRONT", "sweeps/LIDAR_TOP", "sweeps/CAM_FRONT"):
+    for name in (
+        "v1.0-mini",
+        "samples/LIDAR_TOP",
+        "samples/CAM_FRONT",
+        "sweeps/LIDAR_TOP",
+        "sweeps/CAM_FRONT",
+    ):
         (root / name).mkdir(parents=True)
     (root / "lidarseg/v1.0-mini").mkdir(parents=True)
     K = camera.matrix.tolist()
@@ -155,10 +165,21 @@ def as_nuscenes(odometry: Path, root: Path) -> Path:
         np.column_stack([values, rings]).astype("<f4").tofile(root / cloud)
         picture = f"{kind}/CAM_FRONT/n015__CAM_FRONT__{stamp_us}.png"
         shutil.copy(odometry / f"image_2/{k:06d}.png", root / picture)
-        shared = {"sample_token": f"sample-{k - k % 2}", "timestamp": stamp_us, "is_key_frame": kind == "samples"}
+        shared = {
+            "sample_token": f"sample-{k - k % 2}",
+            "timestamp": stamp_us,
+            "is_key_frame": kind == "samples",
+        }
         size = {"height": camera.height, "width": camera.width}
         data += [
-            {"token": f"l-{k}", "calibrated_sensor_token": "c-l", **shared, "height": 0, "width": 0, "filename": cloud},
+            {
+                "token": f"l-{k}",
+                "calibrated_sensor_token": "c-l",
+                **shared,
+                "height": 0,
+                "width": 0,
+                "filename": cloud,
+            },
             {"token": f"c-{k}", "calibrated_sensor_token": "c-c", **shared, **size, "filename": picture},
         ]
         if kind == "samples":

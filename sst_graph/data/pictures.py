@@ -45,12 +45,12 @@ class PictureFiles:
         if (path := self.masks.get(number)) is not None:
             mask = classes_of_mask(read_mask(path, self.size), self.encoding, path)
         picture = self.pictures.get(number)
-        return CameraImage(stamp_ns, mask, NO_PICTURE if picture is None else read_picture(picture, self.size))
+        return CameraImage(
+            stamp_ns, mask, NO_PICTURE if picture is None else read_picture(picture, self.size)
+        )
 
 
-def mask_encoding(
-    masks: Mapping[int, Path], wanted: LabelEncoding, size: tuple[int, int]
-) -> MaskEncoding:
+def mask_encoding(masks: Mapping[int, Path], wanted: LabelEncoding, size: tuple[int, int]) -> MaskEncoding:
     """Encoding of masks; decided over some of them where ``wanted`` is "auto".
 
     Raises:
@@ -65,9 +65,7 @@ def mask_encoding(
     return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
 
 
-def point_labels(
-    path: Path | None, used: NDArray[np.bool_]
-) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+def point_labels(path: Path | None, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
     """Classes and instances of a scan's used points by a SemanticKITTI file; without one, any class.
 
     Args:

@@ -1,4 +1,4 @@
-"""Clouds in .bin, .npy, .npz, .pcd and .ply: compared with libraries that write them; refused where broken."""
+"""Clouds in .bin, .npy, .npz, .pcd and .ply: read as libraries write them; refused where broken."""
 
 from __future__ import annotations
 
@@ -167,7 +167,10 @@ BROKEN = {
     "twice.pcd": (pcd("binary", 1, TWELVE, FIELDS="x x z"), "fields x x z"),
     "kind.pcd": (pcd("zip", 1, TWELVE), "DATA zip"),
     "lzf.pcd": (pcd("binary_compressed", 1, struct.pack("<II", 3, 12) + b"\xff\xff\xff"), "damaged LZF"),
-    "lzf-short.pcd": (pcd("binary_compressed", 1, struct.pack("<II", 13, 12) + TWELVE), "12 compressed bytes"),
+    "lzf-short.pcd": (
+        pcd("binary_compressed", 1, struct.pack("<II", 13, 12) + TWELVE),
+        "12 compressed bytes",
+    ),
     "lzf-size.pcd": (pcd("binary_compressed", 1, struct.pack("<II", 13, 2**31) + TWELVE), "unpacked bytes"),
     "a.ply": (b"plx\n", "no end_header"),
     "short.ply": (ply(2, TWELVE), "12 bytes of points, expected 24"),

@@ -33,7 +33,9 @@ def images_of(stamps: list[int]) -> Sensor[CameraImage]:
     """Image k has the instances k, so that it is known again under another stamp."""
     return Sensor(
         np.array(stamps, np.int64),
-        lambda k: CameraImage(stamps[k], np.zeros((1, 1), np.uint8), NO_PICTURE, np.full((1, 1), k, np.uint16)),
+        lambda k: CameraImage(
+            stamps[k], np.zeros((1, 1), np.uint8), NO_PICTURE, np.full((1, 1), k, np.uint16)
+        ),
     )
 
 
@@ -58,7 +60,11 @@ def test_frames_are_chosen_in_the_order_of_stamps() -> None:
     for frames, found in ((slice(0, 5), "0:4"), (slice(2, 3), "no scan"), (slice(3, 4), "no image")):
         with pytest.raises(ConfigError, match=found):
             merged(
-                PROPERTIES, scans_of([10, 40]), images_of([0, 10, 20]), SourceOptions(frames=frames), Path("d")
+                PROPERTIES,
+                scans_of([10, 40]),
+                images_of([0, 10, 20]),
+                SourceOptions(frames=frames),
+                Path("d"),
             )
 
 
@@ -107,12 +113,14 @@ def test_kitti_odometry_with_image_stamps_of_its_own(kitti_drive: Path) -> None:
 
 # --- calibration ------------------------------------------------------------------------------------------
 
-FAST_STREET = dataclasses.replace(CROWDED_STREET, frames=60, frame_rate_hz=30.0, motion="no_stop", speed_mps=6.0)
+FAST_STREET = dataclasses.replace(
+    CROWDED_STREET, frames=60, frame_rate_hz=30.0, motion="no_stop", speed_mps=6.0
+)
 DROPPED_IMAGES, DROPPED_SCAN = (7, 23, 24, 41), 4
 
 
 def street(drive: SimulatedDrive, every_image: bool) -> TwoClockSource:
-    """A LiDAR at 10 Hz that starts late and drops a scan; a camera at 30 Hz that drops images, or at 10 Hz."""
+    """A LiDAR at 10 Hz that starts late and drops a scan; a camera at 30 Hz with drops, or at 10 Hz."""
     scans = [k for k in range(1, len(drive), 3) if k != 1 and k != 1 + 3 * DROPPED_SCAN]
     images = [k for k in range(len(drive)) if k not in DROPPED_IMAGES and (every_image or k % 3 == 1)]
     stamps = drive.stamps_ns
@@ -137,5 +145,7 @@ def test_a_camera_of_30_hz_is_no_worse_than_one_of_10_hz() -> None:
     drive = simulated(FAST_STREET)
     slow, fast = (calibrate(street(drive, every), drive.nominal) for every in (False, True))
     assert slow.status == fast.status == "ok"
-    for of_fast, of_slow, least in zip(errors(fast, drive), errors(slow, drive), (0.03, 0.005, 5e-4), strict=True):
+    for of_fast, of_slow, least in zip(
+        errors(fast, drive), errors(slow, drive), (0.03, 0.005, 5e-4), strict=True
+    ):
         assert of_fast <= max(of_slow, least)

@@ -48,14 +48,17 @@ def read_camera(path: Path) -> PinholeCamera:
         name = "camera_matrix" if "camera_matrix" in table else "K"
         K = numbers(table[name], f"{path} ({name})", 9)
         values = [K[0], K[4], K[2], K[5]]
-        size = [number(_entry(table, f"image_{side}", path), f"{path} ({side})") for side in ("width", "height")]
+        size = [
+            number(_entry(table, f"image_{side}", path), f"{path} ({side})") for side in ("width", "height")
+        ]
         model = table.get("distortion_model", "plumb_bob")
         coefficients = table.get("distortion_coefficients", table.get("D", []))
     else:
         raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
     require_rectified(str(model), numbers(coefficients or [], f"{path} (distortion)"), path)
     width, height = (_whole(side, path) for side in size)
-    return checked_camera(PinholeCamera(*values, width, height), path)
+    fx, fy, cx, cy = values
+    return checked_camera(PinholeCamera(fx, fy, cx, cy, width, height), path)
 
 
 def read_extrinsic(path: Path) -> gtsam.Pose3:
@@ -91,7 +94,9 @@ def _kalibr(cam: Mapping[Any, Any], path: Path) -> tuple[list[float], list[float
 
 def _entry(table: Mapping[Any, Any], name: str, path: Path) -> Any:
     if name not in table:
-        raise DataError(path, f"no {name}", _EXPECTED if name != "quaternion" else "translation and quaternion")
+        raise DataError(
+            path, f"no {name}", _EXPECTED if name != "quaternion" else "translation and quaternion"
+        )
     return table[name]
 
 

@@ -115,7 +115,10 @@ def open_folder(path: Path, options: SourceOptions) -> TwoClockSource:
     encoding = mask_encoding(masks, options.label_encoding, size)
     pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
     scans = CloudFiles(
-        clouds, _beside(clouds, path / "labels", (".label",)), _timing(clouds, options), options.sweep == "auto"
+        clouds,
+        _beside(clouds, path / "labels", (".label",)),
+        _timing(clouds, options),
+        options.sweep == "auto",
     )
 
     def image(k: int) -> CameraImage:

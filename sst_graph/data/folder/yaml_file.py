@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The table in a YAML file; a matrix of OpenCV is a table of rows, cols, dt, data.
 
     Raises:
-        DataError: a missing file, no YAML, anchors and aliases, tags of objects, deep nesting, a number that is
-            not finite, no table.
+        DataError: a missing file, no YAML, anchors and aliases, tags of objects, deep nesting, no table.
         MissingDependencyError: PyYAML is not installed.
     """
     try:
@@ -33,7 +33,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if text.startswith("%YAML:"):  # OpenCV's first line is no directive of YAML
         text = text.partition("\n")[2]
 
-    class Loader(yaml.SafeLoader):
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
         """Numbers, text, lists and tables, and OpenCV's matrices."""
 
     def matrix(loader: Any, node: Any) -> Any:
@@ -73,10 +73,8 @@ def number(value: Any, place: str) -> float:
         DataError: something else.
     """
     if isinstance(value, str):  # YAML 1.1 takes 1e-3 for text
-        try:
+        with contextlib.suppress(ValueError):
             value = float(value)
-        except ValueError:
-            pass
     if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e300:
         raise DataError(place, f"{value!r:.60}", "a finite number")
     if not math.isfinite(value):

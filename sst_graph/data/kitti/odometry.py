@@ -2,8 +2,9 @@
 
 Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``, ``velodyne``, ``labels``,
 ``image_2`` and ``semantic_2``; where present also ``instance_2`` (uint16, class * 256 + instance),
-``velodyne_times`` (float32 seconds relative to the stamp, one a point), ``groundtruth.json`` and ``times_2.txt``:
-stamps of the images of image_2 by a clock of their own, one a line. ``times.txt`` then stamps the scans alone.
+``velodyne_times`` (float32 seconds relative to the stamp, one a point), ``groundtruth.json`` and
+``times_2.txt``: stamps of the images of image_2 by a clock of their own, one a line. ``times.txt`` then
+stamps the scans alone.
 
 Some labels, masks and pictures may be missing: where nothing is labelled nothing is associated, and an image
 without its picture has no features. Points that are NaN or inf are left out and counted.
@@ -24,8 +25,8 @@ from numpy.typing import NDArray
 
 from sst_graph.classes import MaskEncoding
 from sst_graph.data.arrays import read_offsets, read_points
-from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.data.images import picture_size, read_instances
+from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.data.kitti.odometry_layout import (
     LAYOUT,
     FrameCounts,

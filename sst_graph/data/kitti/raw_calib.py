@@ -135,6 +135,8 @@ def _lines(path: Path) -> dict[str, FloatArray]:
         except ValueError:
             values = np.array([np.nan])
         if not np.isfinite(values).all():
-            raise DataError(f"{path}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}")
+            raise DataError(
+                f"{path}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
+            )
         lines[name.strip()] = values
     return lines

@@ -106,9 +106,7 @@ def find_raw_files(drive: Path, camera: int) -> RawFiles:
     cloud, images = drive / _CLOUD, drive / f"image_{camera:02d}"
     scans = numbered_files(cloud / "data", (".bin", ".txt"))
     pictures = numbered_files(images / "data", (".png", ".jpg", ".jpeg"))
-    scan_stamps, image_stamps = (
-        read_timestamps(folder / "timestamps.txt") for folder in (cloud, images)
-    )
+    scan_stamps, image_stamps = (read_timestamps(folder / "timestamps.txt") for folder in (cloud, images))
     for files, stamps, folder in ((scans, scan_stamps, cloud), (pictures, image_stamps, images)):
         if max(files) >= len(stamps):
             expected = f"{max(files) + 1} or more: one for {files[max(files)].name}"
@@ -173,7 +171,11 @@ def _drives(path: Path) -> list[Path]:
     """Drives in a folder, or in the folders of days in it."""
     entries = listed(path, LAYOUT)
     below = [drive for day in entries if os.path.isfile(day / CAM_TO_CAM) for drive in listed(day, LAYOUT)]
-    return [entry for entry in (*entries, *below) if _DRIVE.fullmatch(entry.name) and os.path.isdir(entry / _CLOUD)]
+    return [
+        entry
+        for entry in (*entries, *below)
+        if _DRIVE.fullmatch(entry.name) and os.path.isdir(entry / _CLOUD)
+    ]
 
 
 def _names(drive: Path) -> tuple[str, ...]:

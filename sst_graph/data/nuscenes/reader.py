@@ -1,8 +1,8 @@
 """Scenes of nuScenes: LIDAR_TOP and one camera, key frames and sweeps, by the tables alone.
 
 Each sensor has its own stamps [us]. The nominal extrinsic is that of the rig: both sensors' poses in the ego
-vehicle, without its motion between the stamps. nuScenes has no masks of images; lidarseg labels stand at the key
-frames. The LiDAR's x axis points to the right of the vehicle and y ahead, as stored.
+vehicle, without its motion between the stamps. nuScenes has no masks of images; lidarseg labels stand at the
+key frames. The LiDAR's x axis points to the right of the vehicle and y ahead, as stored.
 
 Source: the schema in docs/schema_nuscenes.md of nutonomy/nuscenes-devkit.
 """
@@ -182,7 +182,11 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     calibrations = {text_of(r, "token", calibrated): r for r in records(calibrated)}
     samples_path, data_path = tables / "sample.json", tables / "sample_data.json"
     scene_token = text_of(scene, "token", tables / "scene.json")
-    samples = {text_of(r, "token", samples_path) for r in records(samples_path) if r.get("scene_token") == scene_token}
+    samples = {
+        text_of(r, "token", samples_path)
+        for r in records(samples_path)
+        if r.get("scene_token") == scene_token
+    }
     data: dict[str, list[Record]] = {_LIDAR: [], camera: []}
     rigs: dict[str, set[str]] = {_LIDAR: set(), camera: set()}
     for record in records(data_path):
@@ -208,7 +212,9 @@ def _rig(tables: Path, lidar: Channel, camera: Channel) -> tuple[PinholeCamera, 
     """Intrinsics, and cTl by both sensors' poses in the ego vehicle."""
     path = tables / "calibrated_sensor.json"
     K = matrix_of(camera.calibration.get("camera_intrinsic"), (3, 3), f"{path} (camera_intrinsic)")
-    width, height = (whole_of(camera.data[0], side, tables / "sample_data.json") for side in ("width", "height"))
+    width, height = (
+        whole_of(camera.data[0], side, tables / "sample_data.json") for side in ("width", "height")
+    )
     pinhole = PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
     eTc, eTl = pose_of(camera.calibration, path), pose_of(lidar.calibration, path)
     return checked_camera(pinhole, path), eTc.inverse() * eTl
@@ -223,7 +229,9 @@ def _stamps(tables: Path, channel: Channel) -> NDArray[np.int64]:
 
 
 def _paths(path: Path, tables: Path, channel: Channel) -> tuple[Path, ...]:
-    return tuple(_inside(path, text_of(r, "filename", tables / "sample_data.json"), tables) for r in channel.data)
+    return tuple(
+        _inside(path, text_of(r, "filename", tables / "sample_data.json"), tables) for r in channel.data
+    )
 
 
 def _inside(path: Path, filename: str, tables: Path) -> Path:

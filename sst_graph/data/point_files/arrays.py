@@ -1,7 +1,8 @@
 """Clouds in files of plain arrays: KITTI's .bin, NumPy's .npy and .npz.
 
 A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) or (n, 4) of x y z and intensity.
-A .npz has one array a field, or such an array named ``points`` beside fields of their own. Nothing is unpickled.
+A .npz has one array a field, or such an array named ``points`` beside fields of their own. Nothing is
+unpickled.
 """
 
 from __future__ import annotations

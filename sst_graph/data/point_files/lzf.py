@@ -1,7 +1,7 @@
 """LZF, the compression of PCD files (Marc Lehmann's liblzf).
 
-A control byte c < 32 is followed by c + 1 bytes as they are. Else bytes are repeated: c >> 5 (7: plus the next
-byte) + 2 of them, from ((c & 31) << 8 | next byte) + 1 before the end of what was unpacked.
+A control byte c < 32 is followed by c + 1 bytes as they are. Else bytes are repeated: c >> 5 (7: plus the
+next byte) + 2 of them, from ((c & 31) << 8 | next byte) + 1 before the end of what was unpacked.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """PCD files of the Point Cloud Library, version 0.7: ascii, binary, binary_compressed.
 
-Source: the format's description in PCL's documentation (pcd_file_format). A compressed block holds two uint32,
-its own and its unpacked size, and the fields one after the other in LZF.
+Source: the format's description in PCL's documentation (pcd_file_format). A compressed block holds two
+uint32, its own and its unpacked size, and the fields one after the other in LZF.
 """
 
 from __future__ import annotations

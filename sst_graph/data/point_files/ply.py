@@ -1,7 +1,7 @@
 """PLY files, version 1.0: ascii, binary_little_endian, binary_big_endian.
 
-Source: G. Turk, The PLY Polygon File Format (1994). The points are the element ``vertex``. What stands behind it
-(faces) is not read; elements with lists before it are refused.
+Source: G. Turk, The PLY Polygon File Format (1994). The points are the element ``vertex``. What stands behind
+it (faces) is not read; elements with lists before it are refused.
 """
 
 from __future__ import annotations
@@ -59,9 +59,7 @@ def read_ply(data: bytes, path: Path) -> Cloud:
     raise DataError(path, "no element vertex", "points in x, y, z")
 
 
-def _records(
-    body: bytes, encoding: str, dtype: np.dtype[Any], count: int, path: Path
-) -> NDArray[Any]:
+def _records(body: bytes, encoding: str, dtype: np.dtype[Any], count: int, path: Path) -> NDArray[Any]:
     if encoding == "ascii":
         return text_records(body, dtype, count, path)
     if len(body) < count * dtype.itemsize:

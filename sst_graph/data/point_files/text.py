@@ -35,7 +35,9 @@ def text_records(body: bytes, dtype: np.dtype[Any], count: int, path: Path) -> N
             records = np.loadtxt(text, flat, comments=None, ndmin=1)
     except (ValueError, OverflowError) as error:
         line = (str(error).splitlines() or ["?"])[0]
-        raise DataError(path, f"points that are no numbers ({line})", f"{len(flat)} numbers a line") from None
+        raise DataError(
+            path, f"points that are no numbers ({line})", f"{len(flat.names or ())} numbers a line"
+        ) from None
     if len(records) != count:
         raise DataError(path, f"{len(records)} lines of points", f"{count}")
     return np.frombuffer(np.ascontiguousarray(records).tobytes(), dtype, count)
