@@ -15,8 +15,15 @@ from sst_graph.data.point_files.lzf import unpack_lzf
 from sst_graph.errors import DataError
 
 DTYPE = np.dtype(
-    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]
-    + [("label", "<u4")]
+    [
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("intensity", "<f4"),
+        ("ring", "<u2"),
+        ("time", "<f4"),
+        ("label", "<u4"),
+    ]
 )
 
 

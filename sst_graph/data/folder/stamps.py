@@ -1,8 +1,8 @@
 """Stamps of files: in a CSV file beside them, or as their names.
 
 ``images.csv`` beside ``images/``: one "name,stamp_ns" a line, a first line of words is a heading; a file
-without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or whole nanoseconds
-("1317048145963000000.png").
+without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or whole
+nanoseconds ("1317048145963000000.png").
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
 """KITTI raw drives, ``_sync`` and ``_extract``: each sensor with the stamps of its own ``timestamps.txt``.
 
 SemanticKITTI labels and Cityscapes masks stand beside them where there are any: ``labels/NNNNNNNNNN.label``
-and ``semantic_0N/NNNNNNNNNN.png``, by the numbers of scans and images; ``groundtruth.json`` as in the odometry
-layout. Which of a drive's pictures are rectified is told by their size, or else by the folder's name.
+and ``semantic_0N/NNNNNNNNNN.png``, by the numbers of scans and images; ``groundtruth.json`` as in the
+odometry layout. Pictures are rectified or not by their size, or else by the folder's name.
 
 Points as measured (``sweep`` clockwise or counterclockwise) get their times from the start and the end of
-their own sweep (``timestamps_start.txt``, ``timestamps_end.txt``); without these files from the median period.
+their own sweep (``timestamps_start.txt``, ``timestamps_end.txt``); without these files from the median
+period.
 """
 
 from __future__ import annotations
