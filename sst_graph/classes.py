@@ -106,6 +106,32 @@ CITYSCAPES_TRAIN_IDS: Mapping[int, SemanticClass] = {
 """Cityscapes ``trainIds``: 0 road ... 13 car ... 18 bicycle."""
 
 
+NUSCENES_LIDARSEG: Mapping[int, SemanticClass] = {
+    0: _C.IGNORE,  # noise
+    1: _C.OTHER,  # animal
+    **dict.fromkeys(range(2, 9), _C.PERSON),  # human.pedestrian.*
+    9: _C.FENCE,  # movable_object.barrier
+    10: _C.OTHER,  # movable_object.debris
+    11: _C.OTHER,  # movable_object.pushable_pullable
+    12: _C.OTHER,  # movable_object.trafficcone
+    13: _C.OTHER,  # static_object.bicycle_rack
+    14: _C.TWO_WHEELER,  # vehicle.bicycle
+    **dict.fromkeys(range(15, 21), _C.VEHICLE),  # bus.bendy, bus.rigid, car, construction, ambulance, police
+    21: _C.TWO_WHEELER,  # vehicle.motorcycle
+    22: _C.VEHICLE,  # vehicle.trailer
+    23: _C.VEHICLE,  # vehicle.truck
+    24: _C.GROUND,  # flat.driveable_surface
+    25: _C.GROUND,  # flat.other
+    26: _C.GROUND,  # flat.sidewalk
+    27: _C.TERRAIN,  # flat.terrain
+    28: _C.BUILDING,  # static.manmade: buildings, walls, poles and signs alike
+    29: _C.OTHER,  # static.other
+    30: _C.VEGETATION,  # static.vegetation
+    31: _C.IGNORE,  # vehicle.ego
+}
+"""nuScenes-lidarseg indices, 8 bits."""
+
+
 class MaskEncoding(StrEnum):
     """How the numbers of a semantic mask are to be read."""
 
@@ -126,6 +152,7 @@ def _table(mapping: Mapping[int, SemanticClass], size: int) -> NDArray[np.uint8]
 
 
 _SEMANTIC_KITTI_TABLE = _table(SEMANTIC_KITTI, 1 << 16)
+_NUSCENES_TABLE = _table(NUSCENES_LIDARSEG, 256)
 _MASK_TABLES = {encoding: _table(mapping, 256) for encoding, mapping in _MASK_MAPS.items()}
 
 
@@ -158,6 +185,15 @@ def classes_of_points(
     numbers = (labels & np.uint32(0xFFFF)).astype(np.uint16)
     classes = _look_up(_SEMANTIC_KITTI_TABLE, numbers, place, "a SemanticKITTI class number")
     return classes, (labels >> np.uint32(16)).astype(np.uint16)
+
+
+def classes_of_lidarseg(labels: NDArray[np.uint8], place: str | Path = "labels") -> NDArray[np.uint8]:
+    """Canonical classes (n,) uint8 of nuScenes-lidarseg labels (n,) uint8.
+
+    Raises:
+        DataError: an index that nuScenes-lidarseg does not define.
+    """
+    return _look_up(_NUSCENES_TABLE, labels, place, "a nuScenes-lidarseg index (0 to 31)")
 
 
 def classes_of_mask(

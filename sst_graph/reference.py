@@ -6,7 +6,7 @@ from pathlib import Path
 
 import gtsam
 
-from sst_graph.data.calib import read_calibration
+from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import DataError
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.reading import CALIBRATION, read_json

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sst_graph.data.arrays import read_labels
 from sst_graph.data.images import read_mask
-from sst_graph.data.kitti import KittiSource
+from sst_graph.data.kitti.odometry import KittiSource
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import Scan
 

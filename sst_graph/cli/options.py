@@ -376,7 +376,10 @@ None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
 def _add_source_options(command: argparse.ArgumentParser) -> None:
     """How a drive is read."""
     source = command.add_argument_group("data")
-    source.add_argument("--loader", help="format: auto (default), kitti, ros, or one of an installed package")
+    source.add_argument(
+        "--loader",
+        help="format: auto (default), kitti, kitti-raw, folder, nuscenes, ros, or an installed one",
+    )
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
     source.add_argument("--camera", help=f"camera folder (default {SOURCE_DEFAULTS['camera']})")

@@ -68,12 +68,21 @@ def read_points(path: Path) -> NDArray[np.float32]:
     """
     values = _values(read_file(path, SCAN), path, "<f4", 4, "x y z r in float32")
     points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    check_metres(points, path)
+    return points
+
+
+def check_metres(points: NDArray[np.float32], path: Path) -> None:
+    """Require coordinates (n, 3) that are lengths [m], but for NaN and inf.
+
+    Raises:
+        DataError: one beyond MAX_COORDINATE_M.
+    """
     lengths = np.abs(np.where(np.isfinite(points), points, 0.0))
     if len(points) and float(lengths.max()) > MAX_COORDINATE_M:
         k = int(np.argmax(lengths.max(axis=1)))
         found = f"a coordinate of {float(lengths[k].max()):.3g} m at index {k}"
         raise DataError(path, found, f"metres in float32, at most {MAX_COORDINATE_M:g}")
-    return points
 
 
 def read_labels(path: Path, count: int) -> NDArray[np.uint32]:

@@ -1,4 +1,4 @@
-"""Width and height of a PNG or JPEG file by its header, and whether the file is whole."""
+"""Width and height of a PNG, JPEG or TIFF file by its header, and whether the file is whole."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import struct
 import zlib
 from pathlib import Path
 
+from sst_graph.data.tiff_header import TIFF, check_tiff_whole, tiff_size
 from sst_graph.errors import DataError
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -17,7 +18,7 @@ _START_OF_SCAN, _END_OF_IMAGE = 0xDA, 0xD9
 
 
 def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
-    """Width and height [px] that a PNG or JPEG file declares.
+    """Width and height [px] that a PNG, JPEG or TIFF file declares.
 
     Raises:
         DataError: neither of them, or without a header that says so.
@@ -26,8 +27,10 @@ def image_size(data: bytes, path: str | Path) -> tuple[int, int]:
         width, height = _png_size(data, path)
     elif data.startswith(JPEG):
         width, height = _jpeg_size(data, path)
+    elif data.startswith(TIFF):
+        width, height = tiff_size(data, path)
     else:
-        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", "a PNG or JPEG file")
+        raise DataError(path, f"first bytes {data[:4]!r} of {len(data)}", "a PNG, JPEG or TIFF file")
     if width == 0 or height == 0:
         raise DataError(path, f"a size of {width}x{height} px", "a picture with pixels")
     return width, height
@@ -41,6 +44,8 @@ def check_whole(data: bytes, path: str | Path) -> None:
     """
     if data.startswith(PNG):
         _check_png_chunks(data, path)
+    elif data.startswith(TIFF):
+        check_tiff_whole(data, path)
     else:
         _check_jpeg_end(data, path)
 

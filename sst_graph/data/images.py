@@ -18,7 +18,7 @@ from sst_graph.data.image_header import check_whole, image_size
 from sst_graph.errors import DataError
 from sst_graph.files.reading import FileKind, read_file
 
-IMAGE = FileKind("a PNG or JPEG file", 128 * 1024 * 1024)
+IMAGE = FileKind("a PNG, JPEG or TIFF file", 128 * 1024 * 1024)
 
 MAX_PIXELS = 50_000_000
 """Pixels of an image; a picture of 8K video has 33 million. As 16-bit RGBA this many take 0.4 GB."""
@@ -31,16 +31,16 @@ _PADDING = "extraneous bytes before marker 0xd9"
 
 
 def picture_size(path: Path) -> Size:
-    """Width and height [px] by the header of a PNG or JPEG file; nothing is decoded.
+    """Width and height [px] by the header of a PNG, JPEG or TIFF file; nothing is decoded.
 
     Raises:
-        DataError: a missing file, no PNG or JPEG, or more than MAX_PIXELS.
+        DataError: a missing file, none of these, or more than MAX_PIXELS.
     """
     return _checked_size(read_file(path, IMAGE), path, None)
 
 
 def read_picture(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
-    """Picture (h, w, 3) uint8 BGR of a PNG or JPEG file, grey ones repeated in the channels.
+    """Picture (h, w, 3) uint8 BGR of a PNG, JPEG or TIFF file, grey ones repeated in the channels.
 
     Rows and columns are those of the sensor: an orientation tag is not followed, as intrinsics and masks do
     not follow it either.
@@ -135,10 +135,10 @@ def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> ND
         except cv2.error:
             image = None
     if image is None:
-        raise DataError(path, "an image that does not decode", "a whole PNG or JPEG file")
+        raise DataError(path, "an image that does not decode", "a whole PNG, JPEG or TIFF file")
     damage = [line for line in complaints if _tells_damage(line)]
     if damage:
-        raise DataError(path, f"a damaged image ({damage[0]})", "a whole PNG or JPEG file")
+        raise DataError(path, f"a damaged image ({damage[0]})", "a whole PNG, JPEG or TIFF file")
     decoded: NDArray[Any] = np.asarray(image)
     if decoded.shape[:2] != (height, width):
         found = f"{decoded.shape[1]}x{decoded.shape[0]} px"
@@ -148,6 +148,8 @@ def _decoded(data: bytes, flags: int, path: str | Path, size: Size | None) -> ND
 
 def _tells_damage(line: str) -> bool:
     """Whether a decoder's line says that pixels are missing or wrong; libpng warns of much besides."""
+    if line.startswith("[ERROR") and "tiff" in line:
+        return True
     if line.startswith("libpng warning"):
         return "IDAT" in line
     return line.startswith(("libpng", "Corrupt", "Premature", "Inconsistent")) and _PADDING not in line

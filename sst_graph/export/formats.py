@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.calib import KittiCalibration
+from sst_graph.data.kitti.calib import KittiCalibration
 from sst_graph.errors import ConfigError
 from sst_graph.export.marginal import marginal_of_result
 from sst_graph.result import CalibrationResult

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sst_graph.data.calib import pose_from, read_calibration
+from sst_graph.data.kitti.calib import pose_from, read_calibration
 from sst_graph.errors import ConfigError, DataError
 
 P0 = "P0: 700 0 600 0 0 710 170 0 0 0 1 0"

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from sst_graph.data.calib import read_calibration
+from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import FORMATS, ExportOptions, export_text
 from sst_graph.export.formats import fixed_axis_rpy, quaternion_xyzw

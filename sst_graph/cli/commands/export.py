@@ -7,7 +7,7 @@ import argparse
 from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.outputs import check_apart
-from sst_graph.data.calib import read_calibration
+from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text
 from sst_graph.files import output_file

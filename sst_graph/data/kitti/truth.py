@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sst_graph.data.calib import KittiCalibration, pose_from
+from sst_graph.data.kitti.calib import KittiCalibration, pose_from
 from sst_graph.errors import DataError
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.reading import GROUND_TRUTH, read_json
@@ -25,9 +26,32 @@ def drive_truth(folder: Path, calibration: KittiCalibration, camera: str) -> tup
     Raises:
         DataError: a file that is no such JSON.
     """
-    path = folder / _FILE
-    if not os.path.lexists(path):
+    stored = read_truth(folder / _FILE)
+    if stored is None:
         return GroundTruth(calibration.cTl(camera), 0.0), True
+    truth = stored.truth
+    if stored.camera != camera:
+        shift = calibration.cTc0(camera) * calibration.cTc0(stored.camera).inverse()
+        truth = replace(truth, cTl=shift * truth.cTl)
+    return truth, False
+
+
+@dataclass(frozen=True)
+class StoredTruth:
+    """Contents of a ``groundtruth.json``: the truth of a camera."""
+
+    truth: GroundTruth
+    camera: str
+
+
+def read_truth(path: Path) -> StoredTruth | None:
+    """The truth in a ``groundtruth.json``, or None where there is no such file.
+
+    Raises:
+        DataError: a file that is no such JSON.
+    """
+    if not os.path.lexists(path):
+        return None
     values = read_json(path, GROUND_TRUTH)
     if not isinstance(values, dict):
         raise DataError(path, f"a JSON {type(values).__name__}", _EXPECTED)
@@ -35,8 +59,6 @@ def drive_truth(folder: Path, calibration: KittiCalibration, camera: str) -> tup
     offset_s = None if values.get("time_offset_s") is None else table.offset_s("time_offset_s")
     rows = values.get("T_camera_lidar")
     matrix = table.matrix("T_camera_lidar", (len(rows) if isinstance(rows, list) else 4, 4))
-    truth_cTl = pose_from(matrix, f"{path} (T_camera_lidar)")
-    own = values.get("camera", "image_2")
-    if isinstance(own, str) and own != camera:
-        truth_cTl = calibration.cTc0(camera) * calibration.cTc0(own).inverse() * truth_cTl
-    return GroundTruth(truth_cTl, offset_s), False
+    camera = values.get("camera")
+    truth = GroundTruth(pose_from(matrix, f"{path} (T_camera_lidar)"), offset_s)
+    return StoredTruth(truth, camera if isinstance(camera, str) else "image_2")

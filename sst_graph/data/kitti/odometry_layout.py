@@ -87,7 +87,21 @@ def find_sequence(path: Path, sequence: str | None) -> Path:
     return path / "sequences" / matches[0]
 
 
-def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles:
+@dataclass(frozen=True)
+class FrameCounts:
+    """Stamps of a drive: of its frames, and of its images where these have their own."""
+
+    stamps: int
+    image_stamps: int | None = None
+
+
+def image_times_path(folder: Path, camera: str) -> Path | None:
+    """File with the images' own stamps, ``times_2.txt`` of image_2, where there is one."""
+    path = folder / f"times_{camera.removeprefix('image_').lstrip('0') or '0'}.txt"
+    return path if os.path.lexists(path) else None
+
+
+def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> KittiFiles:
     """Files of a sequence, checked against each other and against the number of stamps.
 
     A number that has neither a scan nor labels is a gap, and so is one with neither image nor mask. What
@@ -105,9 +119,12 @@ def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles
     labels = numbered_files(folder / "labels", (".label",))
     images = numbered_files(folder / camera, _PICTURES)
     masks = numbered_files(folder / camera.replace("image", "semantic"), (".png",))
-    frames = max(*scans, *images, *masks) + 1
-    if frames != stamps:
-        raise DataError(folder / "times.txt", f"{stamps} stamps", f"{frames}, as there are frames")
+    if counts.image_stamps is None:
+        _check_stamps(folder / "times.txt", counts.stamps, {**scans, **images, **masks}, "frames")
+    else:
+        _check_stamps(folder / "times.txt", counts.stamps, scans, "scans")
+        times = image_times_path(folder, camera) or folder
+        _check_stamps(times, counts.image_stamps, {**images, **masks}, "images")
     if cloud != "velodyne":
         labels = {k: path for k, path in labels.items() if k <= max(scans)}
     _check_some_partner(scans, labels, folder / "labels")
@@ -124,6 +141,13 @@ def find_files(folder: Path, camera: str, cloud: str, stamps: int) -> KittiFiles
 
 def _is_sequence(path: Path) -> bool:
     return (path / "calib.txt").is_file() or (path / "velodyne").is_dir()
+
+
+def _check_stamps(times: Path, stamps: int, files: Mapping[int, Path], what: str) -> None:
+    """Require a stamp for each number up to the last file's, and no more."""
+    count = max(files) + 1
+    if count != stamps:
+        raise DataError(times, f"{stamps} stamps", f"{count}, as there are {what}")
 
 
 def _optional(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:

@@ -2,7 +2,9 @@
 
 Below ``PATH/sequences/NN`` (or below PATH itself): ``calib.txt``, ``times.txt``, ``velodyne``, ``labels``,
 ``image_2`` and ``semantic_2``; where present also ``instance_2`` (uint16, class * 256 + instance),
-``velodyne_times`` (float32 seconds relative to the stamp, one a point) and ``groundtruth.json``.
+``velodyne_times`` (float32 seconds relative to the stamp, one a point), ``groundtruth.json`` and
+``times_2.txt``: stamps of the images of image_2 by a clock of their own, one a line. ``times.txt`` then
+stamps the scans alone.
 
 Some labels, masks and pictures may be missing: where nothing is labelled nothing is associated, and an image
 without its picture has no features. Points that are NaN or inf are left out and counted.
@@ -21,25 +23,32 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
-from sst_graph.data.arrays import read_labels, read_offsets, read_points
-from sst_graph.data.calib import read_calibration
-from sst_graph.data.images import picture_size, read_instances, read_mask, read_picture
+from sst_graph.classes import MaskEncoding
+from sst_graph.data.arrays import read_offsets, read_points
+from sst_graph.data.images import picture_size, read_instances
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
-from sst_graph.data.kitti_layout import LAYOUT, KittiFiles, find_files, find_sequence, is_kitti
-from sst_graph.data.kitti_truth import drive_truth
+from sst_graph.data.kitti.calib import read_calibration
+from sst_graph.data.kitti.odometry_layout import (
+    LAYOUT,
+    FrameCounts,
+    KittiFiles,
+    find_files,
+    find_sequence,
+    image_times_path,
+    is_kitti,
+)
+from sst_graph.data.kitti.truth import drive_truth
+from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions, Sweep
+from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, printable
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.timestamps import read_times
-from sst_graph.types import NO_PICTURE, CameraImage, Frame, GroundTruth, Scan, SemanticClass
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
 
 _LOG = logging.getLogger(__name__)
-
-_MASKS_TO_JUDGE = 8
-"""How many masks, spread over the drive, decide on their encoding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,13 +176,15 @@ class KittiSource:
         )
 
     def _scan(self, index: int) -> Scan | None:
-        path = self.files.scans.get(index)
-        if path is None:
-            return None
+        return self.scan(index) if index in self.files.scans else None
+
+    def scan(self, index: int) -> Scan:
+        """Scan of an index that has one; errors as of the frame."""
+        path = self.files.scans[index]
         points = read_points(path)
         # Beams without a return come as NaN from many drivers.
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
-        classes, instances = self._labels(index, used)
+        classes, instances = point_labels(self.files.labels.get(index), used)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])
         return Scan(
@@ -185,14 +196,6 @@ class KittiSource:
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
         )
-
-    def _labels(self, index: int, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
-        """Classes and instances of a scan's used points; where it has no labels they may be anything."""
-        path = self.files.labels.get(index)
-        if path is None:
-            count = int(used.sum())
-            return np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
-        return classes_of_points(read_labels(path, len(used))[used], path)
 
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
@@ -207,32 +210,21 @@ class KittiSource:
         number = index + self.options.image_shift
         if number not in self.files.image_numbers:
             return None
-        return CameraImage(
-            stamp_ns=int(self.stamps_ns[index]),
-            mask=self._mask(self.files.masks.get(number)),
-            pixels=self._pixels(self.files.images.get(number)),
-        )
+        return self.pictures.image(number, int(self.stamps_ns[index]))
 
     @property
-    def _size(self) -> tuple[int, int]:
-        return self.camera.width, self.camera.height
-
-    def _mask(self, path: Path | None) -> NDArray[np.uint8]:
-        """Classes (h, w); where there is no mask every pixel may be anything."""
-        if path is None:
-            return np.full((self.camera.height, self.camera.width), SemanticClass.IGNORE, np.uint8)
-        return classes_of_mask(read_mask(path, self._size), self.drive.encoding, path)
-
-    def _pixels(self, path: Path | None) -> NDArray[np.uint8]:
-        return NO_PICTURE if path is None else read_picture(path, self._size)
+    def pictures(self) -> PictureFiles:
+        """Pictures and masks."""
+        size = self.camera.width, self.camera.height
+        return PictureFiles(size, self.files.images, self.files.masks, self.drive.encoding)
 
     def _instances(self, index: int) -> NDArray[np.uint16] | None:
         path = self.files.instances.get(index + self.options.image_shift)
-        return None if path is None else read_instances(path, self._size)
+        return None if path is None else read_instances(path, (self.camera.width, self.camera.height))
 
 
-def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
-    """Open a drive in KITTI's layout.
+def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSource:
+    """Open a drive in KITTI's layout; one with image stamps of its own has two clocks.
 
     Raises:
         DataError: a file or line is missing, counts disagree, stamps do not rise.
@@ -242,24 +234,53 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource:
     calibration = read_calibration(folder / "calib.txt")
     nominal = calibration.cTl(options.camera)
     stamps_ns = read_times(folder / "times.txt")
-    files = find_files(folder, options.camera, options.cloud, len(stamps_ns))
+    image_times = image_times_path(folder, options.camera)
+    image_stamps_ns = None if image_times is None else read_times(image_times)
+    counts = FrameCounts(len(stamps_ns), None if image_stamps_ns is None else len(image_stamps_ns))
+    files = find_files(folder, options.camera, options.cloud, counts)
     if options.sweep in TURNS and len(stamps_ns) < 2:
         raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
-    indices = _select(files, options, len(stamps_ns))
     size = picture_size(next(iter(files.images.values())))
     if missing := files.missing():
         _LOG.info("%s: %s", printable(folder), missing)
     truth, is_reference = drive_truth(folder, calibration, options.camera)
-    pairs = [k for k in indices if k in files.scans and k + options.image_shift in files.image_numbers]
     drive = KittiDrive(
         camera=calibration.camera(options.camera, *size),
         nominal=nominal,
-        truth=_shifted(truth, stamps_ns, pairs, options.image_shift),
+        truth=truth,
         truth_is_reference=is_reference,
-        encoding=_encoding(files, options, size),
+        encoding=mask_encoding(files.masks, options.label_encoding, size),
         timing=_timing(options, stamps_ns),
     )
+    if image_stamps_ns is not None:
+        source = KittiSource(_name(folder), drive, files, stamps_ns, (), replace(options, image_shift=0))
+        return _with_image_stamps(source, image_stamps_ns, options, folder)
+    indices = _select(files, options, len(stamps_ns))
+    shift = options.image_shift
+    pairs = [k for k in indices if k in files.scans and k + shift in files.image_numbers]
+    drive = replace(drive, truth=_shifted(truth, stamps_ns, pairs, shift))
     return KittiSource(_name(folder), drive, files, stamps_ns, indices, options)
+
+
+def _with_image_stamps(
+    source: KittiSource, image_stamps_ns: NDArray[np.int64], options: SourceOptions, folder: Path
+) -> TwoClockSource:
+    """The drive with images stamped by their own clock (n,) [ns], by number."""
+    scans, images = np.array(list(source.files.scans)), np.array(sorted(source.files.image_numbers))
+    pictures = source.pictures
+
+    def scan(k: int) -> Scan:
+        return source.scan(int(scans[k]))
+
+    def image(k: int) -> CameraImage:
+        return pictures.image(int(images[k]), int(image_stamps_ns[images[k]]))
+
+    drive = source.drive
+    properties = DriveProperties(
+        source.name, drive.camera, drive.nominal, drive.truth, drive.truth_is_reference
+    )
+    of_scans, of_images = Sensor(source.stamps_ns[scans], scan), Sensor(image_stamps_ns[images], image)
+    return merged(properties, of_scans, of_images, options, folder)
 
 
 def _timing(options: SourceOptions, stamps_ns: NDArray[np.int64]) -> SweepTiming | None:
@@ -290,14 +311,6 @@ def _shifted(truth: GroundTruth, stamps_ns: NDArray[np.int64], pairs: list[int],
     ks = np.array(pairs)
     seconds = float(np.mean(stamps_ns[ks + shift] - stamps_ns[ks])) * 1e-9
     return replace(truth, time_offset_s=truth.time_offset_s + seconds)
-
-
-def _encoding(files: KittiFiles, options: SourceOptions, size: tuple[int, int]) -> MaskEncoding:
-    if options.label_encoding != "auto":
-        return MaskEncoding(options.label_encoding)
-    paths = list(files.masks.values())
-    chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
-    return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
 
 
 def _folder(files: Mapping[int, Path]) -> str:

@@ -1,0 +1,1 @@
+"""Drives in a folder of images and clouds."""

@@ -1,0 +1,169 @@
+"""A drive in a folder: ``images/``, ``clouds/`` and ``camera.yaml``, each sensor with stamps of its own.
+
+Where present also ``masks/`` (.png, Cityscapes numbers, named as the images), ``labels/`` (.label as in
+SemanticKITTI, named as the clouds; a field ``label`` of the clouds serves as well) and ``extrinsic.yaml``.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.classes import classes_of_points
+from sst_graph.data.arrays import listed
+from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
+from sst_graph.data.folder.stamps import StampedFiles, stamped_files
+from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
+from sst_graph.data.point_files import SUFFIXES, Cloud, read_cloud
+from sst_graph.data.scan_order import rings_from_order
+from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.sweep_timing import SweepTiming
+from sst_graph.types import CameraImage, Scan
+
+_LOG = logging.getLogger(__name__)
+
+LAYOUT = "a folder with images, clouds and camera.yaml; stamps as names or in images.csv and clouds.csv"
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
+_IMAGES, _CLOUDS, _CAMERA, _EXTRINSIC = "images", "clouds", "camera.yaml", "extrinsic.yaml"
+_DEFAULT_CAMERA, _DEFAULT_CLOUD = SourceOptions().camera, SourceOptions().cloud
+
+
+def is_folder(path: Path) -> bool:
+    """Whether a folder holds images and clouds."""
+    return os.path.isdir(path / _IMAGES) and os.path.isdir(path / _CLOUDS)
+
+
+@dataclass(frozen=True, eq=False)
+class CloudFiles:
+    """Clouds in the order of their stamps.
+
+    Attributes:
+        files: with their stamps.
+        labels: paths of label files by position.
+        timing: times of points by azimuth, where the options name a sense of rotation.
+        stored_times: take the times that the clouds hold.
+    """
+
+    files: StampedFiles
+    labels: dict[int, Path]
+    timing: SweepTiming | None
+    stored_times: bool
+
+    def scan(self, k: int) -> Scan:
+        """Scan k; points that are NaN or inf are left out.
+
+        Raises:
+            DataError: a file is damaged or holds what it must not.
+        """
+        stamp_ns = int(self.files.stamps_ns[k])
+        cloud = read_cloud(self.files.paths[k])
+        points = cloud.points()
+        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        classes, instances = self._labels(k, cloud, used)
+        offsets_s = None
+        if self.timing is not None:
+            offsets_s = self.timing.offsets_s(points[used])
+        elif self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
+            offsets_s = times[used]
+        rings = cloud.rings()
+        points = np.ascontiguousarray(points[used])
+        return Scan(
+            stamp_ns=stamp_ns,
+            points=points,
+            classes=classes,
+            instances=instances,
+            offsets_s=offsets_s,
+            rings=rings_from_order(points) if rings is None else rings[used],
+            left_out=len(used) - len(points),
+        )
+
+    def _labels(
+        self, k: int, cloud: Cloud, used: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        path = self.labels.get(k)
+        if path is None and (labels := cloud.labels()) is not None:
+            return classes_of_points(labels[used], cloud.path)
+        return point_labels(path, used)
+
+
+def open_folder(path: Path, options: SourceOptions) -> TwoClockSource:
+    """Open a drive in a folder.
+
+    Raises:
+        DataError: a folder or file is missing or damaged, a name that is no stamp, stamps that do not rise.
+        ConfigError: an option that the layout does not have, or frames that the drive has not.
+        MissingDependencyError: PyYAML is not installed.
+    """
+    _check_options(path, options)
+    images = stamped_files(path / _IMAGES, PICTURES)
+    clouds = stamped_files(path / _CLOUDS, SUFFIXES)
+    for what, files in ((_IMAGES, images), (_CLOUDS, clouds)):
+        if files.without_stamp:
+            _LOG.warning("%s: %d %s without a stamp left out", printable(path), files.without_stamp, what)
+    camera = read_camera(path / _CAMERA)
+    extrinsic = path / _EXTRINSIC
+    nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None
+    size = (camera.width, camera.height)
+    masks = _beside(images, path / "masks", (".png",))
+    encoding = mask_encoding(masks, options.label_encoding, size)
+    pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
+    scans = CloudFiles(
+        clouds,
+        _beside(clouds, path / "labels", (".label",)),
+        _timing(clouds, options),
+        options.sweep == "auto",
+    )
+
+    def image(k: int) -> CameraImage:
+        return pictures.image(k, int(images.stamps_ns[k]))
+
+    properties = DriveProperties(printable(path.resolve().name), camera, nominal)
+    of_scans, of_images = Sensor(clouds.stamps_ns, scans.scan), Sensor(images.stamps_ns, image)
+    return merged(properties, of_scans, of_images, options, path)
+
+
+def _check_options(path: Path, options: SourceOptions) -> None:
+    wrong = {
+        "sequence": options.sequence is not None,
+        "camera": options.camera not in (_DEFAULT_CAMERA, _IMAGES),
+        "cloud": options.cloud not in (_DEFAULT_CLOUD, _CLOUDS),
+    }
+    for name, is_wrong in wrong.items():
+        if is_wrong:
+            raise ConfigError(f"{name} {getattr(options, name)!r}: {path} has images and clouds only")
+
+
+def _timing(clouds: StampedFiles, options: SourceOptions) -> SweepTiming | None:
+    """Times by azimuth where the options name a sense of rotation."""
+    if options.sweep not in TURNS:
+        return None
+    if len(clouds.stamps_ns) < 2:
+        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
+    period_s = float(np.median(np.diff(clouds.stamps_ns))) * 1e-9
+    start_rad = float(np.radians(options.sweep_start_deg))
+    return SweepTiming(TURNS[options.sweep], start_rad, period_s, options.sweep_stamp)
+
+
+def _beside(files: StampedFiles, folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
+    """Files of another folder by the position of the file with the same name.
+
+    Raises:
+        DataError: the folder is there, and holds none.
+    """
+    if not folder.is_dir():
+        return {}
+    named = {entry.stem: entry for entry in listed(folder, "files") if entry.suffix.lower() in suffixes}
+    found = {k: named[path.stem] for k, path in enumerate(files.paths) if path.stem in named}
+    if not found:
+        raise DataError(folder, "no file with the name of one beside it", f"a partner of {files.paths[0]}")
+    return found
+
+
+FOLDER_LOADER = Loader(recognizes=is_folder, open=open_folder, layout=LAYOUT)

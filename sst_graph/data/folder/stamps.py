@@ -1,0 +1,114 @@
+"""Stamps of files: in a CSV file beside them, or as their names.
+
+``images.csv`` beside ``images/``: one "name,stamp_ns" a line, a first line of words is a heading; a file
+without a line is left out. As a name: seconds with a decimal point ("1317048145.963.png"), or whole
+nanoseconds ("1317048145963000000.png").
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.arrays import listed
+from sst_graph.errors import DataError
+from sst_graph.files.reading import FileKind, read_text
+from sst_graph.timestamps import MAX_STAMPS, check_rising, parse_seconds
+from sst_graph.validation import LATEST_NS
+
+STAMPS_CSV = FileKind("a CSV file of name,stamp_ns", 128 * 1024 * 1024)
+LEAST_STEP_NS = 1_000_000
+"""Median interval [ns] below which whole numbers are no nanoseconds but a count, or another unit."""
+
+_WHOLE = re.compile(r"[+-]?\d{1,20}", re.ASCII)
+_SECONDS = re.compile(r"\d{1,12}\.\d+", re.ASCII)
+
+
+@dataclass(frozen=True, eq=False)
+class StampedFiles:
+    """Files of one sensor in the order of their stamps.
+
+    Attributes:
+        stamps_ns: (n,) rising strictly [ns].
+        paths: (n,) files.
+        without_stamp: number of files that are left out because the CSV file does not name them.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    paths: tuple[Path, ...]
+    without_stamp: int = 0
+
+
+def stamped_files(folder: Path, suffixes: tuple[str, ...]) -> StampedFiles:
+    """Files of a folder with their stamps.
+
+    Args:
+        suffixes: of the files, lower case; others are passed over.
+
+    Raises:
+        DataError: no file, a name that is no stamp and no CSV file, stamps that are equal, a line of the CSV
+            file that names no file or no stamp.
+    """
+    entries = listed(folder, f"files {', '.join('*' + suffix for suffix in suffixes)}")
+    files = {path.name: path for path in entries if path.suffix.lower() in suffixes}
+    if not files:
+        raise DataError(folder, "no such file", f"files {', '.join('*' + suffix for suffix in suffixes)}")
+    table = folder.with_name(f"{folder.name}.csv")
+    if table.exists():
+        stamps = _table(table, files)
+    else:
+        stamps = {name: _stamp_of(path, table) for name, path in files.items()}
+    names = sorted(stamps, key=lambda name: stamps[name])
+    stamps_ns = np.array([stamps[name] for name in names], np.int64)
+    check_rising(stamps_ns, table if table.exists() else folder)
+    if len(names) > 1 and float(np.median(np.diff(stamps_ns))) < LEAST_STEP_NS:
+        step = float(np.median(np.diff(stamps_ns)))
+        found = f"stamps with a median step of {step:g} ns"
+        expected = "stamps in seconds with a decimal point or in whole nanoseconds"
+        raise DataError(table if table.exists() else folder, found, expected)
+    return StampedFiles(stamps_ns, tuple(files[name] for name in names), len(files) - len(names))
+
+
+def _stamp_of(path: Path, table: Path) -> int:
+    """Stamp [ns] that a file's name is."""
+    stem = path.name[: -len(path.suffix)]
+    if _SECONDS.fullmatch(stem):
+        return parse_seconds(stem, path)
+    if _WHOLE.fullmatch(stem):
+        return _checked(int(stem), path)
+    expected = f"a stamp (seconds with a decimal point, or whole nanoseconds), or {table.name} beside it"
+    raise DataError(path, f"the name {stem!r:.80}", expected)
+
+
+def _table(table: Path, files: Mapping[str, Path]) -> dict[str, int]:
+    """Stamps by name."""
+    text = read_text(table, STAMPS_CSV)
+    if text.count("\n") > MAX_STAMPS:
+        raise DataError(table, f"{text.count(chr(10))} lines", f"at most {MAX_STAMPS} stamps")
+    stamps: dict[str, int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        words = [word.strip().strip('"') for word in line.split(",")]
+        if not any(words) or (number == 1 and len(words) == 2 and words[1][:1].isalpha()):
+            continue
+        if len(words) != 2 or not _WHOLE.fullmatch(words[1]):
+            raise DataError(f"{table}:{number}", f"{line!r:.80}", "name,stamp_ns")
+        name = words[0]
+        if name not in files:
+            raise DataError(f"{table}:{number}", f"{name!r:.80}", f"the name of a file in {table.stem}")
+        if name in stamps:
+            raise DataError(f"{table}:{number}", f"{name!r:.80} again", "each file once")
+        stamps[name] = _checked(int(words[1]), f"{table}:{number}")
+    if not stamps:
+        raise DataError(table, "no stamp", "one name,stamp_ns a line")
+    return stamps
+
+
+def _checked(stamp_ns: int, place: str | Path) -> int:
+    if abs(stamp_ns) > LATEST_NS:
+        raise DataError(place, f"a stamp of {stamp_ns} ns", "nanoseconds that fit into 64 bits")
+    return stamp_ns

@@ -1,0 +1,100 @@
+"""Reading of small YAML files: numbers, text, lists, tables; no anchors, no objects."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from pathlib import Path
+from typing import Any
+
+from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.files.reading import FileKind, read_text
+
+YAML = FileKind("a YAML file", 64 * 1024)
+_MAX_DEPTH = 16
+_OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The table in a YAML file; a matrix of OpenCV is a table of rows, cols, dt, data.
+
+    Raises:
+        DataError: a missing file, no YAML, anchors and aliases, tags of objects, deep nesting, no table.
+        MissingDependencyError: PyYAML is not installed.
+    """
+    try:
+        import yaml
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: reading YAML needs PyYAML, which is not installed: pip install 'sst-graph[yaml]'"
+        ) from None
+
+    text = read_text(path, YAML)
+    if text.startswith("%YAML:"):  # OpenCV's first line is no directive of YAML
+        text = text.partition("\n")[2]
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+        """Numbers, text, lists and tables, and OpenCV's matrices."""
+
+    def matrix(loader: Any, node: Any) -> Any:
+        return loader.construct_mapping(node, deep=True)
+
+    Loader.add_constructor(_OPENCV_MATRIX, matrix)
+    try:
+        _check_events(yaml, text)
+        value = yaml.load(text, Loader)  # a SafeLoader
+    except (yaml.YAMLError, ValueError, TypeError, OverflowError, AttributeError, RecursionError) as error:
+        line = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(path, f"no YAML ({line:.200})", "numbers, text, lists and tables") from None
+    if not isinstance(value, dict):
+        raise DataError(path, f"a YAML {type(value).__name__}", "a table")
+    return value
+
+
+def _check_events(yaml: Any, text: str) -> None:
+    """Refuse what takes memory or time beyond the text's own size.
+
+    Raises:
+        ValueError: an alias, or deep nesting.
+    """
+    depth = 0
+    for event in yaml.parse(text, yaml.SafeLoader):
+        if isinstance(event, yaml.AliasEvent):
+            raise ValueError("an alias")
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MAX_DEPTH:
+            raise ValueError(f"more than {_MAX_DEPTH} levels")
+
+
+def number(value: Any, place: str) -> float:
+    """A finite number.
+
+    Raises:
+        DataError: something else.
+    """
+    if isinstance(value, str):  # YAML 1.1 takes 1e-3 for text
+        with contextlib.suppress(ValueError):
+            value = float(value)
+    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) > 1e300:
+        raise DataError(place, f"{value!r:.60}", "a finite number")
+    if not math.isfinite(value):
+        raise DataError(place, f"{value!r:.60}", "a finite number")
+    return float(value)
+
+
+def numbers(value: Any, place: str, count: int | None = None) -> list[float]:
+    """Finite numbers of a list, of lists of lists, or of a matrix of OpenCV or ROS; row by row.
+
+    Raises:
+        DataError: something else, or another number of them.
+    """
+    if isinstance(value, dict) and "data" in value:
+        value = value["data"]
+    if not isinstance(value, list):
+        raise DataError(place, f"{value!r:.60}", "a list of numbers")
+    flat: list[Any] = []
+    for item in value:
+        flat.extend(item if isinstance(item, list) else [item])
+    if count is not None and len(flat) != count:
+        raise DataError(place, f"{len(flat)} numbers", f"{count}")
+    return [number(item, place) for item in flat]

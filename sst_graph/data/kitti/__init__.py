@@ -1,0 +1,1 @@
+"""Readers of KITTI: the odometry layout and the raw drives."""

@@ -1,0 +1,194 @@
+"""KITTI raw drives, ``_sync`` and ``_extract``: each sensor with the stamps of its own ``timestamps.txt``.
+
+SemanticKITTI labels and Cityscapes masks stand beside them where there are any: ``labels/NNNNNNNNNN.label``
+and ``semantic_0N/NNNNNNNNNN.png``, by the numbers of scans and images; ``groundtruth.json`` as in the
+odometry layout. Pictures are rectified or not by their size, or else by the folder's name.
+
+Points as measured (``sweep`` clockwise or counterclockwise) get their times from the start and the end of
+their own sweep (``timestamps_start.txt``, ``timestamps_end.txt``); without these files from the median
+period.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.arrays import MAX_POINTS, check_metres, read_points
+from sst_graph.data.images import picture_size
+from sst_graph.data.kitti.raw_calib import RawCalibration, raw_camera_number, read_raw_calibration
+from sst_graph.data.kitti.raw_layout import (
+    LAYOUT,
+    RawFiles,
+    SweepTimes,
+    calibration_folder,
+    find_drive,
+    find_raw_files,
+    is_raw,
+)
+from sst_graph.data.kitti.truth import read_truth
+from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
+from sst_graph.data.scan_order import rings_from_order
+from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.reading import FileKind, read_text
+from sst_graph.sweep_timing import SweepStamp, SweepTiming
+from sst_graph.types import CameraImage, GroundTruth, Scan
+
+TEXT_SCAN = FileKind("a cloud of lines x y z r", 64 * 1024 * 1024)
+
+
+@dataclass(frozen=True)
+class TurnTimes:
+    """Times of points by azimuth and by the start and end of their own sweep.
+
+    Attributes:
+        fraction: 1 for a scanner that turns counter-clockwise, seen from above, -1 for clockwise.
+        start_rad: azimuth at which a turn begins [rad].
+        stamp: the instant that a stamp names where starts and ends are not known.
+        period_s: median interval between stamps [s].
+        sweeps: starts and ends; None: a turn takes the period.
+    """
+
+    fraction: float
+    start_rad: float
+    stamp: SweepStamp
+    period_s: float
+    sweeps: SweepTimes | None
+
+    def offsets_s(self, number: int, stamp_ns: int, points: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Times (n,) of the points (n, 3) of a scan after its stamp [s]."""
+        if self.sweeps is None:
+            return SweepTiming(self.fraction, self.start_rad, self.period_s, self.stamp).offsets_s(points)
+        start_ns, end_ns = int(self.sweeps.starts_ns[number]), int(self.sweeps.ends_ns[number])
+        turn = SweepTiming(self.fraction, self.start_rad, (end_ns - start_ns) * 1e-9, "start")
+        return turn.offsets_s(points) + np.float32((start_ns - stamp_ns) * 1e-9)
+
+
+@dataclass(frozen=True)
+class RawScans:
+    """Scans of a drive by number.
+
+    Attributes:
+        scans, labels: paths; some labels may be missing.
+        turn: times of the points, where they are asked for.
+    """
+
+    scans: Mapping[int, Path]
+    labels: Mapping[int, Path]
+    turn: TurnTimes | None
+
+    def scan(self, number: int, stamp_ns: int) -> Scan:
+        """Scan of a number.
+
+        Raises:
+            DataError: a file is damaged or holds what it must not.
+        """
+        path = self.scans[number]
+        points = read_points(path) if path.suffix.lower() == ".bin" else read_text_points(path)
+        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        classes, instances = point_labels(self.labels.get(number), used)
+        points = np.ascontiguousarray(points[used])
+        offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
+        left_out = len(used) - len(points)
+        return Scan(stamp_ns, points, classes, instances, offsets_s, rings_from_order(points), left_out)
+
+
+def read_text_points(path: Path) -> NDArray[np.float32]:
+    """Points (n, 3) float32 [m] of a cloud in text: x y z r a line.
+
+    Raises:
+        DataError: a missing file, a line with other than four numbers, a coordinate that is no length.
+    """
+    text = read_text(path, TEXT_SCAN)
+    if text.count("\n") > MAX_POINTS:
+        raise DataError(path, f"{text.count(chr(10))} lines", f"at most {MAX_POINTS}")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without lines
+            values = np.loadtxt(io.StringIO(text), np.float32, comments=None, ndmin=2)
+    except ValueError as error:
+        raise DataError(path, f"no numbers ({str(error).splitlines()[0]})", "lines of x y z r") from None
+    if values.size and values.shape[1] != 4:
+        raise DataError(path, f"{values.shape[1]} numbers a line", "4: x y z r")
+    points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    check_metres(points, path)
+    return points
+
+
+def open_raw(path: Path, options: SourceOptions) -> TwoClockSource:
+    """Open a drive of KITTI raw.
+
+    Raises:
+        DataError: a file or line is missing or damaged, stamps do not rise, the lens distorts.
+        ConfigError: no such drive, camera or range of frames.
+    """
+    drive = find_drive(path, options.sequence)
+    number = raw_camera_number(options.camera)
+    calibration = read_raw_calibration(calibration_folder(drive))
+    files = find_raw_files(drive, number)
+    size = picture_size(next(iter(files.pictures.values())))
+    camera, nominal = _camera(calibration, drive, number, size)
+    truth = _truth(drive, options.camera, nominal)
+    encoding = mask_encoding(files.masks, options.label_encoding, size)
+    pictures = PictureFiles(size, files.pictures, files.masks, encoding)
+    clouds = RawScans(files.scans, files.labels, _turn_times(files, options))
+    scans = np.array(list(files.scans))
+    images = np.array(sorted({*files.pictures, *(k for k in files.masks if k < len(files.image_stamps_ns))}))
+    scan_stamps, image_stamps = files.scan_stamps_ns[scans], files.image_stamps_ns[images]
+
+    def scan(k: int) -> Scan:
+        return clouds.scan(int(scans[k]), int(scan_stamps[k]))
+
+    def image(k: int) -> CameraImage:
+        return pictures.image(int(images[k]), int(image_stamps[k]))
+
+    is_reference = not (drive / "groundtruth.json").exists()
+    properties = DriveProperties(printable(drive.resolve().name), camera, nominal, truth, is_reference)
+    return merged(properties, Sensor(scan_stamps, scan), Sensor(image_stamps, image), options, drive)
+
+
+def _camera(
+    calibration: RawCalibration, drive: Path, number: int, size: tuple[int, int]
+) -> tuple[PinholeCamera, gtsam.Pose3]:
+    """Intrinsics and cTl for rectified pictures or for those as recorded, whichever have the size."""
+    kinds = [rectified for rectified in (True, False) if calibration.size(number, rectified) == size]
+    if not kinds:
+        expected = " or ".join("{}x{} px".format(*calibration.size(number, kind)) for kind in (True, False))
+        raise DataError(drive / f"image_{number:02d}", "pictures of {}x{} px".format(*size), expected)
+    rectified = kinds[0] if len(kinds) == 1 else not drive.resolve().name.endswith("_extract")
+    return (calibration.rectified if rectified else calibration.as_recorded)(number, *size)
+
+
+def _truth(drive: Path, camera: str, nominal: gtsam.Pose3) -> GroundTruth:
+    """``groundtruth.json``, or the published calibration; its clocks are near, but not known to agree."""
+    stored = read_truth(drive / "groundtruth.json")
+    if stored is None:
+        return GroundTruth(nominal, None)
+    if raw_camera_number(stored.camera) != raw_camera_number(camera):
+        found = f"the truth of {stored.camera}"
+        raise DataError(drive / "groundtruth.json", found, f"that of {camera}")
+    return stored.truth
+
+
+def _turn_times(files: RawFiles, options: SourceOptions) -> TurnTimes | None:
+    if options.sweep not in TURNS:
+        return None
+    stamps = files.scan_stamps_ns
+    if len(stamps) < 2:
+        raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
+    period_s = float(np.median(np.diff(stamps))) * 1e-9
+    start_rad = float(np.radians(options.sweep_start_deg))
+    return TurnTimes(TURNS[options.sweep], start_rad, options.sweep_stamp, period_s, files.sweeps)
+
+
+RAW_LOADER = Loader(recognizes=is_raw, open=open_raw, layout=LAYOUT)

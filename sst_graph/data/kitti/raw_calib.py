@@ -1,0 +1,142 @@
+"""Calibration of a KITTI raw recording: ``calib_cam_to_cam.txt`` and ``calib_velo_to_cam.txt``.
+
+Rectified pictures (``_sync``) follow uv1 ~ P_rect_0N R_rect_00 [R T]_velo lP1 (KITTI devkit), so that
+cTl = [I | K^-1 P_rect_0N[:, 3]] R_rect_00 [R T]_velo with K = P_rect_0N[:, :3]. Pictures as recorded
+(``_extract``) follow K_0N with the distortion D_0N, and cTl = [R_0N T_0N] [R T]_velo.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.kitti.calib import KittiCalibration, pose_from
+from sst_graph.data.undistorted import require_rectified
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.checked_values import checked_camera
+from sst_graph.files.reading import FileKind, read_text
+
+FloatArray = NDArray[np.float64]
+
+CAM_TO_CAM, VELO_TO_CAM = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
+CALIB_RAW = FileKind("a KITTI raw calibration", 1024 * 1024)
+
+_LINE = re.compile(r"(?:[KDRTS]|[RSP]_rect)_\d\d|R|T", re.ASCII)
+
+
+@dataclass(frozen=True)
+class RawCalibration:
+    """Calibration of one day of recording.
+
+    Attributes:
+        folder: with the two files, named in errors.
+        cameras: lines of ``calib_cam_to_cam.txt`` by name, "P_rect_02": (n,).
+        c0Tl: pose of the LiDAR in camera 0, not rectified.
+    """
+
+    folder: Path
+    cameras: Mapping[str, FloatArray]
+    c0Tl: gtsam.Pose3
+
+    def size(self, camera: int, rectified: bool) -> tuple[int, int]:
+        """Width and height [px] of the pictures of a camera.
+
+        Raises:
+            DataError: no such line.
+        """
+        name = f"S_rect_{camera:02d}" if rectified else f"S_{camera:02d}"
+        width, height = self._line(name, 2)
+        return round(width), round(height)
+
+    def rectified(self, camera: int, width: int, height: int) -> tuple[PinholeCamera, gtsam.Pose3]:
+        """Intrinsics of a camera's rectified pictures of width x height [px], and cTl.
+
+        Raises:
+            DataError: a line is missing, or holds no such matrix.
+        """
+        P = self._line(f"P_rect_{camera:02d}", 12).reshape(3, 4)
+        R = self._line("R_rect_00", 9).reshape(3, 3)
+        place = f"{self.folder / CAM_TO_CAM} (R_rect_00)"
+        c0Tl = pose_from(np.column_stack([R, np.zeros(3)]), place) * self.c0Tl
+        named = f"image_{camera}"
+        odometry = KittiCalibration(self.folder / CAM_TO_CAM, {camera: P}, c0Tl)
+        return odometry.camera(named, width, height), odometry.cTl(named)
+
+    def as_recorded(self, camera: int, width: int, height: int) -> tuple[PinholeCamera, gtsam.Pose3]:
+        """Intrinsics of a camera's pictures of width x height [px] as recorded, and cTl.
+
+        Raises:
+            DataError: a line is missing or holds no such matrix, or the lens distorts.
+        """
+        path = self.folder / CAM_TO_CAM
+        K = self._line(f"K_{camera:02d}", 9).reshape(3, 3)
+        D = self._line(f"D_{camera:02d}", 5)
+        require_rectified("plumb_bob", D.tolist(), f"{path} (D_{camera:02d})")
+        R = self._line(f"R_{camera:02d}", 9).reshape(3, 3)
+        t = self._line(f"T_{camera:02d}", 3)
+        cTc0 = pose_from(np.column_stack([R, t]), f"{path} (R_{camera:02d}, T_{camera:02d})")
+        fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        pinhole = PinholeCamera(fx, fy, cx, cy, width, height)
+        return checked_camera(pinhole, f"{path} (K_{camera:02d})"), cTc0 * self.c0Tl
+
+    def _line(self, name: str, count: int) -> FloatArray:
+        path = self.folder / CAM_TO_CAM
+        if name not in self.cameras:
+            raise DataError(path, f"no line {name}", f"{name}: {count} numbers")
+        values = self.cameras[name]
+        if len(values) != count:
+            raise DataError(path, f"{len(values)} values for {name}", f"{count}")
+        return values
+
+
+def read_raw_calibration(folder: Path) -> RawCalibration:
+    """Read the two files of a folder.
+
+    Raises:
+        DataError: a file is missing, a value is no finite number, or no rigid transform.
+    """
+    cameras = _lines(folder / CAM_TO_CAM)
+    path = folder / VELO_TO_CAM
+    lidar = _lines(path)
+    for name, count in (("R", 9), ("T", 3)):
+        if len(lidar.get(name, ())) != count:
+            raise DataError(path, f"{len(lidar.get(name, ()))} values for {name}", f"{count}")
+    matrix = np.column_stack([lidar["R"].reshape(3, 3), lidar["T"]])
+    return RawCalibration(folder, cameras, pose_from(matrix, f"{path} (R, T)"))
+
+
+def raw_camera_number(camera: str) -> int:
+    """Number of a camera named image_2 or image_02.
+
+    Raises:
+        ConfigError: another name.
+    """
+    match = re.fullmatch(r"image_0?(\d)", camera, re.ASCII)
+    if match is None:
+        raise ConfigError(f"camera {camera!r}: expected image_0N, as in image_02")
+    return int(match.group(1))
+
+
+def _lines(path: Path) -> dict[str, FloatArray]:
+    lines: dict[str, FloatArray] = {}
+    for number, line in enumerate(read_text(path, CALIB_RAW).splitlines(), 1):
+        name, colon, words = line.partition(":")
+        if not colon or not _LINE.fullmatch(name.strip()):
+            continue
+        try:
+            values = np.array([float(word) for word in words.split()])
+        except ValueError:
+            values = np.array([np.nan])
+        if not np.isfinite(values).all():
+            raise DataError(
+                f"{path}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
+            )
+        lines[name.strip()] = values
+    return lines

@@ -1,0 +1,269 @@
+"""Scenes of nuScenes: LIDAR_TOP and one camera, key frames and sweeps, by the tables alone.
+
+Each sensor has its own stamps [us]. The nominal extrinsic is that of the rig: both sensors' poses in the ego
+vehicle, without its motion between the stamps. nuScenes has no masks of images; lidarseg labels stand at the
+key frames. The LiDAR's x axis points to the right of the vehicle and y ahead, as stored.
+
+Source: the schema in docs/schema_nuscenes.md of nutonomy/nuscenes-devkit.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.classes import classes_of_lidarseg
+from sst_graph.data.arrays import MAX_POINTS, check_metres, listed
+from sst_graph.data.nuscenes.tables import Record, matrix_of, pose_of, records, text_of, whole_of
+from sst_graph.data.pictures import PictureFiles
+from sst_graph.data.source import TURNS, Loader, SourceOptions
+from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.checked_values import checked_camera
+from sst_graph.files.reading import FileKind, read_file
+from sst_graph.sweep_timing import SweepTiming
+from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass
+
+LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
+_LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
+_NS_PER_US = 1000
+_PCD_BIN = FileKind("a nuScenes cloud of x y z intensity ring in float32", 20 * MAX_POINTS)
+_LIDARSEG = FileKind("lidarseg labels, one uint8 a point", MAX_POINTS)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One sensor of a scene.
+
+    Attributes:
+        name: CAM_FRONT.
+        calibration: its record of ``calibrated_sensor.json``.
+        data: its records of ``sample_data.json``, by stamp.
+    """
+
+    name: str
+    calibration: Record
+    data: tuple[Record, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class LidarFiles:
+    """Scans of a scene in the order of their stamps.
+
+    Attributes:
+        stamps_ns: (n,) [ns].
+        paths: of the clouds.
+        labels: of the lidarseg labels, by position.
+        timing: times of points by azimuth, where the options name a sense of rotation.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    paths: tuple[Path, ...]
+    labels: Mapping[int, Path] = field(default_factory=dict)
+    timing: SweepTiming | None = None
+
+    def scan(self, k: int) -> Scan:
+        """Scan k.
+
+        Raises:
+            DataError: a damaged file, rings that are none, another number of labels than points.
+        """
+        path = self.paths[k]
+        data = read_file(path, _PCD_BIN)
+        if len(data) % 20:
+            raise DataError(path, f"{len(data)} bytes", f"a multiple of 20 ({_PCD_BIN.name})")
+        values = np.frombuffer(data, "<f4").reshape(-1, 5)
+        points = np.ascontiguousarray(values[:, :3])
+        check_metres(points, path)
+        used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
+        rings = values[used, 4]
+        if not ((rings >= 0) & (rings < 256) & (rings == np.floor(rings))).all():
+            raise DataError(path, "rings that are no whole numbers of 0 to 255", _PCD_BIN.name)
+        points = np.ascontiguousarray(points[used])
+        offsets_s = None if self.timing is None else self.timing.offsets_s(points)
+        return Scan(
+            stamp_ns=int(self.stamps_ns[k]),
+            points=points,
+            classes=self._classes(k, used),
+            offsets_s=offsets_s,
+            rings=rings.astype(np.uint16),
+            left_out=len(used) - len(points),
+        )
+
+    def _classes(self, k: int, used: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        path = self.labels.get(k)
+        if path is None:
+            return np.full(int(used.sum()), SemanticClass.IGNORE, np.uint8)
+        labels = np.frombuffer(read_file(path, _LIDARSEG), np.uint8)
+        if len(labels) != len(used):
+            raise DataError(path, f"{len(labels)} labels", f"{len(used)}, one a point of the scan")
+        return classes_of_lidarseg(labels[used], path)
+
+
+def is_nuscenes(path: Path) -> bool:
+    """Whether a folder holds tables of nuScenes."""
+    return os.path.isdir(path) and bool(_versions(path))
+
+
+def open_nuscenes(path: Path, options: SourceOptions) -> TwoClockSource:
+    """Open a scene.
+
+    Raises:
+        DataError: a table or file is missing or damaged.
+        ConfigError: no such scene or camera, or several and none named.
+    """
+    versions = _versions(path)
+    if not versions:
+        raise DataError(path, "no folder v1.0-* with sample_data.json", LAYOUT)
+    if len(versions) > 1:
+        named = ", ".join(version.name for version in versions)
+        raise ConfigError(f"{path}: tables {named}: keep one of them in the folder")
+    tables = versions[0]
+    scene = _scene(tables, options.sequence)
+    lidar, camera = _channels(tables, scene, _camera_name(options.camera))
+    pinhole, nominal = _rig(tables, lidar, camera)
+    size = (pinhole.width, pinhole.height)
+    pictures = PictureFiles(size, dict(enumerate(_paths(path, tables, camera))))
+    image_stamps = _stamps(tables, camera)
+    scans = _lidar_files(path, tables, lidar, options)
+
+    def image(k: int) -> CameraImage:
+        return pictures.image(k, int(image_stamps[k]))
+
+    name = f"nuscenes/{printable(text_of(scene, 'name', tables))}"
+    properties = DriveProperties(name, pinhole, nominal, GroundTruth(nominal, None), True)
+    of_scans, of_images = Sensor(scans.stamps_ns, scans.scan), Sensor(image_stamps, image)
+    return merged(properties, of_scans, of_images, options, path)
+
+
+def _versions(path: Path) -> list[Path]:
+    entries = listed(path, LAYOUT)
+    return [p for p in entries if p.name.startswith("v1.0-") and os.path.isfile(p / "sample_data.json")]
+
+
+def _camera_name(camera: str) -> str:
+    return _CAMERA if camera == SourceOptions().camera else camera
+
+
+def _scene(tables: Path, name: str | None) -> Record:
+    """The scene of a name, scene-0061 or 61, or the only one."""
+    path = tables / "scene.json"
+    scenes = {text_of(scene, "name", path): scene for scene in records(path)}
+    if name is None and len(scenes) == 1:
+        return next(iter(scenes.values()))
+    wanted = {name, f"scene-{name:0>4}"} if name is not None else set()
+    found = [scene for key, scene in scenes.items() if key in wanted]
+    if not found:
+        some = ", ".join(list(scenes)[:12]) + (", ..." if len(scenes) > 12 else "")
+        asked = "name one of them" if name is None else f"none is {name!r}"
+        raise ConfigError(f"{tables}: {len(scenes)} scenes ({some}): {asked}")
+    return found[0]
+
+
+def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channel]:
+    """LiDAR and camera of a scene.
+
+    Raises:
+        DataError: no data of one.
+        ConfigError: no such camera.
+    """
+    sensors, calibrated = tables / "sensor.json", tables / "calibrated_sensor.json"
+    channels = {text_of(r, "token", sensors): text_of(r, "channel", sensors) for r in records(sensors)}
+    if camera not in channels.values() or not camera.startswith("CAM"):
+        named = ", ".join(sorted(name for name in set(channels.values()) if name.startswith("CAM")))
+        raise ConfigError(f"camera {camera!r}: {tables} has {named}")
+    calibrations = {text_of(r, "token", calibrated): r for r in records(calibrated)}
+    samples_path, data_path = tables / "sample.json", tables / "sample_data.json"
+    scene_token = text_of(scene, "token", tables / "scene.json")
+    samples = {
+        text_of(r, "token", samples_path)
+        for r in records(samples_path)
+        if r.get("scene_token") == scene_token
+    }
+    data: dict[str, list[Record]] = {_LIDAR: [], camera: []}
+    rigs: dict[str, set[str]] = {_LIDAR: set(), camera: set()}
+    for record in records(data_path):
+        if record.get("sample_token") not in samples:
+            continue
+        token = text_of(record, "calibrated_sensor_token", data_path)
+        if token not in calibrations:
+            raise DataError(data_path, f"calibrated_sensor_token {token!r:.60}", f"one of {calibrated.name}")
+        channel = channels.get(str(calibrations[token].get("sensor_token")))
+        if channel in data:
+            data[channel].append(record)
+            rigs[channel].add(token)
+    found = []
+    for name in (_LIDAR, camera):
+        if len(rigs[name]) != 1:
+            raise DataError(data_path, f"{len(rigs[name])} calibrations of {name} in the scene", "one")
+        rows = tuple(sorted(data[name], key=lambda row: whole_of(row, "timestamp", data_path)))
+        found.append(Channel(name, calibrations[next(iter(rigs[name]))], rows))
+    return found[0], found[1]
+
+
+def _rig(tables: Path, lidar: Channel, camera: Channel) -> tuple[PinholeCamera, gtsam.Pose3]:
+    """Intrinsics, and cTl by both sensors' poses in the ego vehicle."""
+    path = tables / "calibrated_sensor.json"
+    K = matrix_of(camera.calibration.get("camera_intrinsic"), (3, 3), f"{path} (camera_intrinsic)")
+    width, height = (
+        whole_of(camera.data[0], side, tables / "sample_data.json") for side in ("width", "height")
+    )
+    pinhole = PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
+    eTc, eTl = pose_of(camera.calibration, path), pose_of(lidar.calibration, path)
+    return checked_camera(pinhole, path), eTc.inverse() * eTl
+
+
+def _stamps(tables: Path, channel: Channel) -> NDArray[np.int64]:
+    path = tables / "sample_data.json"
+    stamps = [whole_of(record, "timestamp", path) for record in channel.data]
+    if stamps and not 0 <= stamps[0] <= stamps[-1] < 2**52:
+        raise DataError(path, f"a timestamp {stamps[-1]}", "microseconds since 1970")
+    return np.array(stamps, np.int64) * _NS_PER_US
+
+
+def _paths(path: Path, tables: Path, channel: Channel) -> tuple[Path, ...]:
+    return tuple(
+        _inside(path, text_of(r, "filename", tables / "sample_data.json"), tables) for r in channel.data
+    )
+
+
+def _inside(path: Path, filename: str, tables: Path) -> Path:
+    """The file of a table's entry.
+
+    Raises:
+        DataError: a name that leads out of the data set.
+    """
+    parts = Path(filename).parts
+    if not parts or Path(filename).is_absolute() or ".." in parts:
+        raise DataError(tables, f"filename {filename!r:.80}", "a file below the data set's folder")
+    return path.joinpath(*parts)
+
+
+def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOptions) -> LidarFiles:
+    stamps_ns = _stamps(tables, lidar)
+    labels: dict[int, Path] = {}
+    lidarseg = tables / "lidarseg.json"
+    if lidarseg.exists():
+        position = {r.get("token"): k for k, r in enumerate(lidar.data)}
+        for record in records(lidarseg):
+            k = position.get(record.get("sample_data_token"))
+            if k is not None:
+                labels[k] = _inside(path, text_of(record, "filename", lidarseg), tables)
+    timing = None
+    if options.sweep in TURNS:
+        if len(stamps_ns) < 2:
+            raise ConfigError(f"sweep {options.sweep!r}: the period of a turn needs two stamps or more")
+        period_s = float(np.median(np.diff(stamps_ns))) * 1e-9
+        start_rad = float(np.radians(options.sweep_start_deg))
+        timing = SweepTiming(TURNS[options.sweep], start_rad, period_s, options.sweep_stamp)
+    return LidarFiles(stamps_ns, _paths(path, tables, lidar), labels, timing)
+
+
+NUSCENES_LOADER = Loader(recognizes=is_nuscenes, open=open_nuscenes, layout=LAYOUT)

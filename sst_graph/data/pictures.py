@@ -1,0 +1,80 @@
+"""Pictures and Cityscapes masks of a drive, kept as files by number."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
+from sst_graph.data.arrays import read_labels
+from sst_graph.data.images import read_mask, read_picture
+from sst_graph.data.source import LabelEncoding
+from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
+
+_MASKS_TO_JUDGE = 8
+"""How many masks, spread over the drive, decide on their encoding."""
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """Images by number; a picture or a mask may be missing.
+
+    Attributes:
+        size: width and height of all of them [px].
+        pictures, masks: paths by number.
+        encoding: of the masks.
+    """
+
+    size: tuple[int, int]
+    pictures: Mapping[int, Path]
+    masks: Mapping[int, Path] = field(default_factory=dict)
+    encoding: MaskEncoding = MaskEncoding.IDS
+
+    def image(self, number: int, stamp_ns: int) -> CameraImage:
+        """Image of a number; without its mask every pixel may be anything.
+
+        Raises:
+            DataError: a file is damaged, of another size, or holds what it must not.
+        """
+        width, height = self.size
+        mask = np.full((height, width), SemanticClass.IGNORE, np.uint8)
+        if (path := self.masks.get(number)) is not None:
+            mask = classes_of_mask(read_mask(path, self.size), self.encoding, path)
+        picture = self.pictures.get(number)
+        return CameraImage(
+            stamp_ns, mask, NO_PICTURE if picture is None else read_picture(picture, self.size)
+        )
+
+
+def mask_encoding(masks: Mapping[int, Path], wanted: LabelEncoding, size: tuple[int, int]) -> MaskEncoding:
+    """Encoding of masks; decided over some of them where ``wanted`` is "auto".
+
+    Raises:
+        DataError: a mask that cannot be read, or numbers that no encoding defines.
+    """
+    if wanted != "auto":
+        return MaskEncoding(wanted)
+    if not masks:
+        return MaskEncoding.IDS
+    paths = list(masks.values())
+    chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
+    return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
+
+
+def point_labels(path: Path | None, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+    """Classes and instances of a scan's used points by a SemanticKITTI file; without one, any class.
+
+    Args:
+        used: (n,) False for points that are left out.
+
+    Raises:
+        DataError: a damaged file, another number of labels than points, an unknown class.
+    """
+    if path is None:
+        count = int(used.sum())
+        return np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
+    return classes_of_points(read_labels(path, len(used))[used], path)

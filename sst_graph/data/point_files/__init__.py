@@ -1,0 +1,8 @@
+"""Point clouds in files of any common format."""
+
+from __future__ import annotations
+
+from sst_graph.data.point_files.cloud import Cloud
+from sst_graph.data.point_files.reading import SUFFIXES, read_cloud
+
+__all__ = ["SUFFIXES", "Cloud", "read_cloud"]

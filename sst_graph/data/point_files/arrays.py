@@ -1,0 +1,114 @@
+"""Clouds in files of plain arrays: KITTI's .bin, NumPy's .npy and .npz.
+
+A .npy is a structured array with fields x, y, z, ..., or an array (n, 3) or (n, 4) of x y z and intensity.
+A .npz has one array a field, or such an array named ``points`` beside fields of their own. Nothing is
+unpickled.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.arrays import MAX_POINTS
+from sst_graph.data.point_files.cloud import MAX_POINT_BYTES, Cloud, check_count, cloud_of, structured_fields
+from sst_graph.errors import DataError
+
+_MAX_BYTES = 512 * 1024 * 1024
+"""Of one array, unpacked."""
+_MAX_HEADER = 10_000
+_BROKEN = (ValueError, EOFError, OSError, KeyError, TypeError, SyntaxError, zipfile.BadZipFile, zlib.error)
+
+
+def read_bin(data: bytes, path: Path) -> Cloud:
+    """x y z intensity in float32 little-endian, as in KITTI.
+
+    Raises:
+        DataError: a truncated file.
+    """
+    if len(data) % 16:
+        raise DataError(path, f"{len(data)} bytes", "a multiple of 16 (x y z intensity in float32)")
+    values = np.frombuffer(data, "<f4").reshape(-1, 4)
+    return cloud_of(path, {name: values[:, k] for k, name in enumerate("xyz")})
+
+
+def read_npy(data: bytes, path: Path) -> Cloud:
+    """One array.
+
+    Raises:
+        DataError: no such array.
+    """
+    return cloud_of(path, _fields(_array(data, path), path))
+
+
+def read_npz(data: bytes, path: Path) -> Cloud:
+    """Arrays by name.
+
+    Raises:
+        DataError: no such arrays, or more of them than a cloud has.
+    """
+    fields: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            # by the directory, before a byte is unpacked
+            unpacked = sum(member.file_size for member in members)
+            if len(members) > 64 or unpacked > _MAX_BYTES:
+                found = f"{len(members)} arrays of {unpacked} bytes"
+                raise DataError(path, found, f"at most 64 of {_MAX_BYTES} bytes")
+            arrays = {}
+            for member in members:
+                with archive.open(member) as stream:
+                    content = stream.read(member.file_size + 1)
+                arrays[member.filename.removesuffix(".npy")] = _array(content, path)
+    except (*_BROKEN, NotImplementedError, RuntimeError) as error:
+        raise DataError(path, f"no .npz file ({_line(error)})", "arrays that NumPy wrote") from None
+    for name, array in arrays.items():
+        fields.update(_fields(array, path) if name == "points" else {name: array})
+    return cloud_of(path, fields)
+
+
+def _array(data: bytes, path: Path) -> NDArray[Any]:
+    """The array of a .npy file, its size compared with the file's before memory is taken."""
+    stream = io.BytesIO(data)
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"version {version}")
+        read_header = (
+            np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        )
+        shape, fortran, dtype = read_header(stream, max_header_size=_MAX_HEADER)
+    except (*_BROKEN, RecursionError, MemoryError) as error:
+        raise DataError(path, f"no .npy file ({_line(error)})", "an array that NumPy wrote") from None
+    if dtype.hasobject or dtype.itemsize == 0 or dtype.itemsize > MAX_POINT_BYTES or len(shape) not in (1, 2):
+        raise DataError(path, f"an array of {dtype}, shape {shape}", "numbers or structured records")
+    count = 1
+    for length in shape:
+        count *= int(length)
+    rest = len(data) - stream.tell()
+    if min(shape) < 0 or shape[0] > MAX_POINTS or count * dtype.itemsize != rest:
+        raise DataError(path, f"{rest} bytes behind the header", f"those of an array of shape {shape}")
+    array = np.frombuffer(data, dtype, count, stream.tell())
+    return array.reshape(shape, order="F" if fortran else "C")
+
+
+def _fields(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]]:
+    check_count(path, len(array))
+    if array.dtype.names is not None:
+        if array.ndim != 1:
+            raise DataError(path, f"records of shape {array.shape}", "(n,)")
+        return structured_fields(path, array)
+    if array.ndim != 2 or array.shape[1] not in (3, 4):
+        raise DataError(path, f"an array of shape {array.shape}", "(n, 3) or (n, 4), or records with x, y, z")
+    return {name: array[:, k] for k, name in enumerate("xyz")}
+
+
+def _line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -1,0 +1,152 @@
+"""A point cloud by named fields, whatever file it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.arrays import MAX_POINTS, check_metres
+from sst_graph.errors import DataError
+from sst_graph.files.reading import FileKind
+
+CLOUD_FILE = FileKind("a point cloud", 512 * 1024 * 1024)
+MAX_POINT_BYTES = 1024
+"""Of one point with all its fields."""
+
+RINGS = ("ring", "rings", "channel", "laser_id")
+TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time")
+LABELS = ("label", "labels")
+
+_ABSOLUTE_S = 1e3
+"""Times beyond this [s] are stamps of the LiDAR's clock, not times after the scan's stamp."""
+_LONGEST_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """Fields of a cloud, each (n,): those that are used, others are left out.
+
+    Attributes:
+        path: the file, named in errors.
+        fields: by lower-case name; x, y, z [m] always.
+    """
+
+    path: Path
+    fields: Mapping[str, NDArray[Any]]
+
+    def points(self) -> NDArray[np.float32]:
+        """(n, 3) float32 [m]; those of beams without a return may be NaN.
+
+        Raises:
+            DataError: a coordinate that is no length.
+        """
+        with np.errstate(over="ignore"):
+            points = np.stack([self.fields[name].astype(np.float32) for name in "xyz"], axis=1)
+        check_metres(points, self.path)
+        return points
+
+    def rings(self) -> NDArray[np.uint16] | None:
+        """Laser numbers (n,), or None.
+
+        Raises:
+            DataError: one that is no whole number of 0 to 65535.
+        """
+        values = self._first(RINGS)
+        return None if values is None else self._whole(values, 0xFFFF, "rings").astype(np.uint16)
+
+    def labels(self) -> NDArray[np.uint32] | None:
+        """SemanticKITTI labels (n,): class in the low, instance in the high 16 bits; or None.
+
+        Raises:
+            DataError: one that is no whole number of 32 bits.
+        """
+        values = self._first(LABELS)
+        return None if values is None else self._whole(values, 0xFFFFFFFF, "labels").astype(np.uint32)
+
+    def offsets_s(self, stamp_ns: int, used: NDArray[np.bool_]) -> NDArray[np.float32] | None:
+        """Times (n,) of the points after the scan's stamp [s], or None where the cloud has none.
+
+        Whole numbers are nanoseconds, others seconds. Stamps of the LiDAR's clock are made relative.
+
+        Args:
+            used: (n,) False for points that are left out, whose times may be anything.
+
+        Raises:
+            DataError: a time more than a second from the stamp.
+        """
+        values = self._first(TIMES)
+        if values is None:
+            return None
+        if values.dtype.kind in "iu":
+            absolute = bool((np.abs(values[used].astype(np.float64)) > _ABSOLUTE_S * 1e9).any())
+            whole = values.astype(np.int64) - (stamp_ns if absolute else 0)
+            seconds = whole.astype(np.float64) * 1e-9
+        else:
+            seconds = values.astype(np.float64)
+            if (np.abs(seconds[used]) > _ABSOLUTE_S).any():
+                seconds = seconds - stamp_ns * 1e-9
+        bad = np.flatnonzero(used & ~(np.abs(seconds) <= _LONGEST_S))
+        if len(bad):
+            found = f"{len(bad)} times that are NaN or beyond {_LONGEST_S:g} s, first at index {bad[0]}"
+            expected = "seconds in floats or nanoseconds in whole numbers, absolute or after the scan's stamp"
+            raise DataError(self.path, found, expected)
+        return np.where(used, seconds, 0.0).astype(np.float32)
+
+    def _first(self, names: tuple[str, ...]) -> NDArray[Any] | None:
+        return next((self.fields[name] for name in names if name in self.fields), None)
+
+    def _whole(self, values: NDArray[Any], most: int, what: str) -> NDArray[Any]:
+        """Values that are whole numbers of 0 to ``most``; floats are taken where they hold such."""
+        with np.errstate(invalid="ignore"):
+            good = (values >= 0) & (values <= most)
+            if values.dtype.kind == "f":
+                good &= values == np.floor(values)
+        if not good.all():
+            k = int(np.argmin(good))
+            raise DataError(self.path, f"{what} {values[k]} at index {k}", f"whole numbers, 0 to {most}")
+        return values
+
+
+def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
+    """A cloud of the fields that are used.
+
+    Raises:
+        DataError: no x, y, z, a field of other than numbers, or fields of other lengths.
+    """
+    lower = {name.lower(): values for name, values in fields.items()}
+    missing = [name for name in "xyz" if name not in lower]
+    if missing:
+        named = ", ".join(sorted(fields)) or "none"
+        raise DataError(path, f"no field {missing[0]} (fields: {named})", "fields x, y, z [m]")
+    used = {name: lower[name] for name in ("x", "y", "z", *RINGS, *TIMES, *LABELS) if name in lower}
+    count = len(lower["x"]) if lower["x"].ndim else -1
+    for name, values in used.items():
+        if values.dtype.kind not in "fiu" or values.shape != (count,):
+            found = f"{name} of {values.dtype}, shape {values.shape}"
+            raise DataError(path, found, f"numbers, one a point ({count} points)")
+    check_count(path, count)
+    return Cloud(path, used)
+
+
+def check_count(path: Path, count: int) -> None:
+    """Require a number of points that a scan may have, before memory is taken.
+
+    Raises:
+        DataError: more than MAX_POINTS.
+    """
+    if not 0 <= count <= MAX_POINTS:
+        raise DataError(path, f"{count} points", f"0 to {MAX_POINTS}")
+
+
+def structured_fields(path: Path, records: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """Fields (n,) of structured records (n,), in the machine's byte order."""
+    return {
+        name: np.ascontiguousarray(records[name]).astype(records.dtype[name].newbyteorder("="), copy=False)
+        for name in records.dtype.names or ()
+        if records.dtype[name].shape == ()
+    }

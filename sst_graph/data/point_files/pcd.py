@@ -1,0 +1,149 @@
+"""PCD files of the Point Cloud Library, version 0.7: ascii, binary, binary_compressed.
+
+Source: the format's description in PCL's documentation (pcd_file_format). A compressed block holds two
+uint32, its own and its unpacked size, and the fields one after the other in LZF.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.point_files.cloud import (
+    CLOUD_FILE,
+    MAX_POINT_BYTES,
+    Cloud,
+    check_count,
+    cloud_of,
+    structured_fields,
+)
+from sst_graph.data.point_files.lzf import unpack_lzf
+from sst_graph.data.point_files.text import text_records
+from sst_graph.errors import DataError
+
+_MAX_HEADER = 64 * 1024
+_TYPES = {
+    (kind, size): np.dtype(f"<{kind.lower()}{size}")
+    for kind, sizes in (("F", (4, 8)), ("I", (1, 2, 4, 8)), ("U", (1, 2, 4, 8)))
+    for size in sizes
+}
+
+
+@dataclass(frozen=True)
+class PcdHeader:
+    """What the header of a PCD file declares.
+
+    Attributes:
+        dtype: of a point's record; fields of several values are (count,) arrays.
+        count: number of points.
+        data: ascii, binary or binary_compressed.
+        end: where the points begin [bytes].
+    """
+
+    dtype: np.dtype[Any]
+    count: int
+    data: str
+    end: int
+
+
+def read_pcd(data: bytes, path: Path) -> Cloud:
+    """Points of a PCD file.
+
+    Raises:
+        DataError: no such header, another number of points than it declares, damaged compression.
+    """
+    header = _header(data, path)
+    body = data[header.end :]
+    if header.data == "ascii":
+        records = text_records(body, header.dtype, header.count, path)
+    elif header.data == "binary":
+        records = _binary(body, header, path)
+    else:
+        records = _compressed(body, header, path)
+    return cloud_of(path, structured_fields(path, records))
+
+
+def _header(data: bytes, path: Path) -> PcdHeader:
+    entries: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in entries:
+        end = data.find(b"\n", at, _MAX_HEADER)
+        if end < 0:
+            raise DataError(path, "no line DATA", "a PCD header of version 0.7")
+        words = data[at:end].decode("ascii", "replace").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            entries[words[0].upper()] = words[1:]
+    try:
+        names = entries["FIELDS"]
+        sizes, kinds = [int(word) for word in entries["SIZE"]], entries["TYPE"]
+        counts = [int(word) for word in entries.get("COUNT", ["1"] * len(names))]
+        if "POINTS" in entries:
+            count = int(entries["POINTS"][0])
+        else:
+            count = int(entries["WIDTH"][0]) * int(entries["HEIGHT"][0])
+        (kind,) = entries["DATA"]
+    except (KeyError, ValueError, IndexError) as error:
+        raise DataError(path, f"a header without {error}"[:80], "a PCD header of version 0.7") from None
+    if kind not in ("ascii", "binary", "binary_compressed"):
+        raise DataError(path, f"DATA {kind:.40}", "ascii, binary or binary_compressed")
+    check_count(path, count)
+    return PcdHeader(_dtype(names, kinds, sizes, counts, path), count, kind, at)
+
+
+def _dtype(
+    names: list[str], kinds: list[str], sizes: list[int], counts: list[int], path: Path
+) -> np.dtype[Any]:
+    if not names or not len(names) == len(kinds) == len(sizes) == len(counts):
+        found = f"{len(names)} fields, {len(kinds)} types, {len(sizes)} sizes, {len(counts)} counts"
+        raise DataError(path, found, "as many of each")
+    fields: list[tuple[Any, ...]] = []
+    for k, (name, kind, size, count) in enumerate(zip(names, kinds, sizes, counts, strict=True)):
+        if (kind, size) not in _TYPES or not 1 <= count <= MAX_POINT_BYTES:
+            found = f"field {name:.40} of type {kind:.10}, {size} bytes, count {count}"
+            raise DataError(path, found, "F of 4 or 8 bytes, I or U of 1, 2, 4 or 8")
+        # PCL pads with fields named _ that may come several times
+        unique = f"_{k}" if name == "_" else name
+        fields.append((unique, _TYPES[kind, size]) if count == 1 else (unique, _TYPES[kind, size], (count,)))
+    try:
+        dtype = np.dtype(fields)
+    except ValueError:
+        raise DataError(path, f"fields {' '.join(names)}"[:200], "fields of different names") from None
+    if dtype.itemsize > MAX_POINT_BYTES:
+        raise DataError(path, f"{dtype.itemsize} bytes a point", f"at most {MAX_POINT_BYTES}")
+    return dtype
+
+
+def _binary(body: bytes, header: PcdHeader, path: Path) -> NDArray[Any]:
+    size = header.count * header.dtype.itemsize
+    if len(body) < size:
+        raise DataError(path, f"{len(body)} bytes of points", f"{size} for {header.count} points")
+    return np.frombuffer(body, header.dtype, header.count)
+
+
+def _compressed(body: bytes, header: PcdHeader, path: Path) -> NDArray[Any]:
+    """Records of fields that stand one after the other, packed."""
+    if len(body) < 8:
+        raise DataError(path, f"{len(body)} bytes of points", "the sizes of a compressed block")
+    packed, size = struct.unpack_from("<II", body)
+    if size != header.count * header.dtype.itemsize:
+        expected = f"{header.count * header.dtype.itemsize} for {header.count} points"
+        raise DataError(path, f"{size} unpacked bytes declared", expected)
+    if size > CLOUD_FILE.max_bytes:
+        raise DataError(path, f"{size} unpacked bytes declared", f"at most {CLOUD_FILE.max_bytes}")
+    if len(body) - 8 < packed:
+        raise DataError(path, f"{len(body) - 8} compressed bytes", f"{packed}")
+    columns = unpack_lzf(body[8 : 8 + packed], size, path)
+    records = np.zeros(header.count, header.dtype)
+    at = 0
+    for name in header.dtype.names or ():
+        field = header.dtype[name]
+        end = at + header.count * field.itemsize
+        records[name] = np.frombuffer(columns[at:end], field.base).reshape(header.count, *field.shape)
+        at = end
+    return records

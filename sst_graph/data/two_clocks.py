@@ -1,0 +1,230 @@
+"""A drive whose camera and LiDAR stamp their data by clocks and at rates of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Generic, TypeVar, overload
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.source import SourceOptions, Sweep
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.sweep_timing import SweepStamp
+from sst_graph.timestamps import check_rising
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor(Generic[T]):
+    """What one sensor measured, read when asked for.
+
+    Attributes:
+        stamps_ns: (n,) in the sensor's own clock, rising strictly [ns].
+        read: measurement k of n, stamped ``stamps_ns[k]``; DataError where its files cannot be used.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    read: Callable[[int], T]
+
+    def __len__(self) -> int:
+        return len(self.stamps_ns)
+
+
+@dataclass(frozen=True)
+class DriveProperties:
+    """What holds for every frame of a drive.
+
+    Attributes:
+        name: of the drive.
+        camera: intrinsics.
+        nominal: cTl that the data bring, or None.
+        truth: what is known to be true, or None.
+        truth_is_reference: the truth is a published calibration, not known to hold.
+        sweep, sweep_stamp: as :class:`~sst_graph.data.source.SourceOptions` has them.
+    """
+
+    name: str
+    camera: PinholeCamera
+    nominal: gtsam.Pose3 | None = None
+    truth: GroundTruth | None = None
+    truth_is_reference: bool = False
+    sweep: Sweep = "auto"
+    sweep_stamp: SweepStamp = "forward"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Positions of a frame's scan and image among those of their sensors; one may be None."""
+
+    scan: int | None
+    image: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class TwoClockSource:
+    """Frames in the order of their stamps (satisfies :class:`~sst_graph.types.Source`); a slice is one, too.
+
+    A frame holds a scan or an image; both where their stamps are equal. Made by :func:`merged`.
+
+    Attributes:
+        properties: what holds for every frame.
+        scans, images: of the whole drive.
+        places: scan and image of every frame of the whole drive.
+        indices: the frames of this part of the drive, as positions in ``places``.
+    """
+
+    properties: DriveProperties
+    scans: Sensor[Scan]
+    images: Sensor[CameraImage]
+    places: tuple[Place, ...]
+    indices: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        return self.properties.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        return self.properties.camera
+
+    @property
+    def nominal(self) -> gtsam.Pose3 | None:
+        return self.properties.nominal
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        return self.properties.truth
+
+    @property
+    def truth_is_reference(self) -> bool:
+        """Whether the truth is a published calibration, not known to hold."""
+        return self.properties.truth_is_reference
+
+    @property
+    def sweep(self) -> Sweep:
+        """How the times of the points are found."""
+        return self.properties.sweep
+
+    @property
+    def sweep_stamp(self) -> SweepStamp:
+        """The instant that a scan's stamp names where times follow from azimuths."""
+        return self.properties.sweep_stamp
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> TwoClockSource: ...
+    def __getitem__(self, position: int | slice) -> Frame | TwoClockSource:
+        """Frame at a position (read from disk), or the drive restricted to a slice of positions.
+
+        Raises:
+            DataError: a file of the frame cannot be used.
+            IndexError: no frame at this position.
+        """
+        if isinstance(position, slice):
+            return replace(self, indices=self.indices[position])
+        return Frame(self.indices[position], self.read_scan(position), self.read_image(position))
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[position] for position in range(len(self)))
+
+    def frame_number(self, position: int) -> int:
+        """Index of the frame at a position; nothing is read."""
+        return self.indices[position]
+
+    def read_scan(self, position: int) -> Scan | None:
+        """Scan of the frame at a position; errors as of the frame."""
+        place = self.places[self.indices[position]]
+        return None if place.scan is None else self.scans.read(place.scan)
+
+    def read_image(self, position: int) -> CameraImage | None:
+        """Image of the frame at a position; errors as of the frame."""
+        place = self.places[self.indices[position]]
+        return None if place.image is None else self.images.read(place.image)
+
+
+def merged(
+    properties: DriveProperties,
+    scans: Sensor[Scan],
+    images: Sensor[CameraImage],
+    options: SourceOptions,
+    folder: Path,
+) -> TwoClockSource:
+    """The drive of a LiDAR and a camera.
+
+    ``options.frames`` counts frames in the order of stamps. With ``options.image_shift`` image k is image
+    k + shift, stamped as image k; the truth's time offset follows.
+
+    Args:
+        folder: named in errors.
+
+    Raises:
+        DataError: no scan or no image, or stamps of a sensor that do not rise strictly.
+        ConfigError: frames that the drive has not, or that hold no scan or no image.
+    """
+    for what, sensor in (("scan", scans), ("image", images)):
+        if not len(sensor):
+            raise DataError(folder, f"no {what}", "scans and images")
+        check_rising(sensor.stamps_ns, f"{folder} ({what}s)")
+    if options.image_shift:
+        images, seconds = _shifted(images, options.image_shift)
+        truth = properties.truth
+        if truth is not None and truth.time_offset_s is not None:
+            truth = replace(truth, time_offset_s=truth.time_offset_s + seconds)
+            properties = replace(properties, truth=truth)
+    properties = replace(properties, sweep=options.sweep, sweep_stamp=options.sweep_stamp)
+    places = _places(scans.stamps_ns, images.stamps_ns)
+    indices = _selected(places, options)
+    return TwoClockSource(properties, scans, images, places, indices)
+
+
+def _places(scan_stamps_ns: NDArray[np.int64], image_stamps_ns: NDArray[np.int64]) -> tuple[Place, ...]:
+    """Scans and images in the order of their stamps, those of equal stamps together."""
+    stamps = np.union1d(scan_stamps_ns, image_stamps_ns)
+    scan_at = {int(stamp): k for k, stamp in enumerate(scan_stamps_ns)}
+    image_at = {int(stamp): k for k, stamp in enumerate(image_stamps_ns)}
+    return tuple(Place(scan_at.get(stamp), image_at.get(stamp)) for stamp in stamps.tolist())
+
+
+def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImage], float]:
+    """Images ``shift`` later, stamped as those in whose place they stand, and by how much on average [s].
+
+    Raises:
+        ConfigError: no image is left.
+    """
+    count = len(images) - abs(shift)
+    if count < 1:
+        raise ConfigError(f"image shift {shift}: the drive has {len(images)} images")
+    first = max(0, -shift)
+    stamps = images.stamps_ns[first : first + count]
+    real = images.stamps_ns[first + shift : first + shift + count]
+
+    def read(k: int) -> CameraImage:
+        return replace(images.read(first + shift + k), stamp_ns=int(stamps[k]))
+
+    return Sensor(stamps, read), float(np.mean(real - stamps)) * 1e-9
+
+
+def _selected(places: tuple[Place, ...], options: SourceOptions) -> tuple[int, ...]:
+    chosen = options.frames or slice(None)
+    first, last = chosen.start or 0, len(places) if chosen.stop is None else chosen.stop
+    if first >= len(places) or last > len(places):
+        raise ConfigError(f"frames {first}:{last}: the drive has frames 0:{len(places)}")
+    indices = tuple(range(first, last))
+    for what, found in (
+        ("scan", any(places[k].scan is not None for k in indices)),
+        ("image", any(places[k].image is not None for k in indices)),
+    ):
+        if not found:
+            raise ConfigError(f"frames {first}:{last}: no {what} among them")
+    return indices

@@ -1,0 +1,250 @@
+"""KITTI raw, folders and nuScenes: what each lays down besides frames, and one line for what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import gtsam
+import numpy as np
+import pytest
+from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes, raw_stamp, write_raw_calibration
+
+from sst_graph.cli import main
+from sst_graph.data import open_source
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.sweep_timing import SweepTiming
+
+Change = Callable[[Path], None]
+
+
+@pytest.fixture
+def raw(kitti_drive: Path, tmp_path: Path) -> Path:
+    return as_kitti_raw(kitti_drive, tmp_path / "raw")
+
+
+@pytest.fixture
+def folder(kitti_drive: Path, tmp_path: Path) -> Path:
+    return as_folder(kitti_drive, tmp_path / "street")
+
+
+@pytest.fixture
+def nuscenes(kitti_drive: Path, tmp_path: Path) -> Path:
+    return as_nuscenes(kitti_drive, tmp_path / "nuscenes")
+
+
+def test_raw_sweeps_give_times_by_their_own_start_and_end(raw: Path) -> None:
+    starts = [raw_stamp(EPOCH_NS + 10**8 * k - 40_000_000) for k in range(5)]
+    ends = [raw_stamp(EPOCH_NS + 10**8 * k + 62_000_000) for k in range(5)]
+    stamps = [raw_stamp(EPOCH_NS + 10**8 * k) for k in range(5)]
+    for name, lines in (("_start", starts), ("_end", ends), ("", stamps)):
+        (raw / f"velodyne_points/timestamps{name}.txt").write_text("\n".join(lines) + "\n")
+    scans = [frame.scan for frame in open_source(raw, sweep="clockwise") if frame.scan is not None]
+    turn = SweepTiming(-1.0, np.pi, 0.102, "start")
+    for scan in scans:
+        np.testing.assert_allclose(scan.offsets_s, turn.offsets_s(scan.points) - 0.04, atol=1e-7)
+    assert all(frame.scan is None or frame.scan.offsets_s is None for frame in open_source(raw))
+
+
+def test_raw_drops_and_other_counts(raw: Path) -> None:
+    (raw / "velodyne_points/data/0000000002.bin").unlink()
+    lines = [raw_stamp(EPOCH_NS + 30_000_000 * k) for k in range(7)]
+    (raw / "image_02/timestamps.txt").write_text("\n".join(lines) + "\n")
+    (raw / "image_02/data/0000000004.png").rename(raw / "image_02/data/0000000006.png")
+    source = open_source(raw)
+    scans = [frame.scan.stamp_ns - EPOCH_NS for frame in source if frame.scan is not None]
+    images = [frame.image.stamp_ns - EPOCH_NS for frame in source if frame.image is not None]
+    assert scans == [0, 100_000_000, 310_000_000, 410_000_000]
+    assert images[:4] == [0, 30_000_000, 60_000_000, 90_000_000] and images[-1] == 180_000_000
+
+
+def test_raw_clouds_in_text(raw: Path) -> None:
+    binary = raw / "velodyne_points/data/0000000001.bin"
+    values = np.fromfile(binary, "<f4").reshape(-1, 4)
+    binary.unlink()
+    np.savetxt(binary.with_suffix(".txt"), values, fmt="%.9g")
+    scan = open_source(raw)[1].scan
+    assert scan is not None
+    np.testing.assert_array_equal(scan.points, values[:, :3])
+
+
+def test_raw_pictures_as_recorded_need_a_lens_without_distortion(raw: Path) -> None:
+    P2 = np.array([[700.0, 0, 4, 35], [0, 700, 3, 0], [0, 0, 1, 0]])
+    c0Tl = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, 0.3), np.array([1.0, 2.0, 3.0]))
+    sizes = {"S_02": "8 6", "S_rect_02": "9 9"}
+    write_raw_calibration(raw.parent, P2, c0Tl, (8, 6), **sizes)
+    with pytest.raises(DataError, match=r"calib_cam_to_cam.txt \(D_02\): found plumb_bob distortion \[-0.37"):
+        open_source(raw)
+    turn = gtsam.Rot3.RzRyRx(0.01, 0.02, 0.03)
+    R = " ".join(f"{value:.15e}" for value in turn.matrix().ravel())
+    write_raw_calibration(
+        raw.parent, P2, c0Tl, (8, 6), **sizes, D_02="0 0 0 0 0", R_02=R, R_rect_00="1 0 0 0 1 0 0 0 1"
+    )
+    source = open_source(raw)
+    velo = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.004, -0.007, 0.009).inverse(), np.zeros(3)) * c0Tl
+    assert source.nominal is not None
+    assert source.nominal.equals(gtsam.Pose3(turn, np.array([0.05, 0.0, 0.0])) * velo, 1e-12)
+
+
+def write(name: str, content: str | bytes) -> Change:
+    data = content.encode() if isinstance(content, str) else content
+    return lambda path: (path / name).write_bytes(data) and None
+
+
+def remove(name: str) -> Change:
+    return lambda path: (path / name).unlink()
+
+
+def edit(name: str, old: str, new: str, count: int = 1) -> Change:
+    def change(path: Path) -> None:
+        text = (path / name).read_text()
+        assert old in text
+        (path / name).write_text(text.replace(old, new, count))
+
+    return change
+
+
+BROKEN: list[tuple[str, Change, str]] = [
+    ("raw", remove("../calib_velo_to_cam.txt"), "calib_velo_to_cam.txt: found no such file"),
+    ("raw", edit("../calib_cam_to_cam.txt", "P_rect_02", "P_rect_09"), "no line P_rect_02"),
+    ("raw", edit("../calib_cam_to_cam.txt", "S_rect_02: ", "S_rect_02: 1"), "pictures of 8x6 px"),
+    ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: 1 "), "10 values for R"),
+    ("raw", edit("../calib_velo_to_cam.txt", "R: ", "R: nan "), "finite numbers for R"),
+    ("raw", edit("image_02/timestamps.txt", "2011-09-26", "26.09.2011"), "expected a stamp as 2011-09-26"),
+    ("raw", write("image_02/timestamps.txt", "2011-09-26 13:02:25.9\n"), "1 stamps, expected 5 or more"),
+    ("raw", write("velodyne_points/timestamps_end.txt", "2011-09-26 13:02:25.9\n"), "1 stamps, expected 5"),
+    ("raw", edit("velodyne_points/timestamps.txt", "13:02:25", "14:02:25"), "falling stamps 0 and 1"),
+    ("raw", remove("velodyne_points/timestamps.txt"), "timestamps.txt: found no such file"),
+    ("folder", remove("camera.yaml"), "camera.yaml: found no such file"),
+    ("folder", edit("camera.yaml", "fx: 700.0", "fx: .nan"), r"\(fx\): found nan"),
+    ("folder", edit("camera.yaml", "fx: 700.0", "fx: [700"), "no YAML"),
+    ("folder", edit("camera.yaml", "height: 6\n", ""), "no height"),
+    ("folder", edit("camera.yaml", "fx: 700.0", "a: &a 1\nfx: *a"), "an alias"),
+    ("folder", write("camera.yaml", "- 1\n"), "a YAML list"),
+    ("folder", write("camera.yaml", "a: !!python/object:os.system {}\n"), "no YAML"),
+    ("folder", write("extrinsic.yaml", "translation: [0, 0, 0]\n"), "no quaternion"),
+    ("folder", write("extrinsic.yaml", "T_camera_lidar: [1, 2]\n"), "2 numbers, expected 16"),
+    ("folder", write("images/first.png", b""), "the name 'first', expected a stamp"),
+    ("folder", write("images.csv", "a.png,100\n"), "'a.png', expected the name of a file in images"),
+    ("folder", write("images.csv", "name,stamp_ns\n"), "no stamp"),
+    ("folder", write("images.csv", "0.png,1.5\n"), "'0.png,1.5', expected name,stamp_ns"),
+    ("folder", write("clouds/0.000000001.bin", bytes(3)), "3 bytes, expected a multiple of 16"),
+    ("nuscenes", write("v1.0-mini/sample.json", "[{"), "no whole record after 0"),
+    ("nuscenes", write("v1.0-mini/scene.json", "{}"), "expected a table of nuScenes"),
+    ("nuscenes", remove("v1.0-mini/calibrated_sensor.json"), "no such file"),
+    (
+        "nuscenes",
+        edit("v1.0-mini/sample_data.json", "samples/CAM_FRONT/", "../samples/"),
+        "below the data set",
+    ),
+    (
+        "nuscenes",
+        edit("v1.0-mini/calibrated_sensor.json", '"camera_intrinsic": [\n[', '"camera_intrinsic": [\n[1,'),
+        "shape",
+    ),
+    ("nuscenes", edit("v1.0-mini/sample_data.json", '"timestamp": 1', '"timestamp": -1', -1), "timestamp"),
+]
+
+
+@pytest.mark.parametrize(("layout", "change", "found"), BROKEN)
+def test_a_broken_drive_is_one_line(
+    request: pytest.FixtureRequest, layout: str, change: Change, found: str
+) -> None:
+    path: Path = request.getfixturevalue(layout)
+    change(path)
+    with pytest.raises(DataError, match=found) as raised:
+        list(open_source(path, sequence="61" if layout == "nuscenes" else None))
+    assert str(raised.value).isprintable()
+
+
+def test_a_broken_drive_ends_a_command_with_2(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "camera.yaml").unlink()
+    assert main(["calibrate", str(folder), "--out", str(tmp_path / "out")]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1 and "camera.yaml: found no such file" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("layout", "options", "found"),
+    [
+        ("raw", {"sequence": "0007"}, "is itself the folder of a drive"),
+        ("raw", {"camera": "left"}, "expected image_0N"),
+        ("folder", {"sequence": "0"}, "images and clouds only"),
+        ("folder", {"camera": "left"}, "images and clouds only"),
+        ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them"),
+        ("nuscenes", {"sequence": "7"}, "none is '7'"),
+        ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT"),
+    ],
+)
+def test_options_that_a_layout_has_not(
+    request: pytest.FixtureRequest, layout: str, options: dict[str, str], found: str
+) -> None:
+    with pytest.raises(ConfigError, match=found):
+        open_source(request.getfixturevalue(layout), **options)  # type: ignore[arg-type]
+
+
+# --- folders ----------------------------------------------------------------------------------------------
+
+CAMERAS = {
+    "kalibr": "cam0:\n  camera_model: pinhole\n  intrinsics: [700, 701, 4, 3]\n  distortion_model: radtan\n"
+    "  distortion_coeffs: [0, 0, 0, 0]\n  resolution: [8, 6]\n",
+    "opencv": "%YAML:1.0\n---\nimage_width: 8\nimage_height: 6\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
+    "   cols: 3\n   dt: d\n   data: [ 700., 0., 4., 0., 701., 3., 0., 0., 1. ]\n"
+    "distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 4\n   dt: d\n"
+    "   data: [ 0., 0., 0., 0. ]\n",
+    "plain": "fx: 700\nfy: 7.01e2\ncx: 4\ncy: 3\nwidth: 8\nheight: 6\n",
+}
+
+
+@pytest.mark.parametrize("kind", CAMERAS)
+def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
+    (folder / "camera.yaml").write_text(CAMERAS[kind])
+    camera = open_source(folder).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (700.0, 701.0, 4.0, 3.0)
+    assert (camera.width, camera.height) == (8, 6)
+    (folder / "camera.yaml").write_text(CAMERAS[kind].replace("0, 0, 0, 0]", "-0.3, 0, 0, 0]"))
+    if kind == "kalibr":
+        with pytest.raises(DataError, match=r"radtan distortion \[-0.3, 0.0, 0.0, 0.0\]"):
+            open_source(folder)
+
+
+def test_an_extrinsic_as_translation_and_quaternion(folder: Path) -> None:
+    (folder / "extrinsic.yaml").write_text("translation: [1, 2, 3]\nquaternion: [0.5, -0.5, 0.5, -0.5]\n")
+    nominal = open_source(folder).nominal
+    assert nominal is not None
+    assert nominal.equals(
+        gtsam.Pose3(gtsam.Rot3.Quaternion(0.5, -0.5, 0.5, -0.5), np.array([1.0, 2, 3])), 1e-12
+    )
+    (folder / "extrinsic.yaml").unlink()
+    assert open_source(folder).nominal is None
+
+
+def test_stamps_in_a_table_and_files_that_are_not_in_it(folder: Path) -> None:
+    names = sorted(path.name for path in (folder / "images").iterdir())[:3]
+    lines = [f"{name},{7_000_000 + 50_000_000 * k}" for k, name in enumerate(names)]
+    (folder / "images.csv").write_text("\n".join(["name,stamp_ns", *lines]) + "\n")
+    stamps = [frame.image.stamp_ns for frame in open_source(folder) if frame.image is not None]
+    assert stamps == [7_000_000, 57_000_000, 107_000_000]
+
+
+def test_names_that_count_are_no_stamps(folder: Path) -> None:
+    for k, path in enumerate(sorted((folder / "images").iterdir())):
+        path.rename(path.with_name(f"{k:06d}.jpg"))
+    with pytest.raises(DataError, match="stamps with a median step of 1 ns"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".jpg"])
+def test_pictures_of_other_formats(folder: Path, suffix: str) -> None:
+    for path in (folder / "images").iterdir():
+        cv2.imwrite(str(path.with_suffix(suffix)), cv2.imread(str(path)))
+        path.unlink()
+    pixels = [frame.image.pixels for frame in open_source(folder) if frame.image is not None]
+    assert [int(picture.mean()) for picture in pixels] == [0, 10, 20, 30, 40]
+    first = min((folder / "images").iterdir())
+    first.write_bytes(first.read_bytes()[:-20])
+    with pytest.raises(DataError, match=r"truncated|damaged"):
+        open_source(folder)[0]

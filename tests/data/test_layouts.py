@@ -1,0 +1,83 @@
+"""One drive in every layout: the same frames, and from them the same calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes
+from stored import written
+from streets import CROWDED_STREET
+
+from sst_graph import calibrate
+from sst_graph.data import open_source
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.types import Frame, Source
+
+
+def stamped_before(frame: Frame, seconds_ns: int) -> Frame:
+    """The frame, its stamps earlier."""
+    scan, image = frame.scan, frame.image
+    return dataclasses.replace(
+        frame,
+        scan=scan and dataclasses.replace(scan, stamp_ns=scan.stamp_ns - seconds_ns),
+        image=image and dataclasses.replace(image, stamp_ns=image.stamp_ns - seconds_ns),
+    )
+
+
+def assert_same_drive(found: Source, wanted: Source, later_ns: int = 0) -> None:
+    assert [stamped_before(frame, later_ns) for frame in found] == list(wanted)
+    assert found.nominal is not None and wanted.nominal is not None
+    assert found.nominal.equals(wanted.nominal, 1e-10)
+    np.testing.assert_allclose(found.camera.matrix, wanted.camera.matrix, atol=1e-9)
+    assert (found.camera.width, found.camera.height) == (wanted.camera.width, wanted.camera.height)
+
+
+def test_kitti_raw_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_path: Path) -> None:
+    drive = as_kitti_raw(kitti_drive, tmp_path / "raw")
+    for path in (drive, drive.parent, drive.parent.parent):
+        source = open_source(path)
+        assert source.name == "2011_09_26_drive_0005_sync"
+        assert_same_drive(source, open_source(kitti_drive), EPOCH_NS)
+
+
+@pytest.mark.parametrize("cloud", [".bin", ".npz"])
+def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_path: Path, cloud: str) -> None:
+    source = open_source(as_folder(kitti_drive, tmp_path / "street", cloud))
+    assert source.name == "street"
+    assert_same_drive(source, open_source(kitti_drive))
+
+
+def test_nuscenes_brings_the_points_and_pictures_of_kitti_odometry(kitti_drive: Path, tmp_path: Path) -> None:
+    root = as_nuscenes(kitti_drive, tmp_path / "nuscenes")
+    source, wanted = open_source(root, sequence="61"), open_source(kitti_drive)
+    assert (source.name, len(source)) == ("nuscenes/scene-0061", len(wanted))
+    for k, (found, frame) in enumerate(zip(source, wanted, strict=True)):
+        assert found.scan is not None and found.image is not None
+        assert frame.scan is not None and frame.image is not None
+        assert found.scan.stamp_ns - EPOCH_NS == frame.scan.stamp_ns == found.image.stamp_ns - EPOCH_NS
+        np.testing.assert_array_equal(found.scan.points, frame.scan.points)
+        np.testing.assert_array_equal(found.scan.rings, np.arange(12))
+        np.testing.assert_array_equal(found.image.pixels, frame.image.pixels)
+        assert found.scan.has_labels == (k % 2 == 0) and not found.image.has_mask
+        if k % 2 == 0:
+            np.testing.assert_array_equal(found.scan.classes, frame.scan.classes)
+    assert source.nominal is not None and wanted.nominal is not None
+    assert source.nominal.equals(wanted.nominal, 1e-9)
+    assert source.camera == wanted.camera
+
+
+def test_every_layout_gives_the_same_calibration(tmp_path: Path) -> None:
+    """Raw stamps count from 1970: nine digits more than those of the odometry layout."""
+    odometry = written(CROWDED_STREET) / "sequences" / "00"
+    wanted_source = open_source(odometry)
+    wanted = calibrate(KeptDrive.of(wanted_source), wanted_source.nominal)
+    assert wanted.status == "ok"
+    for folder in (as_kitti_raw(odometry, tmp_path / "raw"), as_folder(odometry, tmp_path / "folder")):
+        source = open_source(folder)
+        result = calibrate(source, source.nominal)
+        step = gtsam.Pose3.Logmap(wanted.T_camera_lidar.between(result.T_camera_lidar))
+        assert np.abs(step).max() < 1e-6 and abs(result.time_offset_s - wanted.time_offset_s) < 1e-6

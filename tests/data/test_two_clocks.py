@@ -1,0 +1,149 @@
+"""A camera and a LiDAR at rates of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from stored import simulated
+from streets import CROWDED_STREET
+
+from sst_graph import calibrate
+from sst_graph.data import SourceOptions, open_source
+from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.result import CalibrationResult
+from sst_graph.simulator import SimulatedDrive
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan
+
+PROPERTIES = DriveProperties("two", simulated(CROWDED_STREET).camera)
+
+
+def scans_of(stamps: list[int]) -> Sensor[Scan]:
+    return Sensor(
+        np.array(stamps, np.int64),
+        lambda k: Scan(stamps[k], np.full((1, 3), k, np.float32), np.zeros(1, np.uint8)),
+    )
+
+
+def images_of(stamps: list[int]) -> Sensor[CameraImage]:
+    """Image k has the instances k, so that it is known again under another stamp."""
+    return Sensor(
+        np.array(stamps, np.int64),
+        lambda k: CameraImage(
+            stamps[k], np.zeros((1, 1), np.uint8), NO_PICTURE, np.full((1, 1), k, np.uint16)
+        ),
+    )
+
+
+def stamps_of(frame: Frame) -> tuple[int | None, int | None]:
+    return frame.scan and frame.scan.stamp_ns, frame.image and frame.image.stamp_ns
+
+
+def test_frames_come_in_the_order_of_stamps_and_equal_stamps_share_one() -> None:
+    source = merged(PROPERTIES, scans_of([10, 40]), images_of([0, 10, 20]), SourceOptions(), Path("d"))
+    assert [stamps_of(frame) for frame in source] == [(None, 0), (10, 10), (None, 20), (40, None)]
+    assert [frame.index for frame in source] == [0, 1, 2, 3]
+    part = source[1:3]
+    assert isinstance(part, TwoClockSource)
+    assert ([frame.index for frame in part], part.frame_number(1)) == ([1, 2], 2)
+    assert part.read_scan(1) is None and part.read_image(1) is not None
+
+
+def test_frames_are_chosen_in_the_order_of_stamps() -> None:
+    options = SourceOptions(frames=slice(1, 4))
+    source = merged(PROPERTIES, scans_of([10, 40]), images_of([0, 10, 20]), options, Path("d"))
+    assert [frame.index for frame in source] == [1, 2, 3]
+    for frames, found in ((slice(0, 5), "0:4"), (slice(2, 3), "no scan"), (slice(3, 4), "no image")):
+        with pytest.raises(ConfigError, match=found):
+            merged(
+                PROPERTIES,
+                scans_of([10, 40]),
+                images_of([0, 10, 20]),
+                SourceOptions(frames=frames),
+                Path("d"),
+            )
+
+
+@pytest.mark.parametrize(("shift", "shown"), [(1, [1, 2]), (-1, [0, 1])])
+def test_shifted_images_take_the_stamps_of_others(shift: int, shown: list[int]) -> None:
+    options = SourceOptions(image_shift=shift)
+    source = merged(PROPERTIES, scans_of([0, 10, 20]), images_of([0, 10, 20]), options, Path("d"))
+    images = [frame.image for frame in source if frame.image is not None]
+    stamps = [0, 10] if shift > 0 else [10, 20]
+    assert [image.stamp_ns for image in images] == stamps
+    assert [int(image.instances[0, 0]) for image in images if image.instances is not None] == shown
+
+
+@pytest.mark.parametrize(
+    ("scans", "images", "found"),
+    [
+        ([], [0], "no scan"),
+        ([0], [], "no image"),
+        ([0, 20, 10], [0], r"\(scans\): found falling stamps 1 and 2"),
+        ([0], [5, 5], r"\(images\): found equal stamps 0 and 1"),
+    ],
+)
+def test_a_sensor_without_data_or_with_stamps_that_do_not_rise(
+    scans: list[int], images: list[int], found: str
+) -> None:
+    with pytest.raises(DataError, match=found):
+        merged(PROPERTIES, scans_of(scans), images_of(images), SourceOptions(), Path("d"))
+
+
+def test_kitti_odometry_with_image_stamps_of_its_own(kitti_drive: Path) -> None:
+    (kitti_drive / "times_2.txt").write_text("".join(f"{t}\n" for t in (0.05, 0.15, 0.2, 0.36, 0.46)))
+    (kitti_drive / "velodyne/000001.bin").unlink()
+    source = open_source(kitti_drive)
+    stamps = [stamps_of(frame) for frame in source]
+    ms = 10**6
+    assert stamps[:4] == [(0, None), (None, 50 * ms), (None, 150 * ms), (200 * ms, 200 * ms)]
+    third = source[3]
+    assert third.scan is not None and third.image is not None
+    assert (third.image.pixels == 20).all()
+    plain = open_source(kitti_drive, frames="3:4")
+    assert plain[0].image is not None
+    (kitti_drive / "times_2.txt").write_text("0.1\n0.2\n")
+    with pytest.raises(DataError, match=r"times_2\.txt: found 2 stamps, expected 5, as there are images"):
+        open_source(kitti_drive)
+
+
+# --- calibration ------------------------------------------------------------------------------------------
+
+FAST_STREET = dataclasses.replace(CROWDED_STREET, frames=75, frame_rate_hz=30.0)
+DROPPED_IMAGES, DROPPED_SCAN = (7, 23, 24, 41), 4
+
+
+def street(drive: SimulatedDrive, every_image: bool) -> TwoClockSource:
+    """A LiDAR at 10 Hz that starts late and drops a scan; a camera at 30 Hz with drops, or at 10 Hz."""
+    scans = [k for k in range(1, len(drive), 3) if k != 1 and k != 1 + 3 * DROPPED_SCAN]
+    images = [k for k in range(len(drive)) if k not in DROPPED_IMAGES and (every_image or k % 3 == 1)]
+    stamps = drive.stamps_ns
+    properties = DriveProperties("street", drive.camera, drive.nominal, drive.truth)
+    return merged(
+        properties,
+        Sensor(stamps[scans], lambda k: drive.scan(scans[k])),
+        Sensor(stamps[images], lambda k: drive.image(images[k])),
+        SourceOptions(sweep="compensated"),
+        Path("street"),
+    )
+
+
+def errors(result: CalibrationResult, drive: SimulatedDrive) -> tuple[float, float, float]:
+    """Rotation [deg], translation [m], time offset [s]."""
+    step = np.asarray(gtsam.Pose3.Logmap(drive.truth.cTl.between(result.T_camera_lidar)))
+    offset_s = result.time_offset_s - drive.config.time_offset_s
+    return float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:])), abs(offset_s)
+
+
+def test_a_camera_of_30_hz_is_no_worse_than_one_of_10_hz() -> None:
+    drive = simulated(FAST_STREET)
+    slow, fast = (calibrate(street(drive, every), drive.nominal) for every in (False, True))
+    assert slow.status == fast.status == "ok"
+    for of_fast, of_slow, least in zip(
+        errors(fast, drive), errors(slow, drive), (0.03, 0.005, 5e-4), strict=True
+    ):
+        assert of_fast <= max(of_slow, least)
