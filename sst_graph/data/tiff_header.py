@@ -25,7 +25,7 @@ _MAX_VALUES = 1_000_000
 class _Directory:
     """Entries of the first directory: values of SHORT and LONG ones by tag."""
 
-    path: Path
+    path: str | Path
     entries: dict[int, tuple[int, ...]]
 
     def one(self, tag: int, what: str, default: int | None = None) -> int:
@@ -35,7 +35,7 @@ class _Directory:
         return values[0]
 
 
-def tiff_size(data: bytes, path: Path) -> tuple[int, int]:
+def tiff_size(data: bytes, path: str | Path) -> tuple[int, int]:
     """Width and height [px] that a TIFF file declares.
 
     Raises:
@@ -49,7 +49,7 @@ def tiff_size(data: bytes, path: Path) -> tuple[int, int]:
     return directory.one(_WIDTH, "width"), directory.one(_HEIGHT, "height")
 
 
-def check_tiff_whole(data: bytes, path: Path) -> None:
+def check_tiff_whole(data: bytes, path: str | Path) -> None:
     """Require that all strips or tiles lie within the file.
 
     Raises:
@@ -64,7 +64,7 @@ def check_tiff_whole(data: bytes, path: Path) -> None:
         raise DataError(path, f"a TIFF file truncated at byte {len(data)}", "all strips of its pixels")
 
 
-def _directory(data: bytes, path: Path) -> _Directory:
+def _directory(data: bytes, path: str | Path) -> _Directory:
     order = "<" if data.startswith(b"II") else ">"
     try:
         (at,) = struct.unpack_from(f"{order}I", data, 4)

@@ -117,6 +117,16 @@ class TwoClockSource:
         """The instant that a scan's stamp names where times follow from azimuths."""
         return self.properties.sweep_stamp
 
+    @property
+    def scan_positions(self) -> list[int]:
+        """Positions of the frames that have a scan."""
+        return [k for k, index in enumerate(self.indices) if self.places[index].scan is not None]
+
+    @property
+    def image_positions(self) -> list[int]:
+        """Positions of the frames that have an image."""
+        return [k for k, index in enumerate(self.indices) if self.places[index].image is not None]
+
     def __len__(self) -> int:
         return len(self.indices)
 
