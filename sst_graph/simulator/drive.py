@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.simulator.camera.render import Look, View, developed, shade
+from sst_graph.simulator.camera.segmentation import noisy_mask, noisy_points
+from sst_graph.simulator.camera.textures import Atlas, detail_atlas, material_atlas, sky_panorama
 from sst_graph.simulator.casting import cast_image
 from sst_graph.simulator.config import SimulationConfig
 from sst_graph.simulator.lidar import Lidar, make_lidar
-from sst_graph.simulator.render import Look, View, developed, shade
-from sst_graph.simulator.segmentation import noisy_mask, noisy_points
 from sst_graph.simulator.street import Street, build_street, is_instance
 from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
-from sst_graph.simulator.textures import Atlas, detail_atlas, material_atlas, sky_panorama
 from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan
 
 VIEW_RANGE_M = 140.0

@@ -15,7 +15,7 @@ from sst_graph.cameras import BrownConradyCamera, CameraModel, FisheyeCamera, Re
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate
-from sst_graph.simulator.lens import LensDrive
+from sst_graph.simulator.camera.lens import LensDrive
 from sst_graph.types import SemanticClass, Source
 
 STREET = SimulationConfig(

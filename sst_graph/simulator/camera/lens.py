@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from sst_graph.cameras import CameraModel
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.simulator.camera.render import developed
+from sst_graph.simulator.camera.segmentation import noisy_mask
 from sst_graph.simulator.drive import SimulatedDrive
-from sst_graph.simulator.render import developed
-from sst_graph.simulator.segmentation import noisy_mask
 from sst_graph.simulator.surfaces import SEMANTIC_CLASS, Kind
 from sst_graph.types import CameraImage, FloatArray, Frame, GroundTruth, Scan, SemanticClass
 

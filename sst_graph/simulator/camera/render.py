@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.simulator.camera.textures import LEVELS, TILE, Atlas
 from sst_graph.simulator.casting import IndexArray, compact
 from sst_graph.simulator.mesh import Mesh, normals_of
 from sst_graph.simulator.surfaces import DETAIL, TILE_M, Material
-from sst_graph.simulator.textures import LEVELS, TILE, Atlas
 from sst_graph.types import FloatArray
 
 DETAIL_TILE_M = 2.5
