@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any, cast, overload
 
 import gtsam
 
@@ -47,8 +47,15 @@ class RectifiedSource:
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, position: int) -> Frame:
-        """Frame at a position; IndexError as the source's own."""
+    @overload
+    def __getitem__(self, position: int) -> Frame: ...
+    @overload
+    def __getitem__(self, position: slice) -> RectifiedSource: ...
+    def __getitem__(self, position: int | slice) -> Frame | RectifiedSource:
+        """Frame at a position, or the drive restricted to a slice; errors as the source's own."""
+        if isinstance(position, slice):
+            part = cast("Source", self.source[position])  # type: ignore[index]
+            return RectifiedSource(part, self.rectification)
         return self._rectified(self.source[position])
 
     def __iter__(self) -> Iterator[Frame]:

@@ -13,6 +13,7 @@ from stored import written
 from streets import CROWDED_STREET
 
 from sst_graph import calibrate
+from sst_graph.cameras import BrownConradyCamera, Rectification
 from sst_graph.data import open_source
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.types import Frame, Source
@@ -49,6 +50,20 @@ def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_pat
     source = open_source(as_folder(kitti_drive, tmp_path / "street", cloud))
     assert source.name == "street"
     assert_same_drive(source, open_source(kitti_drive))
+
+
+def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
+    folder = as_folder(written(CROWDED_STREET) / "sequences" / "00", tmp_path / "street")
+    plain = open_source(folder)
+    text = (folder / "camera.yaml").read_text()
+    (folder / "camera.yaml").write_text(text + "distortion_model: plumb_bob\ndistortion: [-0.1, 0, 0, 0]\n")
+    drive = open_source(folder)
+    model = BrownConradyCamera(plain.camera, (-0.1, 0.0, 0.0, 0.0))
+    rectification = Rectification.of(model)
+    assert drive.camera == rectification.camera and len(drive) == len(plain)
+    for found, raw in zip(drive[1:3], plain[1:3], strict=True):  # type: ignore[misc]
+        assert found.image == rectification.image(raw.image) and found.scan == raw.scan
+        assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
 
 
 def test_nuscenes_brings_the_points_and_pictures_of_kitti_odometry(kitti_drive: Path, tmp_path: Path) -> None:

@@ -19,8 +19,9 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from sst_graph.cameras.model import CameraModel
+from sst_graph.cameras.readers import camera_of
 from sst_graph.data.folder.yaml_file import number, numbers, read_yaml
-from sst_graph.data.undistorted import require_rectified
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_camera, checked_pose
@@ -30,11 +31,11 @@ _ROUNDED = 1e-3
 """A quaternion's length differs from 1 by no more than its digits were rounded."""
 
 
-def read_camera(path: Path) -> PinholeCamera:
-    """Intrinsics of a camera.
+def read_camera(path: Path) -> CameraModel:
+    """Intrinsics and distortion of a camera.
 
     Raises:
-        DataError: a file that holds none, a lens that distorts, intrinsics that are none.
+        DataError: a file that holds none, an unknown distortion, intrinsics that are none.
         MissingDependencyError: PyYAML is not installed.
     """
     table = read_yaml(path)
@@ -55,10 +56,11 @@ def read_camera(path: Path) -> PinholeCamera:
         coefficients = table.get("distortion_coefficients", table.get("D", []))
     else:
         raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
-    require_rectified(str(model), numbers(coefficients or [], f"{path} (distortion)"), path)
+    distortion = numbers(coefficients or [], f"{path} (distortion)")
     width, height = (_whole(side, path) for side in size)
     fx, fy, cx, cy = values
-    return checked_camera(PinholeCamera(fx, fy, cx, cy, width, height), path)
+    intrinsics = checked_camera(PinholeCamera(fx, fy, cx, cy, width, height), path)
+    return camera_of(intrinsics, str(model), distortion, path)
 
 
 def read_extrinsic(path: Path) -> gtsam.Pose3:

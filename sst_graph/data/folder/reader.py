@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras.rectification import Rectification
+from sst_graph.cameras.source import RectifiedSource
 from sst_graph.classes import classes_of_points
 from sst_graph.data.arrays import listed
 from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
@@ -22,10 +24,10 @@ from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.point_files import SUFFIXES, Cloud, read_cloud
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
-from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, Scan
+from sst_graph.types import CameraImage, Scan, Source
 
 _LOG = logging.getLogger(__name__)
 
@@ -93,8 +95,8 @@ class CloudFiles:
         return point_labels(path, used)
 
 
-def open_folder(path: Path, options: SourceOptions) -> TwoClockSource:
-    """Open a drive in a folder.
+def open_folder(path: Path, options: SourceOptions) -> Source:
+    """Open a drive in a folder; images of a lens that distorts are rectified as they are read.
 
     Raises:
         DataError: a folder or file is missing or damaged, a name that is no stamp, stamps that do not rise.
@@ -107,10 +109,10 @@ def open_folder(path: Path, options: SourceOptions) -> TwoClockSource:
     for what, files in ((_IMAGES, images), (_CLOUDS, clouds)):
         if files.without_stamp:
             _LOG.warning("%s: %d %s without a stamp left out", printable(path), files.without_stamp, what)
-    camera = read_camera(path / _CAMERA)
+    model = read_camera(path / _CAMERA)
     extrinsic = path / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None
-    size = (camera.width, camera.height)
+    size = (model.width, model.height)
     masks = _beside(images, path / "masks", (".png",))
     encoding = mask_encoding(masks, options.label_encoding, size)
     pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
@@ -124,9 +126,10 @@ def open_folder(path: Path, options: SourceOptions) -> TwoClockSource:
     def image(k: int) -> CameraImage:
         return pictures.image(k, int(images.stamps_ns[k]))
 
-    properties = DriveProperties(printable(path.resolve().name), camera, nominal)
+    properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
     of_scans, of_images = Sensor(clouds.stamps_ns, scans.scan), Sensor(images.stamps_ns, image)
-    return merged(properties, of_scans, of_images, options, path)
+    drive = merged(properties, of_scans, of_images, options, path)
+    return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
 
 def _check_options(path: Path, options: SourceOptions) -> None:
