@@ -8,6 +8,8 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from sst_graph.cameras import CameraModel
+from sst_graph.cameras.readers import camera_of
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import FloatArray
@@ -17,27 +19,29 @@ Size = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class CameraModel:
+class ImageGeometry:
     """What the images are projected by.
 
     Attributes:
         camera: intrinsics.
+        lens: with its distortion, where the images have any.
         cRo: rotation of the camera's optical frame into that of the images; not the identity where these
             are rectified for a stereo pair.
     """
 
     camera: PinholeCamera
+    lens: CameraModel | None
     cRo: gtsam.Rot3
 
 
-def camera_model(message: Any, image_topic: str, size: Size, place: str) -> CameraModel:
-    """Model of images of ``size`` by their CameraInfo.
+def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> ImageGeometry:
+    """Geometry of images of ``size`` by their CameraInfo.
 
     Images of a topic with "rect" in its name, as image_proc writes them, have the intrinsics of P and the
     rotation R; all others have those of K and the distortion D.
 
     Raises:
-        DataError: no calibration, one of another size, or images that are distorted.
+        DataError: no calibration, one of another size, or an unknown distortion.
     """
     K, D, R, P = (np.asarray(_field(message, name), np.float64) for name in ("K", "D", "R", "P"))
     _check_size(message, size, place)
@@ -45,17 +49,12 @@ def camera_model(message: Any, image_topic: str, size: Size, place: str) -> Came
     matrix = P.reshape(3, 4)[:, :3] if rectified else K.reshape(3, 3)
     if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0 and np.isfinite(matrix).all()):
         raise DataError(place, f"{'P' if rectified else 'K'} without a focal length", "a calibrated camera")
-    if not rectified:
-        _check_undistorted(D, str(message.distortion_model), place)
     camera = PinholeCamera(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *size)
-    return CameraModel(camera, _rotation(R.reshape(3, 3)) if rectified else gtsam.Rot3())
-
-
-def _check_undistorted(D: FloatArray, model: str, place: str) -> None:
-    if D.any():
-        found = f"distortion {model} with D = {np.array2string(D, precision=4, separator=', ')}"
-        expected = "rectified images (image_proc writes them as image_rect; name that topic by --image-topic)"
-        raise DataError(place, found, expected)
+    if rectified:
+        return ImageGeometry(camera, None, _rotation(R.reshape(3, 3)))
+    # Drivers without a calibrated lens leave D empty or at zero.
+    lens = camera_of(camera, str(message.distortion_model), D, place) if D.any() else None
+    return ImageGeometry(camera, lens, gtsam.Rot3())
 
 
 def _check_size(message: Any, size: Size, place: str) -> None:

@@ -13,10 +13,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras import Rectification, RectifiedSource
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.ros.bag import Bag
-from sst_graph.data.ros.camera_info import CameraModel, camera_model
+from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
 from sst_graph.data.ros.clouds import Cloud, cloud_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
@@ -26,7 +27,7 @@ from sst_graph.data.source import TURNS, Loader, SourceOptions, Sweep
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class RosDrive:
     bag: Bag
     topics: Topics
     index: BagIndex
-    model: CameraModel
+    model: ImageGeometry
     nominal: gtsam.Pose3 | None
     nominal_reason: str
     encoding: MaskEncoding | None
@@ -220,8 +221,10 @@ def is_ros(path: Path) -> bool:
     return path.suffix in _SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
 
-def open_ros(path: Path, options: SourceOptions) -> RosSource:
+def open_ros(path: Path, options: SourceOptions) -> Source:
     """Open a bag: every message of its topics is read once for its stamp.
+
+    Images of a lens that distorts are rectified as they are read.
 
     Raises:
         DataError: no bag, a damaged one, or no topics that fit; no calibrated camera; stamps that are zero or
@@ -240,7 +243,7 @@ def open_ros(path: Path, options: SourceOptions) -> RosSource:
     if first >= len(frames) or last > len(frames):
         raise ConfigError(f"frames {first}:{last}: the drive has frames 0:{len(frames)}, of one sensor each")
     size = _size(bag, topics, index)
-    model = camera_model(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
+    model = image_geometry(index.info, topics.image.name, size, f"{path}, {topics.info.name}")
     oTl, reason = index.transforms.pose(index.image_frame, index.cloud_frame)
     nominal = None if oTl is None else gtsam.Pose3(model.cRo, np.zeros(3)) * oTl
     drive = RosDrive(
@@ -255,9 +258,9 @@ def open_ros(path: Path, options: SourceOptions) -> RosSource:
     )
     if nominal is None:
         _LOG.info("%s: no nominal extrinsic: %s", printable(path), reason)
-    return RosSource(printable(path.stem if path.is_file() else path.name), drive, frames, 0, options)[
-        first:last
-    ]
+    name = printable(path.stem if path.is_file() else path.name)
+    source = RosSource(name, drive, frames, 0, options)[first:last]
+    return source if model.lens is None else RectifiedSource(source, Rectification.of(model.lens))
 
 
 def _frames(index: BagIndex) -> tuple[FramePlaces, ...]:

@@ -13,7 +13,8 @@ pytest.importorskip("rosbags")
 
 from bags import CAMERA_FRAME, EPOCH_NS, LIDAR_FRAME, Messages, chain
 
-from sst_graph.data.ros.camera_info import camera_model
+from sst_graph.cameras import BrownConradyCamera
+from sst_graph.data.ros.camera_info import image_geometry
 from sst_graph.data.ros.clouds import Cloud, cloud_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.topics import COMPRESSED, IMAGE
@@ -198,26 +199,27 @@ def test_intrinsics_of_raw_and_rectified_images() -> None:
     P = np.array([[650.0, 0, 300, -325], [0, 651, 170, 0], [0, 0, 1, 0]])
     R = gtsam.Rot3.Ypr(0.01, -0.02, 0.005)
     info = MAKE.info(CAMERA, p=P.ravel(), r=R.matrix().ravel())
-    raw = camera_model(info, "/cam/image_raw", (640, 360), "here")
+    raw = image_geometry(info, "/cam/image_raw", (640, 360), "here")
     assert raw.camera == CAMERA and raw.cRo.equals(gtsam.Rot3(), 1e-12)
-    rectified = camera_model(info, "/cam/image_rect_color", (640, 360), "here")
+    rectified = image_geometry(info, "/cam/image_rect_color", (640, 360), "here")
     assert rectified.camera == PinholeCamera(650.0, 651.0, 300.0, 170.0, 640, 360)
     assert rectified.cRo.equals(R, 1e-9)
     ros1 = Messages(ros1=True).info(CAMERA)
-    assert camera_model(ros1, "/cam/image_raw", (640, 360), "here").camera == CAMERA
+    assert image_geometry(ros1, "/cam/image_raw", (640, 360), "here").camera == CAMERA
 
 
 def test_cameras_that_cannot_be_used() -> None:
     distorted = MAKE.info(CAMERA, d=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
-    with pytest.raises(DataError, match=r"plumb_bob with D = \[-0.3.*expected rectified images"):
-        camera_model(distorted, "/cam/image_raw", (640, 360), "here")
-    assert camera_model(distorted, "/cam/image_rect", (640, 360), "here").camera == CAMERA
+    lens = image_geometry(distorted, "/cam/image_raw", (640, 360), "here").lens
+    assert lens == BrownConradyCamera(CAMERA, (-0.3, 0.1, 0.0, 0.0, 0.0))
+    rectified = image_geometry(distorted, "/cam/image_rect", (640, 360), "here")
+    assert rectified.camera == CAMERA and rectified.lens is None
     with pytest.raises(DataError, match="640x360 px, expected 320x180 px"):
-        camera_model(MAKE.info(CAMERA), "/cam/image_raw", (320, 180), "here")
+        image_geometry(MAKE.info(CAMERA), "/cam/image_raw", (320, 180), "here")
     with pytest.raises(DataError, match="K without a focal length"):
-        camera_model(MAKE.info(CAMERA, k=np.zeros(9)), "/cam/image_raw", (640, 360), "here")
+        image_geometry(MAKE.info(CAMERA, k=np.zeros(9)), "/cam/image_raw", (640, 360), "here")
     with pytest.raises(DataError, match="binning"):
-        camera_model(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
+        image_geometry(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
 
 
 CTL = gtsam.Pose3(gtsam.Rot3.Ypr(0.3, -0.2, 1.0), np.array([0.1, -0.3, 0.2]))
