@@ -380,6 +380,6 @@ def image_features(
 ) -> ImageFeatures:
     """Mask and contours of an image; ``use_picture``: the contours follow its picture."""
     picture = image.pixels if use_picture else None
-    fields = {c: ContourMap.of(image.mask, c, picture) for c in classes}
+    fields = {c: ContourMap.of(image.mask, c, picture, valid=image.valid) for c in classes}
     contours = {c: field for c, field in fields.items() if field is not None}
     return ImageFeatures(index, image.stamp_ns, image.mask, contours)

@@ -101,7 +101,7 @@ def find_picture_edges(
     inside: NDArray[np.uint8],
     distance: FloatMap,
     picture: Picture,
-    unknown: NDArray[np.uint8] | None = None,
+    outside: NDArray[np.uint8] | None = None,
 ) -> PictureEdges:
     """What the picture shows along the contours of a region.
 
@@ -109,7 +109,7 @@ def find_picture_edges(
         inside: (h, w) 1 in the region, 0 elsewhere.
         distance: (h, w) signed distance to its contour, negative inside, lightly smoothed [px].
         picture: (h, w, 3) BGR.
-        unknown: (h, w) 1 where a contour is not the object's: it is not moved there.
+        outside: (h, w) 1 beside pixels that the lens does not show: a contour is not moved there.
     """
     along = _ALONG_PX // _EVERY
     pixels, own = _closed(contour_pixels(inside), 3 * along)
@@ -124,8 +124,8 @@ def find_picture_edges(
     # At the image's border the object is cut: no edge of its own.
     cut = (pixels == 0).any(axis=1) | (pixels == np.array(inside.shape[::-1]) - 1).any(axis=1)
     foreign = np.zeros(len(pixels), np.bool_)
-    if unknown is not None:
-        foreign = unknown[pixels[:, 1], pixels[:, 0]] > 0
+    if outside is not None:
+        foreign = outside[pixels[:, 1], pixels[:, 0]] > 0
         cut |= foreign
     whole = own[~cut[own]]
     usual = np.median(strongest[whole]) if len(whole) else 0.0

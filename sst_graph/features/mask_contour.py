@@ -46,6 +46,10 @@ class ContourFeet:
     valid: NDArray[np.bool_]
 
 
+_BESIDE = np.ones((5, 5), np.uint8)
+"""Pixels beside one: a contour within two pixels of one that is unknown is no object's."""
+
+
 @storable("distance", "unknown")
 @dataclass(frozen=True)
 class ContourMap:
@@ -76,12 +80,15 @@ class ContourMap:
         semantic_class: SemanticClass,
         picture: Picture | None = None,
         edges: PictureEdges | None = None,
+        valid: NDArray[np.bool_] | None = None,
     ) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image.
 
         Args:
             picture: (h, w, 3) BGR that the contour follows; by default, or where it has another size, none.
             edges: what was found in the picture before, instead of the picture.
+            valid: (h, w) whether the lens shows anything there; beside pixels where it does not, the contour
+                does not follow the picture. None: everywhere.
         """
         # Compared with a plain int: compared with an enum, all pixels are converted to int64.
         inside = (mask == int(semantic_class)).view(np.uint8)
@@ -94,9 +101,10 @@ class ContourMap:
         box = np.ascontiguousarray(inside[part])
         distance = np.asarray(cv2.GaussianBlur(signed_distance(box), (0, 0), _SMOOTHING_PX), np.float32)
         ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
-        unknown = np.asarray(cv2.dilate(ignored, np.ones((5, 5), np.uint8)), np.uint8)
+        unknown = np.asarray(cv2.dilate(ignored, _BESIDE), np.uint8)
         if edges is None and picture is not None and picture.shape[:2] == mask.shape:
-            edges = find_picture_edges(box, distance, picture[part], unknown)
+            outside = None if valid is None else cv2.dilate((~valid[part]).view(np.uint8), _BESIDE)
+            edges = find_picture_edges(box, distance, picture[part], outside)
         if edges is not None:
             shifts, unseen = edges.fields(box)
             distance -= shifts

@@ -81,7 +81,9 @@ def draw_overlay(
     uvs, classes = _projected(scan, image, camera, cTl, offset_s, c_twist)
     zoom = -(-MIN_WIDTH_PX // camera.width)
     picture = _enlarged(_backdrop(image), zoom)
-    _draw_contours(picture, ContourMap.of(image.mask, SemanticClass.VEHICLE, image.pixels), zoom)
+    _draw_contours(
+        picture, ContourMap.of(image.mask, SemanticClass.VEHICLE, image.pixels, valid=image.valid), zoom
+    )
     mask_class = _at(image.mask, uvs)[classes == SemanticClass.VEHICLE]
     uvs = (uvs + 0.5) * zoom - 0.5
     _draw_classes(picture, uvs, classes)

@@ -166,7 +166,7 @@ def test_the_border_of_the_valid_region_is_no_contour() -> None:
     pixels[mask == VEHICLE] = 220
     # A bright line that ends three pixels before the cut, as a window or a fold has.
     pixels[40:80, 117:] = 20
-    contour = ContourMap.of(mask, SemanticClass.VEHICLE, pixels)
+    contour = ContourMap.of(mask, SemanticClass.VEHICLE, pixels, valid=mask != IGNORE)
     assert contour is not None
     rows = np.arange(48.0, 73.0)
     for column in np.arange(114.0, 127.0, 0.5):

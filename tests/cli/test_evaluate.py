@@ -127,7 +127,6 @@ def test_overlay_replaces_only_with_overwrite(
     ("options", "message"),
     [
         (["--frame", "9"], "kitti/00: found no frame 9, expected one of its 5 frames"),
-        (["--image-shift", "2", "--frame", "4"], "frame 4: found no image"),
         (["--out", "picture.jpg"], "expected a name that ends in .png"),
         (["--before", "nothing.json"], "nothing.json: found no such file"),
         (["--frame", "x"], "argument --frame: invalid int value: 'x'"),

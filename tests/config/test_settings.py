@@ -223,7 +223,7 @@ def test_rules_between_settings(settings: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("joint.max_outer=0", "'joint.max_outer' is not a setting any more: sst_graph.graph.outer_loop."),
+        ("joint.max_outer=0", "'joint.max_outer' is not a setting: sst_graph.graph.outer_loop."),
         ("noise.lower_edges=[vehicle]", "unknown setting 'noise.lower_edges'"),
         ("noise.estimate=[focal]", "unknown setting 'noise.estimate'"),
         ("search.seed=1", "unknown setting 'search.seed'; did you mean 'seed'?"),

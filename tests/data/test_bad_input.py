@@ -185,8 +185,8 @@ def test_paths_without_a_drive_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     (tmp_path / "empty").mkdir()
     for path, message in [
-        (tmp_path / "absent", "found no folder"),
-        (tmp_path / "file", "found a file, expected the folder of a drive"),
+        (tmp_path / "absent", "found no file or folder"),
+        (tmp_path / "file", "found no layout that is known, expected KITTI odometry"),
         (tmp_path / "empty", "found no layout that is known, expected KITTI odometry"),
         (tmp_path, "sequences: found an empty folder"),
     ]:

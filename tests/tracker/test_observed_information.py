@@ -29,8 +29,8 @@ def tracker() -> Tracker:
         )
     )
     default = TrackerConfig(start_scans=8, window=10)
-    start = dataclasses.replace(default.calibration.start, enabled=False)
-    calibration = dataclasses.replace(default.calibration, start=start)
+    search = dataclasses.replace(default.calibration.search, enabled=False)
+    calibration = dataclasses.replace(default.calibration, search=search)
     tracker = Tracker(
         street.camera, dataclasses.replace(default, calibration=calibration), street.truth.cTl, 0.05
     )

@@ -33,7 +33,7 @@ def test_the_estimate_comes_some_frames_later_and_is_the_same(
         a, b = at_once.add(frame), spread.add(frame)
         assert not a.refused and not b.refused
         if not spread.estimate.exists:
-            assert b.reason in ("collecting frames for a start", "looking for a start")
+            assert b.reason in ("collecting frames for a start", "searching for a start")
     assert at_once.estimate.exists and spread.estimate.exists
     assert len(spread.inputs.window.scans) == len(frames) == spread.inputs.window.next_scan
     for tracker in (at_once, spread):

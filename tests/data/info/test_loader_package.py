@@ -51,7 +51,7 @@ def test_the_example_package(
     out = capsys.readouterr().out
     assert "street: 3 frames" in out and "80x60 px, fx 300.00" in out
     assert main(["info", str(drive), "--loader", "none"]) == 2
-    assert "expected one of auto, kitti, ros" in capsys.readouterr().err
+    assert "expected one of auto, kitti, kitti-raw, folder, nuscenes, ros, npz" in capsys.readouterr().err
 
 
 def test_an_entry_point_that_fails_says_which(
