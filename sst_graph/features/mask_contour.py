@@ -103,7 +103,9 @@ class ContourMap:
         ignored = (mask[part] == int(SemanticClass.IGNORE)).view(np.uint8)
         unknown = np.asarray(cv2.dilate(ignored, _BESIDE), np.uint8)
         if edges is None and picture is not None and picture.shape[:2] == mask.shape:
-            outside = None if valid is None else cv2.dilate((~valid[part]).view(np.uint8), _BESIDE)
+            outside = None
+            if valid is not None:
+                outside = np.asarray(cv2.dilate((~valid[part]).view(np.uint8), _BESIDE), np.uint8)
             edges = find_picture_edges(box, distance, picture[part], outside)
         if edges is not None:
             shifts, unseen = edges.fields(box)
