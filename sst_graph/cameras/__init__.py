@@ -7,7 +7,6 @@ from sst_graph.cameras.double_sphere import DoubleSphereCamera
 from sst_graph.cameras.fisheye import FisheyeCamera
 from sst_graph.cameras.model import CameraModel
 from sst_graph.cameras.rectification import Rectification, rectified_camera
-from sst_graph.cameras.source import RectifiedSource
 
 __all__ = [
     "BrownConradyCamera",
@@ -15,6 +14,5 @@ __all__ = [
     "DoubleSphereCamera",
     "FisheyeCamera",
     "Rectification",
-    "RectifiedSource",
     "rectified_camera",
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Generic, TypeVar, overload
 
@@ -117,12 +118,12 @@ class TwoClockSource:
         """The instant that a scan's stamp names where times follow from azimuths."""
         return self.properties.sweep_stamp
 
-    @property
+    @cached_property
     def scan_positions(self) -> list[int]:
         """Positions of the frames that have a scan."""
         return [k for k, index in enumerate(self.indices) if self.places[index].scan is not None]
 
-    @property
+    @cached_property
     def image_positions(self) -> list[int]:
         """Positions of the frames that have an image."""
         return [k for k, index in enumerate(self.indices) if self.places[index].image is not None]

@@ -20,9 +20,10 @@ from sst_graph.cameras.readers import (
     cameras_from_kalibr,
     kitti_rectifying_rotation,
 )
-from sst_graph.cameras.tables import parse_camera_yaml, parse_kitti_raw, read_camera_yaml, read_kitti_raw
+from sst_graph.cameras.tables import parse_kitti_raw, read_kitti_raw
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.files.yaml_file import parse_yaml, read_yaml
 
 INTRINSICS = PinholeCamera(700.0, 710.0, 640.0, 360.0, 1280, 720)
 K = INTRINSICS.matrix
@@ -136,7 +137,7 @@ cam2:
 
 def test_a_kalibr_chain(tmp_path: Path) -> None:
     (tmp_path / "camchain.yaml").write_text(CAMCHAIN)
-    cameras = cameras_from_kalibr(read_camera_yaml(tmp_path / "camchain.yaml"))
+    cameras = cameras_from_kalibr(read_yaml(tmp_path / "camchain.yaml"))
     assert list(cameras) == ["cam0", "cam1", "cam2"]
     assert cameras["cam0"].model == BrownConradyCamera(INTRINSICS, PLUMB_BOB[:4])
     assert cameras["cam1"].model == FisheyeCamera(INTRINSICS, (0.01, 0.02, 0.0, 0.0))
@@ -168,7 +169,7 @@ def test_a_kalibr_chain(tmp_path: Path) -> None:
 def test_kalibr_chains_that_cannot_be_used(old: str, new: str, message: str) -> None:
     assert old in CAMCHAIN
     with pytest.raises(DataError, match=message):
-        cameras_from_kalibr(parse_camera_yaml(CAMCHAIN.replace(old, new), "camchain"))
+        cameras_from_kalibr(parse_yaml(CAMCHAIN.replace(old, new), "camchain"))
     with pytest.raises(DataError, match="found the keys image_width, expected cam0"):
         cameras_from_kalibr({"image_width": 3})
 
@@ -185,7 +186,7 @@ def test_what_opencv_wrote(tmp_path: Path, fisheye: bool) -> None:
     storage.write("camera_matrix", K)
     storage.write("distortion_coefficients", np.array(D).reshape(-1, 1))
     storage.release()
-    model = camera_from_opencv(read_camera_yaml(path), path)
+    model = camera_from_opencv(read_yaml(path), path)
     assert model == (FisheyeCamera(INTRINSICS, D) if fisheye else BrownConradyCamera(INTRINSICS, D))
 
 
@@ -198,7 +199,7 @@ camera_matrix: {rows: 3, cols: 3, data: [700, 0, 640, 0, 710, 360, 0, 0, 1]}
 distortion_model: plumb_bob
 distortion_coefficients: {rows: 1, cols: 5, data: [-0.3, 0.1, 0.001, -0.002, 0.01]}
 """
-    assert camera_from_opencv(parse_camera_yaml(text, "front")) == BrownConradyCamera(INTRINSICS, PLUMB_BOB)
+    assert camera_from_opencv(parse_yaml(text, "front")) == BrownConradyCamera(INTRINSICS, PLUMB_BOB)
     with pytest.raises(DataError, match="found no camera_matrix, expected camera_matrix beside image_width"):
         camera_from_opencv({"image_width": 3})
 

@@ -15,11 +15,11 @@ from sst_graph.cameras import (
     DoubleSphereCamera,
     FisheyeCamera,
     Rectification,
-    RectifiedSource,
     rectified_camera,
 )
 from sst_graph.data.frame_parts import AheadReader, SeparateReader
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap

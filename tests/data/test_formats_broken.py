@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes, raw_stamp, write_raw_calibration
 
+from sst_graph.cameras import BrownConradyCamera
 from sst_graph.cli import main
 from sst_graph.data import open_source
+from sst_graph.data.folder.camera_file import read_camera
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.sweep_timing import SweepTiming
 
@@ -207,7 +209,9 @@ def test_cameras_of_other_tools(folder: Path, kind: str) -> None:
     assert (camera.width, camera.height) == (8, 6)
     (folder / "camera.yaml").write_text(CAMERAS[kind].replace("0, 0, 0, 0]", "-0.3, 0, 0, 0]"))
     if kind == "kalibr":
-        with pytest.raises(DataError, match=r"radtan distortion \[-0.3, 0.0, 0.0, 0.0\]"):
+        # Rectified as it is read: with so few pixels there is no pinhole to rectify to.
+        assert read_camera(folder / "camera.yaml") == BrownConradyCamera(camera, (-0.3, 0.0, 0.0, 0.0))
+        with pytest.raises(DataError, match=r"camera \(plumb_bob\): found a field of 8x6 px"):
             open_source(folder)
 
 

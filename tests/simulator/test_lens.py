@@ -11,7 +11,8 @@ from streets import CROWDED_STREET
 
 from sst_graph.batch import calibrate_prepared, prepare_drives
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.cameras import BrownConradyCamera, CameraModel, FisheyeCamera, Rectification, RectifiedSource
+from sst_graph.cameras import BrownConradyCamera, CameraModel, FisheyeCamera, Rectification
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.metrics import calibration_errors
 from sst_graph.simulator import SimulationConfig, simulate

@@ -20,11 +20,11 @@ import gtsam
 import numpy as np
 
 from sst_graph.cameras.model import CameraModel
-from sst_graph.cameras.readers import camera_of
-from sst_graph.data.folder.yaml_file import number, numbers, read_yaml
+from sst_graph.cameras.readers import camera_from_opencv, camera_of, cameras_from_kalibr
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera, checked_pose
+from sst_graph.files.checked_values import checked_pose
+from sst_graph.files.yaml_file import number, numbers, read_yaml
 
 _EXPECTED = "fx, fy, cx, cy, width, height; or Kalibr's cam0; or OpenCV's camera_matrix"
 _ROUNDED = 1e-3
@@ -40,27 +40,19 @@ def read_camera(path: Path) -> CameraModel:
     """
     table = read_yaml(path)
     if "fx" in table:
-        values = [number(_entry(table, name, path), f"{path} ({name})") for name in ("fx", "fy", "cx", "cy")]
-        size = [number(_entry(table, name, path), f"{path} ({name})") for name in ("width", "height")]
-        model, coefficients = table.get("distortion_model", "none"), table.get("distortion", [])
-    elif isinstance(table.get("cam0"), dict):
-        values, size, model, coefficients = _kalibr(table["cam0"], path)
-    elif "camera_matrix" in table or "K" in table:
-        name = "camera_matrix" if "camera_matrix" in table else "K"
-        K = numbers(table[name], f"{path} ({name})", 9)
-        values = [K[0], K[4], K[2], K[5]]
-        size = [
-            number(_entry(table, f"image_{side}", path), f"{path} ({side})") for side in ("width", "height")
-        ]
-        model = table.get("distortion_model", "plumb_bob")
-        coefficients = table.get("distortion_coefficients", table.get("D", []))
-    else:
-        raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
-    distortion = numbers(coefficients or [], f"{path} (distortion)")
-    width, height = (_whole(side, path) for side in size)
-    fx, fy, cx, cy = values
-    intrinsics = checked_camera(PinholeCamera(fx, fy, cx, cy, width, height), path)
-    return camera_of(intrinsics, str(model), distortion, path)
+        names = ("fx", "fy", "cx", "cy", "width", "height")
+        fx, fy, cx, cy, *size = (number(_entry(table, name, path), f"{path} ({name})") for name in names)
+        width, height = (_whole(side, path) for side in size)
+        intrinsics = PinholeCamera(fx, fy, cx, cy, width, height)
+        coefficients = numbers(table.get("distortion") or [], f"{path} (distortion)")
+        return camera_of(intrinsics, str(table.get("distortion_model", "none")), coefficients, path)
+    if isinstance(table.get("cam0"), dict):
+        return cameras_from_kalibr({"cam0": {"camera_model": "pinhole", **table["cam0"]}}, path)["cam0"].model
+    if "camera_matrix" in table or "K" in table:
+        if "D" not in table:
+            table.setdefault("distortion_coefficients", [])
+        return camera_from_opencv(table, path)
+    raise DataError(path, f"keys {', '.join(map(str, table))}"[:200], _EXPECTED)
 
 
 def read_extrinsic(path: Path) -> gtsam.Pose3:
@@ -83,15 +75,6 @@ def read_extrinsic(path: Path) -> gtsam.Pose3:
     matrix[:3, :3] = gtsam.Rot3.Quaternion(*(value / length for value in q)).matrix()
     matrix[:3, 3] = t
     return checked_pose(matrix, str(path))
-
-
-def _kalibr(cam: Mapping[Any, Any], path: Path) -> tuple[list[float], list[float], Any, Any]:
-    model = cam.get("camera_model", "pinhole")
-    if model != "pinhole":
-        raise DataError(f"{path} (cam0)", f"camera_model {model!r:.40}", "pinhole")
-    values = numbers(_entry(cam, "intrinsics", path), f"{path} (intrinsics)", 4)
-    size = numbers(_entry(cam, "resolution", path), f"{path} (resolution)", 2)
-    return values, size, cam.get("distortion_model", "none"), cam.get("distortion_coeffs", [])
 
 
 def _entry(table: Mapping[Any, Any], name: str, path: Path) -> Any:

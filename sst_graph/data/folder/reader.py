@@ -14,14 +14,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.cameras.rectification import Rectification
-from sst_graph.cameras.source import RectifiedSource
+from sst_graph.cameras import Rectification
 from sst_graph.classes import classes_of_points
 from sst_graph.data.arrays import listed
 from sst_graph.data.folder.camera_file import read_camera, read_extrinsic
 from sst_graph.data.folder.stamps import StampedFiles, stamped_files
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
 from sst_graph.data.point_files import SUFFIXES, Cloud, read_cloud
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged

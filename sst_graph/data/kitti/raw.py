@@ -166,7 +166,7 @@ def _camera(
         expected = " or ".join("{}x{} px".format(*calibration.size(number, kind)) for kind in (True, False))
         raise DataError(drive / f"image_{number:02d}", "pictures of {}x{} px".format(*size), expected)
     rectified = kinds[0] if len(kinds) == 1 else not drive.resolve().name.endswith("_extract")
-    return (calibration.rectified if rectified else calibration.as_recorded)(number, *size)
+    return calibration.rectified(number, *size) if rectified else calibration.as_recorded(number)
 
 
 def _truth(drive: Path, camera: str, nominal: gtsam.Pose3) -> GroundTruth:

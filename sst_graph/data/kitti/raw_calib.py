@@ -16,19 +16,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras.readers import camera_from_kitti_raw
+from sst_graph.cameras.tables import read_kitti_raw
 from sst_graph.data.kitti.calib import KittiCalibration, pose_from
-from sst_graph.data.undistorted import require_rectified
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera
-from sst_graph.files.reading import FileKind, read_text
 
 FloatArray = NDArray[np.float64]
 
 CAM_TO_CAM, VELO_TO_CAM = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt"
-CALIB_RAW = FileKind("a KITTI raw calibration", 1024 * 1024)
-
-_LINE = re.compile(r"(?:[KDRTS]|[RSP]_rect)_\d\d|R|T", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -69,22 +65,21 @@ class RawCalibration:
         odometry = KittiCalibration(self.folder / CAM_TO_CAM, {camera: P}, c0Tl)
         return odometry.camera(named, width, height), odometry.cTl(named)
 
-    def as_recorded(self, camera: int, width: int, height: int) -> tuple[PinholeCamera, gtsam.Pose3]:
-        """Intrinsics of a camera's pictures of width x height [px] as recorded, and cTl.
+    def as_recorded(self, camera: int) -> tuple[PinholeCamera, gtsam.Pose3]:
+        """Intrinsics of a camera's pictures as recorded, and cTl.
 
         Raises:
             DataError: a line is missing or holds no such matrix, or the lens distorts.
         """
         path = self.folder / CAM_TO_CAM
-        K = self._line(f"K_{camera:02d}", 9).reshape(3, 3)
-        D = self._line(f"D_{camera:02d}", 5)
-        require_rectified("plumb_bob", D.tolist(), f"{path} (D_{camera:02d})")
+        model = camera_from_kitti_raw(self.cameras, camera, rectified=False, place=path)
+        if not model.is_pinhole:
+            found = f"plumb_bob distortion {self.cameras[f'D_{camera:02d}'].tolist()}"
+            raise DataError(f"{path} (D_{camera:02d})", found, "rectified pictures (all coefficients 0)")
         R = self._line(f"R_{camera:02d}", 9).reshape(3, 3)
         t = self._line(f"T_{camera:02d}", 3)
         cTc0 = pose_from(np.column_stack([R, t]), f"{path} (R_{camera:02d}, T_{camera:02d})")
-        fx, fy, cx, cy = (float(K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        pinhole = PinholeCamera(fx, fy, cx, cy, width, height)
-        return checked_camera(pinhole, f"{path} (K_{camera:02d})"), cTc0 * self.c0Tl
+        return model.intrinsics, cTc0 * self.c0Tl
 
     def _line(self, name: str, count: int) -> FloatArray:
         path = self.folder / CAM_TO_CAM
@@ -102,9 +97,9 @@ def read_raw_calibration(folder: Path) -> RawCalibration:
     Raises:
         DataError: a file is missing, a value is no finite number, or no rigid transform.
     """
-    cameras = _lines(folder / CAM_TO_CAM)
+    cameras = read_kitti_raw(folder / CAM_TO_CAM)
     path = folder / VELO_TO_CAM
-    lidar = _lines(path)
+    lidar = read_kitti_raw(path)
     for name, count in (("R", 9), ("T", 3)):
         if len(lidar.get(name, ())) != count:
             raise DataError(path, f"{len(lidar.get(name, ()))} values for {name}", f"{count}")
@@ -122,21 +117,3 @@ def raw_camera_number(camera: str) -> int:
     if match is None:
         raise ConfigError(f"camera {camera!r}: expected image_0N, as in image_02")
     return int(match.group(1))
-
-
-def _lines(path: Path) -> dict[str, FloatArray]:
-    lines: dict[str, FloatArray] = {}
-    for number, line in enumerate(read_text(path, CALIB_RAW).splitlines(), 1):
-        name, colon, words = line.partition(":")
-        if not colon or not _LINE.fullmatch(name.strip()):
-            continue
-        try:
-            values = np.array([float(word) for word in words.split()])
-        except ValueError:
-            values = np.array([np.nan])
-        if not np.isfinite(values).all():
-            raise DataError(
-                f"{path}:{number}", f"{words.strip()!r:.60}", f"finite numbers for {name.strip()}"
-            )
-        lines[name.strip()] = values
-    return lines

@@ -13,9 +13,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.cameras import Rectification, RectifiedSource
+from sst_graph.cameras import Rectification
 from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
 from sst_graph.data.info.facts import SensorFacts, SourceFacts
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag
 from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
 from sst_graph.data.ros.clouds import Cloud, cloud_of

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
-
-import gtsam
 
 from sst_graph.data.frame_parts import (
     AheadReader,
     image_at,
-    image_positions,
-    number_at,
     scan_at,
     scan_positions,
 )
+from sst_graph.data.source_view import SourceView
 from sst_graph.errors import ConfigError
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.odometry.sweep.decision import SweepDecision, decide_sweep
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
+from sst_graph.types import CameraImage, Frame, Scan, Source
 
 SWEEP_KEY = "sweep"
 """Where a result's diagnostics keep what was decided of the sweeps, by name of the drive."""
 
 
-class SweptSource:
+class SweptSource(SourceView):
     """A source whose scans carry times by azimuth (satisfies :class:`sst_graph.types.Source`).
 
     Scans that bring times of their own keep them.
@@ -37,44 +33,6 @@ class SweptSource:
         self.source, self.sweep_decision = source, decision
         self._ahead = AheadReader(source) if ahead is None else ahead
 
-    @property
-    def name(self) -> str:
-        """Name of the drive."""
-        return self.source.name
-
-    @property
-    def camera(self) -> PinholeCamera:
-        """Intrinsics."""
-        return self.source.camera
-
-    @property
-    def nominal(self) -> gtsam.Pose3 | None:
-        """Nominal cTl of the data."""
-        return self.source.nominal
-
-    @property
-    def truth(self) -> GroundTruth | None:
-        """Truth, where the data bring it."""
-        return self.source.truth
-
-    @property
-    def truth_is_reference(self) -> bool:
-        """Whether it is a reference only."""
-        return bool(getattr(self.source, "truth_is_reference", False))
-
-    @property
-    def scan_positions(self) -> Sequence[int]:
-        """Positions of frames that may have a scan."""
-        return scan_positions(self.source)
-
-    @property
-    def image_positions(self) -> Sequence[int]:
-        """Positions of frames that may have an image."""
-        return image_positions(self.source)
-
-    def __len__(self) -> int:
-        return len(self.source)
-
     def __getitem__(self, position: int) -> Frame:
         """Frame at a position; IndexError as the source's own."""
         frame = self._ahead.frame(position)
@@ -82,10 +40,6 @@ class SweptSource:
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[position] for position in range(len(self)))
-
-    def frame_number(self, position: int) -> int:
-        """Index of the frame at a position."""
-        return number_at(self.source, position)
 
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position."""

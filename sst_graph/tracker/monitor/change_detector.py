@@ -79,7 +79,7 @@ class Change:
     Attributes:
         near: estimate from before the change.
         scans: how many of the latest scans are surely from after it.
-        far: objects no longer meet their labels at all: the new calibration may be anywhere.
+        far: objects do not meet their labels at all: the new calibration may be anywhere.
     """
 
     near: Point

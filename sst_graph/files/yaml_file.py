@@ -16,20 +16,24 @@ _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The table in a YAML file; a matrix of OpenCV is a table of rows, cols, dt, data.
+    """The table in a YAML file; errors as of :func:`parse_yaml`, and of a missing file."""
+    return parse_yaml(read_text(path, YAML), path)
+
+
+def parse_yaml(text: str, place: str | Path) -> dict[str, Any]:
+    """The table in a YAML text; a matrix of OpenCV is a table of rows, cols, dt, data.
 
     Raises:
-        DataError: a missing file, no YAML, anchors and aliases, tags of objects, deep nesting, no table.
+        DataError: no YAML, anchors and aliases, tags of objects, deep nesting, no table.
         MissingDependencyError: PyYAML is not installed.
     """
     try:
         import yaml
     except ImportError:
         raise MissingDependencyError(
-            f"{path}: reading YAML needs PyYAML, which is not installed: pip install 'sst-graph[yaml]'"
+            f"{place}: reading YAML needs PyYAML, which is not installed: pip install 'sst-graph[yaml]'"
         ) from None
 
-    text = read_text(path, YAML)
     if text.startswith("%YAML:"):  # OpenCV's first line is no directive of YAML
         text = text.partition("\n")[2]
 
@@ -45,9 +49,9 @@ def read_yaml(path: Path) -> dict[str, Any]:
         value = yaml.load(text, Loader)  # a SafeLoader
     except (yaml.YAMLError, ValueError, TypeError, OverflowError, AttributeError, RecursionError) as error:
         line = " ".join(str(error).split()) or type(error).__name__
-        raise DataError(path, f"no YAML ({line:.200})", "numbers, text, lists and tables") from None
+        raise DataError(place, f"no YAML ({line:.200})", "numbers, text, lists and tables") from None
     if not isinstance(value, dict):
-        raise DataError(path, f"a YAML {type(value).__name__}", "a table")
+        raise DataError(place, f"a YAML {type(value).__name__}", "a table")
     return value
 
 

@@ -6,18 +6,18 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any, cast, overload
 
-import gtsam
-
-from sst_graph.cameras.rectification import Rectification
+from sst_graph.cameras import Rectification
+from sst_graph.data.frame_parts import image_at, scan_at
+from sst_graph.data.source_view import SourceView
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, Source
+from sst_graph.types import CameraImage, Frame, Scan, Source
 
 
-class RectifiedSource:
+class RectifiedSource(SourceView):
     """A source whose images are rectified as they are read (satisfies :class:`sst_graph.types.Source`).
 
-    What else the source has to say (of its sweep, of its reference) is passed on; frames are read apart where
-    the source can do that.
+    What else the source has to say (of its sweep, its topics) is passed on; rectification leaves the camera's
+    pose.
     """
 
     def __init__(self, source: Source, rectification: Rectification) -> None:
@@ -25,27 +25,9 @@ class RectifiedSource:
         self.source, self.rectification = source, rectification
 
     @property
-    def name(self) -> str:
-        """Name of the drive."""
-        return self.source.name
-
-    @property
     def camera(self) -> PinholeCamera:
         """The pinhole."""
         return self.rectification.camera
-
-    @property
-    def nominal(self) -> gtsam.Pose3 | None:
-        """Nominal cTl of the data: rectification leaves the camera's pose."""
-        return self.source.nominal
-
-    @property
-    def truth(self) -> GroundTruth | None:
-        """Truth, where the data bring it."""
-        return self.source.truth
-
-    def __len__(self) -> int:
-        return len(self.source)
 
     @overload
     def __getitem__(self, position: int) -> Frame: ...
@@ -61,20 +43,13 @@ class RectifiedSource:
     def __iter__(self) -> Iterator[Frame]:
         return map(self._rectified, self.source)
 
-    def frame_number(self, position: int) -> int:
-        """Index of the frame at a position."""
-        known = getattr(self.source, "frame_number", None)
-        return int(known(position)) if known is not None else self.source[position].index
-
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position."""
-        read = getattr(self.source, "read_scan", None)
-        return cast("Scan | None", read(position)) if read is not None else self.source[position].scan
+        return scan_at(self.source, position)
 
     def read_image(self, position: int) -> CameraImage | None:
         """Rectified image of the frame at a position."""
-        read = getattr(self.source, "read_image", None)
-        image = read(position) if read is not None else self.source[position].image
+        image = image_at(self.source, position)
         return None if image is None else self.rectification.image(image)
 
     def __getattr__(self, name: str) -> Any:

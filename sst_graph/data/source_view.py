@@ -1,0 +1,60 @@
+"""A source seen through another one, which changes what its frames hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+
+from sst_graph.data.frame_parts import image_positions, number_at, scan_positions
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.types import GroundTruth, Source
+
+
+class SourceView:
+    """What a view of a source passes on; deriving from it and giving frames, scans and images makes a
+    :class:`sst_graph.types.Source` that reads the last two separately."""
+
+    source: Source
+
+    @property
+    def name(self) -> str:
+        """Name of the drive."""
+        return self.source.name
+
+    @property
+    def camera(self) -> PinholeCamera:
+        """Intrinsics."""
+        return self.source.camera
+
+    @property
+    def nominal(self) -> gtsam.Pose3 | None:
+        """Nominal cTl of the data."""
+        return self.source.nominal
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        """Truth, where the data bring it."""
+        return self.source.truth
+
+    @property
+    def truth_is_reference(self) -> bool:
+        """Whether it is a reference only."""
+        return bool(getattr(self.source, "truth_is_reference", False))
+
+    @property
+    def scan_positions(self) -> Sequence[int]:
+        """Positions of frames that may have a scan."""
+        return scan_positions(self.source)
+
+    @property
+    def image_positions(self) -> Sequence[int]:
+        """Positions of frames that may have an image."""
+        return image_positions(self.source)
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def frame_number(self, position: int) -> int:
+        """Index of the frame at a position."""
+        return number_at(self.source, position)
