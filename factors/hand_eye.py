@@ -64,7 +64,7 @@ class CameraMotion:
 
 @dataclass(frozen=True, eq=False)
 class LidarMotion:
-    """What LiDAR odometry measured over the same interval: l1Tl2(d), d as in the module.
+    """What LiDAR odometry measured between the same two images.
 
     Attributes:
         l1Tl2: pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``time_offset_0_s``.
