@@ -18,7 +18,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.files.array_store import ArrayStore, storable
+from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -52,12 +52,14 @@ class PrepareConfig(Settings):
         image_edges: move the contours of the masks to the edges in the picture.
         lidar_odometry: motion between scans.
         use_visual_odometry: track image features for the motion of the camera.
+        in_memory_bytes: of what is kept, the rest lies in a temporary file.
     """
 
     max_range_m: float = internal(MAX_RANGE_M)
     image_edges: bool = internal(True)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     use_visual_odometry: bool = internal(True)
+    in_memory_bytes: int = internal(IN_MEMORY_BYTES)
 
 
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
@@ -258,7 +260,7 @@ def prepare_drive(
     tracker = FeatureTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore()
+    left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore(config.in_memory_bytes)
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
