@@ -23,7 +23,7 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import move_points, moved_pose
+from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourMap, nearest_contours
@@ -74,14 +74,6 @@ degrees are other edges."""
 MIN_OBJECT_SHARE = 0.1
 """Least fraction of an object's boundary points in view that must have a match. An object that the image's
 labels miss crosses contours of others in a few places only."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Camera motion around one image: twist at its instant and the twist's rate of change, (6,) each."""
-
-    c_twist: FloatArray
-    c_acceleration: FloatArray
 
 
 class PointDeviation(Protocol):
@@ -145,7 +137,7 @@ class PairedEdges:
     owners: IntArray
     bounds: IntArray
     contours: Sequence[ContourMap]
-    motions: Sequence[Motion]
+    motions: Sequence[CameraTwist]
     base_taus_s: FloatArray
     biases_px: FloatArray
     velocities: FloatArray | None = None
@@ -177,12 +169,12 @@ class PairedEdges:
         groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
         starts = [a for a, _, _ in groups]
         if not all((taus[a:b] == taus[a]).all() for a, b, _ in groups):
-            twists, accelerations = (self.repeated(each).T for each in self._motion_rows())
-            return self.camera.project(move_points(cTl, columns, taus, twists, accelerations).cPs.T)
+            each = CameraTwist(*(self.repeated(rows).T for rows in self._motion_rows()))
+            return self.camera.project(move_points(cTl, columns, taus, each).cPs.T)
         # Every group moves as one rigid body.
         cPs = np.empty_like(columns)
         for (a, b, motion), tau_s in zip(groups, taus[starts].tolist(), strict=True):
-            moved = moved_pose(cTl, tau_s, motion.c_twist, motion.c_acceleration)
+            moved = moved_pose(cTl, tau_s, motion)
             np.matmul(moved.rotation().matrix(), columns[:, a:b], out=cPs[:, a:b])
             cPs[:, a:b] += np.asarray(moved.translation()).reshape(3, 1)
         return self.camera.project(cPs.T)
@@ -243,7 +235,7 @@ class ScanWithImage:
     contours: Mapping[SemanticClass, ContourMap]
     camera: PinholeCamera
     base_tau_s: float
-    motion: Motion
+    motion: CameraTwist
     velocities: Mapping[SemanticClass, FloatArray] | None = None
 
 

@@ -21,7 +21,6 @@ from sst_graph.association.edge_matching import (
     BOTTOM,
     EdgeMatches,
     MatchConfig,
-    Motion,
     PairedEdges,
     SilhouetteMatches,
     match_edges,
@@ -35,6 +34,7 @@ from sst_graph.drive.preparation import Drive, boundaries_of
 from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
 from sst_graph.errors import ConfigError
 from sst_graph.factors.matches import Alignment
+from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
@@ -119,7 +119,7 @@ class PairMatches:
     drive: int
     pair: Pair
     l_twist: TwistSample | None
-    motion: Motion
+    motion: CameraTwist
     matches: Mapping[SemanticClass, SilhouetteMatches]
     tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
     scene: Scene | None = None
@@ -363,7 +363,7 @@ class _Motions:
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
-    of_images: Sequence[Motion]
+    of_images: Sequence[CameraTwist]
     l_twists: TwistSamples | None
     measured: FloatArray
     since_s: FloatArray
@@ -378,7 +378,7 @@ class _Motions:
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
         l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
-            rest = Motion(np.zeros(6), np.zeros(6))
+            rest = CameraTwist(np.zeros(6), np.zeros(6))
             return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
@@ -386,7 +386,7 @@ class _Motions:
         )
         Ad = np.asarray(state.cTl.AdjointMap())
         rows = zip(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, strict=True)
-        return cls([Motion(*row) for row in rows], l_twists, measured, since_s)
+        return cls([CameraTwist(*row) for row in rows], l_twists, measured, since_s)
 
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
@@ -533,7 +533,7 @@ class DriveMatches:
             },
         )
 
-    def _alignment_of(self, own: slice, motion: Motion) -> Alignment:
+    def _alignment_of(self, own: slice, motion: CameraTwist) -> Alignment:
         """Of one group."""
         alone = own == slice(0, len(self)) and self.alignment.c_acceleration.ndim == 1
         return self.alignment if alone else self.alignment.of_one_image(own, motion.c_acceleration)

@@ -105,8 +105,8 @@ def frame_gains(
         own = columns[k]
         without = _left_out(robust, sums, terms[k], scores[k], rows)[np.ix_(own, own)]
         view = _view(terms[k], scores[k], prior_covariance, int(own[6]), model)
-        full, so_far = robust.matrix[np.ix_(own, own)], before[k] / after[own]
-        found.append(_entry(pair, len(rows), drives, state, view, full, without, so_far))
+        gain = _Gain(robust.matrix[np.ix_(own, own)], without, before[k] / after[own])
+        found.append(_entry(pair, len(rows), drives[pair.drive], state.cTl, view, gain))
     return tuple(found)
 
 
@@ -209,28 +209,35 @@ def _view(
     return positive_part(np.linalg.inv(covariance) - own)
 
 
+@dataclass(frozen=True)
+class _Gain:
+    """Uncertainty of extrinsic and time offset with and without a frame.
+
+    Attributes:
+        full: (7, 7) covariance with all frames.
+        without: (7, 7) covariance without this one.
+        so_far: (7,) variances with the frames up to this one, over those with all.
+    """
+
+    full: FloatArray
+    without: FloatArray
+    so_far: FloatArray
+
+
 def _entry(
-    pair: PairMatches,
-    matches: int,
-    drives: Sequence[Drive],
-    state: State,
-    view: FloatArray,
-    full: FloatArray,
-    without: FloatArray,
-    so_far: FloatArray,
+    pair: PairMatches, matches: int, drive: Drive, cTl: gtsam.Pose3, view: FloatArray, gain: _Gain
 ) -> FrameInformation:
-    """``full``, ``without``: (7, 7) covariances; ``so_far``: (7,) variances over those of all frames."""
-    drive = drives[pair.drive]
+    """``matches``: how many the frame has, in all its pairs; ``view``: (6, 6) information by itself."""
     lPs = np.concatenate([m.alignment.lPs for m in pair.matches.values()])
     us = np.concatenate([m.alignment.pixels[:, 0] for m in pair.matches.values()])
-    sigmas = np.sqrt(np.diag(full))
+    sigmas = np.sqrt(np.diag(gain.full))
     return FrameInformation(
         FrameId(drive.name, drive.scans[pair.pair.scan].index),
-        bits_between(without, full),
-        np.sqrt(np.maximum(np.diag(without), 0.0)) / sigmas,
-        np.sqrt(np.maximum(so_far, 0.0)),
+        bits_between(gain.without, gain.full),
+        np.sqrt(np.maximum(np.diag(gain.without), 0.0)) / sigmas,
+        np.sqrt(np.maximum(gain.so_far, 0.0)),
         view,
-        np.asarray(state.cTl.inverse().AdjointMap() @ pair.motion.c_twist),
+        np.asarray(cTl.inverse().AdjointMap() @ pair.motion.c_twist),
         matches,
         sum(len(np.unique(m.objects)) for m in pair.matches.values()),
         float(np.linalg.norm(lPs, axis=1).min()),
