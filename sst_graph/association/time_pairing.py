@@ -26,7 +26,7 @@ class Pair:
 
 
 def pair_by_time(
-    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], offset_s: float, max_interval_s: float
+    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], time_offset_s: float, max_interval_s: float
 ) -> list[Pair]:
     """Each scan with the image closest to it in true time, under a time offset (sign: :mod:`factors`).
 
@@ -35,7 +35,7 @@ def pair_by_time(
         max_interval_s: pairs farther apart in true time are left out [s].
     """
     images, base_taus_s = nearest_images(
-        scan_stamps_ns, image_stamps_ns, np.array([offset_s]), max_interval_s
+        scan_stamps_ns, image_stamps_ns, np.array([time_offset_s]), max_interval_s
     )
     return [
         Pair(scan, int(images[0, scan]), float(base_taus_s[0, scan]))
@@ -44,10 +44,10 @@ def pair_by_time(
 
 
 def pair_every_image(
-    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], offset_s: float, max_interval_s: float
+    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], time_offset_s: float, max_interval_s: float
 ) -> list[Pair]:
     """Each image with the scan closest to it in true time; arguments as of :func:`pair_by_time`."""
-    away_s = np.array([-offset_s])
+    away_s = np.array([-time_offset_s])
     scans, base_taus_s = nearest_images(image_stamps_ns, scan_stamps_ns, away_s, max_interval_s)
     return [
         Pair(int(scans[0, image]), image, -float(base_taus_s[0, image]))

@@ -283,8 +283,8 @@ class DriveEdges:
 
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
-        drive, offset_s = self.drive, state.time_offset_s(self.number)
-        pairs = self.pairs(offset_s)
+        drive, time_offset_s = self.drive, state.time_offset_s(self.number)
+        pairs = self.pairs(time_offset_s)
         # 1. The groups that have an image, and in it a contour of their class; once for each image.
         numbers: dict[int, list[int]] = {}
         for number, pair in enumerate(pairs):
@@ -304,7 +304,7 @@ class DriveEdges:
         paired, index = self._paired(groups, pairs, motions, state)
         shares = None
         if self.unknown_mps is not None:
-            taus_s = offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
+            taus_s = time_offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
             shares = dynamic_object_weights(self.unknown_mps[index], taus_s, DYNAMIC_REACH_M)
             if not shares.all():
                 kept = np.flatnonzero(shares)
@@ -312,7 +312,7 @@ class DriveEdges:
         # 4. Match them.
         scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
         deviation = deviation_of(state.nuisances, scene)
-        found = match_edges(paired, state.cTl, offset_s, kernel, self.config, deviation)
+        found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if shares is not None and not (shares == 1.0).all():
@@ -329,16 +329,16 @@ class DriveEdges:
             index[found.index],
             found.index - np.repeat(firsts, np.diff(found.bounds)),
             state.cTl,
-            offset_s,
+            time_offset_s,
         )
 
-    def pairs(self, offset_s: float) -> list[Pair]:
+    def pairs(self, time_offset_s: float) -> list[Pair]:
         """Scans and images that belong together in true time under an offset."""
         drive = self.drive
         stamps = drive.scan_stamps_ns, drive.image_stamps_ns
         if self.config.every_image and drive.has_dense_images:
-            return pair_every_image(*stamps, offset_s, EVERY_IMAGE_REACH * drive.scan_period_s)
-        return pair_by_time(*stamps, offset_s, drive.image_period_s)
+            return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.scan_period_s)
+        return pair_by_time(*stamps, time_offset_s, drive.image_period_s)
 
     def _paired(
         self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
@@ -431,7 +431,7 @@ class DriveMatches:
         group_pairs, group_classes: pair and class of each group.
         points: (m,) which of the drive's points each match is, and
         places: (m,) which of the points of its scan and class each match is.
-        cTl, offset_s: extrinsic and time offset that the matches were made at.
+        cTl, time_offset_s: extrinsic and time offset that the matches were made at.
     """
 
     edges: DriveEdges
@@ -443,7 +443,7 @@ class DriveMatches:
     points: IntArray
     places: IntArray
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
 
     def __len__(self) -> int:
         return len(self.points)
@@ -516,7 +516,7 @@ class DriveMatches:
             return {}
         pair = self.pair_of
         base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
-        at = self.cTl, self.offset_s, self.c_twists[pair].T
+        at = self.cTl, self.time_offset_s, self.c_twists[pair].T
         scene = self.motions.scene(self.edges.drive, pair)
         return residual_columns(self.alignment, scene, base_taus_s, at, names)
 
