@@ -227,11 +227,14 @@ class Drive:
 
     @cached_property
     def has_dense_images(self) -> bool:
-        """Whether there are clearly more images than scans; scans that a part of the drive leaves out count,
-        too."""
+        """Whether there are clearly more images than scans."""
+        return self.image_period_s < DENSE_SHARE * self.lidar_period_s
+
+    @cached_property
+    def lidar_period_s(self) -> float:
+        """As :attr:`scan_period_s`, but a part of a drive has that of the whole one [s]."""
         spans_ns = [motion.to_ns - motion.from_ns for motion in self.lidar_motions]
-        period_s = 1e-9 * float(np.median(spans_ns)) if spans_ns else self.scan_period_s
-        return self.image_period_s < DENSE_SHARE * period_s
+        return 1e-9 * float(np.median(spans_ns)) if spans_ns else self.scan_period_s
 
     @cached_property
     def scan_period_s(self) -> float:

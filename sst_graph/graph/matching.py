@@ -337,7 +337,7 @@ class DriveEdges:
         drive = self.drive
         stamps = drive.scan_stamps_ns, drive.image_stamps_ns
         if self.config.every_image and drive.has_dense_images:
-            return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.scan_period_s)
+            return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.lidar_period_s)
         return pair_by_time(*stamps, time_offset_s, drive.image_period_s)
 
     def _paired(
