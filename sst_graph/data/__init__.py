@@ -6,7 +6,7 @@ from sst_graph.data.folder.reader import FOLDER_LOADER
 from sst_graph.data.kitti.odometry import KITTI_LOADER, KittiSource
 from sst_graph.data.kitti.raw import RAW_LOADER
 from sst_graph.data.nuscenes.reader import NUSCENES_LOADER
-from sst_graph.data.ros import ROS_LOADER, RosSource
+from sst_graph.data.ros import ROS_LOADER
 from sst_graph.data.source import Loader, SourceOptions, loader_names, open_source, register_loader
 
 register_loader("kitti", KITTI_LOADER)
@@ -18,7 +18,6 @@ register_loader("ros", ROS_LOADER)
 __all__ = [
     "KittiSource",
     "Loader",
-    "RosSource",
     "SourceOptions",
     "loader_names",
     "open_source",

@@ -156,7 +156,9 @@ def open_raw(path: Path, options: SourceOptions) -> Source:
     is_reference = not (drive / "groundtruth.json").exists()
     name = printable(drive.resolve().name)
     properties = DriveProperties(name, model.intrinsics, nominal, truth, is_reference)
-    source = merged(properties, Sensor(scan_stamps, scan), Sensor(image_stamps, image), options, drive)
+    of_scans = Sensor(scan_stamps, scan, "velodyne_points")
+    of_images = Sensor(image_stamps, image, f"image_{number:02d}")
+    source = merged(properties, of_scans, of_images, options, drive)
     return source if model.is_pinhole else RectifiedSource(source, Rectification.of(model))
 
 
