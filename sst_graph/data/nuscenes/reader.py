@@ -192,7 +192,7 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     data: dict[str, list[Record]] = {_LIDAR: [], camera: []}
     rigs: dict[str, set[str]] = {_LIDAR: set(), camera: set()}
     for record in records(data_path):
-        if record.get("sample_token") not in samples:
+        if text_of(record, "sample_token", data_path) not in samples:
             continue
         token = text_of(record, "calibrated_sensor_token", data_path)
         if token not in calibrations:
@@ -251,9 +251,10 @@ def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOption
     labels: dict[int, Path] = {}
     lidarseg = tables / "lidarseg.json"
     if lidarseg.exists():
-        position = {r.get("token"): k for k, r in enumerate(lidar.data)}
+        data = tables / "sample_data.json"
+        position = {text_of(r, "token", data): k for k, r in enumerate(lidar.data)}
         for record in records(lidarseg):
-            k = position.get(record.get("sample_data_token"))
+            k = position.get(text_of(record, "sample_data_token", lidarseg))
             if k is not None:
                 labels[k] = _inside(path, text_of(record, "filename", lidarseg), tables)
     timing = None

@@ -11,7 +11,7 @@ import numpy as np
 from sst_graph.cameras import CameraModel
 from sst_graph.cameras.readers import camera_from_camera_info
 from sst_graph.errors import DataError
-from sst_graph.types import FloatArray
+from sst_graph.files.checked_values import checked_pose
 
 Size = tuple[int, int]
 """Width, height [px]."""
@@ -51,10 +51,8 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
         # Drivers without a calibrated lens name a model and leave D empty.
         table["distortion_model"] = "none"
     model = camera_from_camera_info(table, rectified, place)
-    R = np.asarray(table.get("R", table.get("r")), np.float64).reshape(3, 3)
-    return ImageGeometry(model, _rotation(R) if rectified else gtsam.Rot3())
-
-
-def _rotation(R: FloatArray) -> gtsam.Rot3:
-    """R, which drivers leave at zero where nothing is rectified."""
-    return gtsam.Rot3(R) if abs(np.linalg.det(R) - 1.0) < 1e-3 else gtsam.Rot3()
+    pose = np.eye(4)
+    pose[:3, :3] = np.asarray(table.get("R", table.get("r")), np.float64).reshape(3, 3)
+    # Drivers leave R at zero where nothing is rectified.
+    turned = rectified and pose[:3, :3].any()
+    return ImageGeometry(model, checked_pose(pose, f"{place}: R").rotation() if turned else gtsam.Rot3())

@@ -221,6 +221,10 @@ def test_cameras_that_cannot_be_used() -> None:
         image_geometry(MAKE.info(CAMERA), "/cam/image_raw", (320, 180), "here")
     with pytest.raises(DataError, match="K = 0, an uncalibrated camera"):
         image_geometry(MAKE.info(CAMERA, k=np.zeros(9)), "/cam/image_raw", (640, 360), "here")
+    sheared = np.array([1.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    for R in (sheared, np.full(9, np.inf)):
+        with pytest.raises(DataError, match="here: R"):
+            image_geometry(MAKE.info(CAMERA, r=R), "/cam/image_rect", (640, 360), "here")
     with pytest.raises(DataError, match="P = 0, an uncalibrated camera"):
         image_geometry(MAKE.info(CAMERA, p=np.zeros(12)), "/cam/image_rect", (640, 360), "here")
     with pytest.raises(DataError, match="binning"):
