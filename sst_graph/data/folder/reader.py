@@ -127,7 +127,8 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         return pictures.image(k, int(images.stamps_ns[k]))
 
     properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
-    of_scans, of_images = Sensor(clouds.stamps_ns, scans.scan), Sensor(images.stamps_ns, image)
+    of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
+    of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
