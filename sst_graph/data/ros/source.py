@@ -188,7 +188,16 @@ class RosSource:
         if self.drive.timing is not None:
             offsets_s = self.drive.timing.offsets_s(cloud.points)
         rings = rings_from_order(cloud.points) if cloud.rings is None else cloud.rings
-        return Scan(place.stamp_ns, cloud.points, classes, instances, offsets_s, rings, cloud.left_out)
+        return Scan(
+            place.stamp_ns,
+            cloud.points,
+            classes,
+            instances,
+            offsets_s,
+            rings,
+            cloud.left_out,
+            cloud.intensities,
+        )
 
     def _cloud(self, place: Stamped) -> Cloud:
         times, labels = self.sweep == "auto", self.drive.topics.mask is not None
