@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
@@ -124,6 +125,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(TrackerConfig(), args, flags)
+    check_classes([source], config.calibration.classes, args.classes)
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))
     if not (args.resume and args.checkpoint.exists()):

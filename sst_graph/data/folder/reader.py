@@ -74,7 +74,7 @@ class CloudFiles:
             offsets_s = self.timing.offsets_s(points[used])
         elif self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
             offsets_s = times[used]
-        rings = cloud.rings()
+        rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
         return Scan(
             stamp_ns=stamp_ns,
@@ -84,6 +84,7 @@ class CloudFiles:
             offsets_s=offsets_s,
             rings=rings_from_order(points) if rings is None else rings[used],
             left_out=len(used) - len(points),
+            intensities=None if intensities is None else intensities[used],
         )
 
     def _labels(

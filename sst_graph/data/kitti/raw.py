@@ -95,17 +95,19 @@ class RawScans:
             DataError: a file is damaged or holds what it must not.
         """
         path = self.scans[number]
-        points = read_points(path) if path.suffix.lower() == ".bin" else read_text_points(path)
+        read = read_points if path.suffix.lower() == ".bin" else read_text_points
+        points, intensities = read(path)
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = point_labels(self.labels.get(number), used)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
         left_out = len(used) - len(points)
-        return Scan(stamp_ns, points, classes, instances, offsets_s, rings_from_order(points), left_out)
+        rings = rings_from_order(points)
+        return Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out, intensities[used])
 
 
-def read_text_points(path: Path) -> NDArray[np.float32]:
-    """Points (n, 3) float32 [m] of a cloud in text: x y z r a line.
+def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points (n, 3) float32 [m] and reflectances (n,) of a cloud in text: x y z r a line.
 
     Raises:
         DataError: a missing file, a line with other than four numbers, a coordinate that is no length.
@@ -121,9 +123,10 @@ def read_text_points(path: Path) -> NDArray[np.float32]:
         raise DataError(path, f"no numbers ({str(error).splitlines()[0]})", "lines of x y z r") from None
     if values.size and values.shape[1] != 4:
         raise DataError(path, f"{values.shape[1]} numbers a line", "4: x y z r")
-    points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    values = values.reshape(-1, 4)
+    points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)
-    return points
+    return points, np.ascontiguousarray(values[:, 3])
 
 
 def open_raw(path: Path, options: SourceOptions) -> Source:

@@ -96,6 +96,7 @@ class LidarFiles:
             offsets_s=offsets_s,
             rings=rings.astype(np.uint16),
             left_out=len(used) - len(points),
+            intensities=np.ascontiguousarray(values[used, 3]),
         )
 
     def _classes(self, k: int, used: NDArray[np.bool_]) -> NDArray[np.uint8]:

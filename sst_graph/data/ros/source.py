@@ -76,7 +76,16 @@ class BagMessages:
             classes, instances = classes_of_points(cloud.labels, place)
         offsets_s = cloud.offsets_s if self.timing is None else self.timing.offsets_s(cloud.points)
         rings = rings_from_order(cloud.points) if cloud.rings is None else cloud.rings
-        return Scan(stamped.stamp_ns, cloud.points, classes, instances, offsets_s, rings, cloud.left_out)
+        return Scan(
+            stamped.stamp_ns,
+            cloud.points,
+            classes,
+            instances,
+            offsets_s,
+            rings,
+            cloud.left_out,
+            cloud.intensities,
+        )
 
     def image(self, k: int) -> CameraImage:
         """Image k of the topic, with the mask of its stamp; errors as of a scan."""
