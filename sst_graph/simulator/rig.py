@@ -40,8 +40,8 @@ def beside(drive: SimulatedDrive, cTa: gtsam.Pose3, time_offset_s: float | None 
         cTa: pose of the drive's own camera in the further one.
         time_offset_s: of its images; by default the same, as of cameras with one trigger [s].
     """
-    offset_s = drive.config.time_offset_s if time_offset_s is None else time_offset_s
-    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, offset_s)
+    time_offset_s = drive.config.time_offset_s if time_offset_s is None else time_offset_s
+    return Mount(cTa * drive.nominal, cTa * drive.truth.cTl, time_offset_s)
 
 
 def stereo_pose(baseline_m: float = STEREO_BASELINE_M) -> gtsam.Pose3:
@@ -60,8 +60,8 @@ def surround(drive: SimulatedDrive, count: int = 6) -> dict[str, Mount]:
         arm = float(rng.uniform(0.2, 1.0))
         where = np.array([arm * np.cos(yaw), arm * np.sin(yaw), -float(rng.uniform(0.0, 0.3))])
         nominal = gtsam.Pose3(gtsam.Rot3.Rz(yaw) * _OPTICAL, where).inverse()
-        offset_s = drive.config.time_offset_s + float(rng.uniform(-0.03, 0.03))
-        mounts[f"camera_{k}"] = Mount(nominal, nominal * mounting_error(drive.config, rng), offset_s)
+        time_offset_s = drive.config.time_offset_s + float(rng.uniform(-0.03, 0.03))
+        mounts[f"camera_{k}"] = Mount(nominal, nominal * mounting_error(drive.config, rng), time_offset_s)
     return mounts
 
 
