@@ -152,7 +152,7 @@ def frame_factor(
     Args:
         alignments: one or more, over the same image (one twist).
         cTl: key of the extrinsic, or a fixed pose.
-        time_offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key, and 0 is refused).
+        time_offset_s: its key, or a fixed one [s] (a float: an int is a key, and 0 is refused).
         c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for zero.
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel; a

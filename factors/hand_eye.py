@@ -3,8 +3,8 @@
     c1Tc2 = cTl . l1Tl2(d) . cTl^-1,    l1Tl2(d) = Exp(-l_twist_1 d) . l1Tl2 . Exp(l_twist_2 d)
 
 The camera moves from its stamp t1 to t2, on the LiDAR's clock from t1 + D to t2 + D. The LiDAR's motion
-l1Tl2 was measured over [t1 + time_offset_0_s, t2 + time_offset_0_s] and is carried by d = D - time_offset_0_s at both ends
-with the LiDAR's twist there. Turns determine the rotation, and turns that begin or end the time offset;
+l1Tl2 was measured over [t1 + D0, t2 + D0], D0 = ``time_offset_0_s``, and is carried by d = D - D0 at both
+ends with the LiDAR's twist there. Turns determine the rotation, and turns that begin or end the time offset;
 translation along the axis of a plane motion stays free. Sources: Taylor & Nieto, Motion-based calibration
 of multimodal sensor extrinsics and timing offset estimation, T-RO 2016; Park et al., Spatiotemporal
 camera-LiDAR calibration, 2020.

@@ -82,8 +82,8 @@ def pose_alignment_factor(
         condensed: False gives one or two rows a match and one more.
 
     Returns:
-        A factor on the distinct keys: X_a, X_b, X_scan, cTl, time_offset_s, biases; its noise is the unit's or,
-        in all its rows, the given one.
+        A factor on the distinct keys: X_a, X_b, X_scan, cTl, time_offset_s, biases; its noise is the unit's
+        or, in all its rows, the given one.
 
     Raises:
         FactorError: keys or intervals that make no factor; see also :func:`sst_graph.factors.frame_factor`.

@@ -107,9 +107,8 @@ def calibrate_prepared(
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
     config = config or CalibrationConfig()
     guess = Guess(initial, initial_time_offset_s)
-    return finished(lambda: _METHODS[config.method](drives, guess, config, progress), drives, guess, config)[
-        0
-    ]
+    method = _METHODS[config.method]
+    return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
 
 
 def finished(

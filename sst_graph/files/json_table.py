@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
-from sst_graph.files.checked_values import check_finite, checked_time_offset_s, checked_pose, checked_text
+from sst_graph.files.checked_values import check_finite, checked_pose, checked_text, checked_time_offset_s
 
 FloatArray = NDArray[np.float64]
 
