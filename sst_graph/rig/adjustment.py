@@ -1,4 +1,4 @@
-"""All cameras together: their estimates as one Gaussian, and what is known of the rig, in one factor graph."""
+"""All cameras in one factor graph: their estimates as one Gaussian, and what is known of the rig."""
 
 from __future__ import annotations
 
@@ -100,8 +100,8 @@ def adjusted(marginal: RigMarginal, known: KnownRig) -> RigMarginal:
 
 
 def rig_graph(marginal: RigMarginal, known: KnownRig) -> gtsam.NonlinearFactorGraph:
-    """The factor graph of a rig: the cameras' joint Gaussian on their extrinsics E and time offsets D, a factor
-    for each known pose, and one between the time offsets of neighbours with one trigger."""
+    """The factor graph of a rig: the cameras' joint Gaussian on their extrinsics E and time offsets D, a
+    factor for each known pose, and one between the first time offset and each other with one trigger."""
     graph, keys = gtsam.NonlinearFactorGraph(), marginal.keys()
     graph.add(marginal.factor())
     for pose in known.poses:

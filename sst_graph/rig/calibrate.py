@@ -32,7 +32,7 @@ from sst_graph.rig.adjustment import (
 )
 from sst_graph.rig.influences import UNKNOWNS, CameraInfluences
 from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
-from sst_graph.rig.known import KnownPose, KnownRig
+from sst_graph.rig.known import KnownRig
 from sst_graph.rig.marginal import RigMarginal
 from sst_graph.rig.result import RigResult, worst
 from sst_graph.types import Source
@@ -48,6 +48,7 @@ def calibrate_rig(
     config: CalibrationConfig | None = None,
     known: KnownRig | None = None,
     *,
+    initial_time_offsets_s: Mapping[str, float] | None = None,
     progress: Progress | None = None,
 ) -> RigResult:
     """Extrinsics and time offsets of several cameras on one LiDAR, with their joint covariance.
@@ -58,6 +59,7 @@ def calibrate_rig(
         initial: rough guess of each cTl; a camera that is missing, or None, has none.
         config: settings of method joint, for all cameras.
         known: poses of cameras in one another, and a common trigger.
+        initial_time_offsets_s: rough guess of each time offset; 0 for a camera that is missing [s].
         progress: called with (stage, steps done, steps in all).
 
     Raises:
@@ -69,7 +71,9 @@ def calibrate_rig(
     _check(sources, config)
     known.check(list(sources))
     drives = prepare_rig(sources, config, progress)
-    return calibrate_rig_prepared(drives, initial, config, known, progress=progress)
+    initial, offsets_s = initial or {}, initial_time_offsets_s or {}
+    guesses = {name: Guess(initial.get(name), offsets_s.get(name, 0.0)) for name in drives}
+    return calibrate_rig_prepared(drives, guesses, config, known, progress)
 
 
 def prepare_rig(
@@ -89,16 +93,17 @@ def prepare_rig(
 
 def calibrate_rig_prepared(
     drives: Mapping[str, Sequence[Drive]],
-    initial: Mapping[str, gtsam.Pose3 | None] | None = None,
-    config: CalibrationConfig | None = None,
-    known: KnownRig | None = None,
-    *,
+    guesses: Mapping[str, Guess],
+    config: CalibrationConfig,
+    known: KnownRig,
     progress: Progress | None = None,
 ) -> RigResult:
-    """:func:`calibrate_rig` of drives from :func:`prepare_rig`, with the same settings."""
-    config, known, initial = config or CalibrationConfig(), known or KnownRig(), initial or {}
+    """:func:`calibrate_rig` of drives from :func:`prepare_rig`, with the same settings.
+
+    Args:
+        guesses: of every camera.
+    """
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
-    guesses = {name: Guess(initial.get(name)) for name in drives}
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
     # 2. Their joint covariance, by the errors that they have in common.
@@ -171,17 +176,6 @@ class _Camera:
         return None if outcome is None else CameraInfluences.of(outcome)
 
     @property
-    def covariance(self) -> FloatArray:
-        """(7, 7) of its own estimate; wide where it is not to be trusted."""
-        return self.result.covariance if self.trusted else np.diag(_UNKNOWN_SIGMAS**2)
-
-    @property
-    def by_static_objects(self) -> FloatArray:
-        """(7, 7) by static objects alone."""
-        static = None if self.estimate is None else self.estimate.by_static_objects
-        return self.covariance if static is None or not self.trusted else static
-
-    @property
     def clusters(self) -> float:
         """Effective number of sides of objects behind its covariance."""
         outcome = None if self.estimate is None else self.estimate.solved
@@ -206,7 +200,7 @@ def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
         own = replace(problem, guess=start, config=replace(problem.config, search=search))
     result, estimate = finished(lambda: solve_problem(own), own.drives, own.guess, own.config)
     if start is not None:
-        config = result.config | {"search": to_dict(problem.config.search)}
+        config = {**result.config, "search": to_dict(problem.config.search)}
         guess = problem.guess
         result = replace(result, initial=guess.cTl, initial_time_offset_s=guess.time_offset_s, config=config)
     return _Camera(problem, result, estimate)
@@ -228,8 +222,14 @@ class _Rig:
 
     @cached_property
     def joint(self) -> JointCovariance:
-        cameras = self.cameras.values()
-        return joint_covariance([own.covariance for own in cameras], [own.influences for own in cameras])
+        covariances = [self._covariance(name) for name in self.cameras]
+        return joint_covariance(covariances, [camera.influences for camera in self.cameras.values()])
+
+    def _covariance(self, name: str) -> FloatArray:
+        """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""
+        camera, poses = self.cameras[name], self.known.poses
+        linked = self.known.one_trigger or any(name in (p.camera, p.reference) for p in poses)
+        return np.diag(_UNKNOWN_SIGMAS**2) if linked and not camera.trusted else camera.result.covariance
 
     @cached_property
     def marginal(self) -> RigMarginal:
@@ -266,7 +266,7 @@ class _Rig:
         for compared in self.poses:
             pose = compared.known
             names = (pose.camera, pose.reference)
-            better, weaker = sorted(names, key=lambda name: _size(self.cameras[name].covariance))
+            better, weaker = sorted(names, key=lambda name: _size(self._covariance(name)))
             if not self.cameras[better].trusted or weaker in starts:
                 continue
             cTb = pose.T_camera_reference
@@ -289,16 +289,10 @@ class _Rig:
 
     def result(self, after: RigMarginal, config: CalibrationConfig) -> RigResult:
         """The result, with the cameras' estimates after the adjustment."""
-        reasons = [pose.sentence for pose in self.poses if pose.contradicted]
-        if self.trigger is not None and self.trigger.contradicted:
-            reasons.append(self.trigger.sentence)
+        of_trigger = [self.trigger.sentence] if self.trigger is not None and self.trigger.contradicted else []
+        of_poses = [pose for pose in self.poses if pose.contradicted]
         wrong = {
-            name: [
-                pose.sentence
-                for pose in self.poses
-                if pose.contradicted and name in (pose.known.camera, pose.known.reference)
-            ]
-            + [self.trigger.sentence] * (self.trigger is not None and self.trigger.contradicted)
+            name: [p.sentence for p in of_poses if name in (p.known.camera, p.known.reference)] + of_trigger
             for name in self.cameras
         }
         static = self._static_covariances()
@@ -306,13 +300,11 @@ class _Rig:
             name: _camera_result(camera, name, after, static[name], wrong[name], config)
             for name, camera in self.cameras.items()
         }
-        # The blocks of the joint covariance are those of the results, also of cameras that are not used.
-        covariance = after.covariance.copy()
         return RigResult(
             results,
-            covariance,
+            after.covariance,
             worst([result.status for result in results.values()]),
-            tuple(reasons),
+            (*(pose.sentence for pose in of_poses), *of_trigger),
             self.known,
             self._diagnostics(),
         )
@@ -323,7 +315,8 @@ class _Rig:
         whole = np.zeros((n, n))
         for i, camera in enumerate(cameras):
             at = slice(UNKNOWNS * i, UNKNOWNS * (i + 1))
-            whole[at, at] = camera.by_static_objects
+            known = camera.estimate.by_static_objects if camera.estimate and camera.trusted else None
+            whole[at, at] = self.joint.matrix[at, at] if known is None else known
         after = adjusted(replace(self.marginal, covariance=whole), self.agreed)
         return {name: after.of_camera(name) for name in self.cameras}
 

@@ -47,7 +47,7 @@ class Influence:
     Attributes:
         names: (k,) numbers of the errors, rising, the same in all cameras.
         steps: (k, 7) influence of a unit error [rad, m, s].
-        means: (k,) mean whitened residual beyond that of the next wider kind: what the data show of the error.
+        means: (k,) mean whitened residual beyond that of the next wider kind.
         weights: (k,) robust weight behind it.
     """
 
@@ -203,6 +203,7 @@ def _by_motion(robust: RobustCovariance, solution: JointSolution) -> tuple[IntAr
         _, by_cTl, by_offset = transferred(
             sample.twist, sample.acceleration, since_s, values.atVector(key), cTl, True
         )
+        assert by_cTl is not None and by_offset is not None
         rows = responses[key].copy()
         rows[:, :6] += by_cTl
         rows[:, unknowns.column(clock)] += by_offset

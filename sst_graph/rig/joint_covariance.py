@@ -68,9 +68,7 @@ def joint_covariance(
             cross = _cross(one, other, correlations)
             whole[blocks[i], blocks[j]], whole[blocks[j], blocks[i]] = cross, cross.T
     sides = [own.matches["side"].names for own in known]
-    names, seen = (
-        np.unique(np.concatenate(sides), return_counts=True) if sides else (np.zeros(0), np.zeros(0))
-    )
+    seen = np.unique(np.concatenate([np.zeros(0, np.int64), *sides]), return_counts=True)[1]
     return JointCovariance(_positive(whole, blocks), correlations, int((seen > 1).sum()))
 
 

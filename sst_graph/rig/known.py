@@ -15,7 +15,7 @@ from sst_graph.types import ByValue
 FloatArray = NDArray[np.float64]
 
 ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M = 0.03, 0.002
-"""How well a stereo calibration with a target is taken to know the pose between two cameras, along each axis."""
+"""How well a calibration with a target is taken to know the pose between two cameras, along each axis."""
 TRIGGER_SIGMA_S = 1e-4
 """How far apart the time offsets of cameras with one trigger may be: half a difference of exposure times."""
 

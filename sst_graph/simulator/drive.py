@@ -184,6 +184,10 @@ class SimulatedDrive:
         kinds, instances = noisy_points(kinds, instances, returns, config.label_noise, (config.seed, index))
         return returns.points, returns.offsets_s, returns.rings.astype(np.uint16), kinds, instances
 
+    def raw_image(self, position: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint16]]:
+        """Picture (h, w, 3), kinds and instances (h, w) of a frame, without its scan."""
+        return self._image(self._checked(position))
+
     def _image(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint16]]:
         """Picture and labels of image ``index``."""
         light, kinds, numbers = self.look_through(index, self.camera)
