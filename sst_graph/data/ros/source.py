@@ -329,5 +329,5 @@ def _place(bag: Bag, place: Stamped) -> str:
 
 
 ROS_LOADER = Loader(
-    recognizes=is_ros, open=open_ros, layout=LAYOUT, unused=("sequence", "camera", "cloud", "image_shift")
+    recognizes=is_ros, open=open_ros, layout=LAYOUT, unused=("sequence", "cloud", "image_shift")
 )
