@@ -30,7 +30,7 @@ from sst_graph.batch.method_estimate import (
 from sst_graph.batch.motion_factor import may_use_motion, with_motion
 from sst_graph.batch.motion_method import motion_method
 from sst_graph.batch.part_solver import PartSolver
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
@@ -109,9 +109,18 @@ def calibrate_prepared(
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
     config = config or CalibrationConfig()
     guess = Guess(initial, initial_time_offset_s)
+    method = _METHODS[config.method]
+    return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
+
+
+def finished(
+    run: Callable[[], MethodEstimate], drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+) -> tuple[CalibrationResult, MethodEstimate | None]:
+    """The result of what ``run`` estimates, and the estimate itself; None where it finds none."""
     began = time.perf_counter()
+    estimate = None
     try:
-        estimate = _METHODS[config.method](drives, guess, config, progress)
+        estimate = run()
         result = result_of(estimate, drives, guess, config)
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
@@ -121,7 +130,7 @@ def calibrate_prepared(
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
         diagnostics["left_out"] = left_out
-    return replace(result, diagnostics=diagnostics)
+    return replace(result, diagnostics=diagnostics), estimate
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -140,7 +149,12 @@ def joint_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> MethodEstimate:
     """The default: a global search, then object outlines over the whole drive in one factor graph."""
-    problem = CalibrationProblem.of(drives, guess, config, progress)
+    return solve_problem(CalibrationProblem.of(drives, guess, config, progress))
+
+
+def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
+    """The steps of the joint method."""
+    drives = problem.drives
     # 1. Start: a global search, whose candidates are compared on a few scans.
     start = problem.start()
     # 2. Outlines over all frames, from the best start and from others that are nearly as good.
@@ -175,6 +189,7 @@ def joint_method(
         | {"start_score": start.score, "contradictions": contradictions.diagnostics}
         | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
         | joint_diagnostics(problem, motion.estimate, lower),
+        JointOutcome(problem, motion.estimate, assumptions.considered),
     )
 
 

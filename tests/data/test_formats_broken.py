@@ -172,7 +172,7 @@ def test_a_broken_drive_ends_a_command_with_2(
         ("raw", {"sequence": "0007"}, "is itself the folder of a drive"),
         ("raw", {"camera": "left"}, "expected image_0N"),
         ("folder", {"sequence": "0"}, "images and clouds only"),
-        ("folder", {"camera": "left"}, "images and clouds only"),
+        ("folder", {"camera": "left"}, "cameras images: none is .left."),
         ("nuscenes", {}, "2 scenes .scene-0061, scene-0103.: name one of them"),
         ("nuscenes", {"sequence": "7"}, "none is '7'"),
         ("nuscenes", {"sequence": "61", "camera": "CAM_LEFT"}, "has CAM_BACK, CAM_FRONT"),

@@ -220,4 +220,4 @@ def _place(bag: Bag, place: Stamped) -> str:
     return f"{bag.path}, {place.message.topic} at {place.stamp_ns} ns"
 
 
-ROS_LOADER = Loader(recognizes=is_ros, open=open_ros, layout=LAYOUT, unused=("sequence", "camera", "cloud"))
+ROS_LOADER = Loader(recognizes=is_ros, open=open_ros, layout=LAYOUT, unused=("sequence", "cloud"))
