@@ -21,7 +21,12 @@ from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
-MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
+MOVABLE_CLASSES = (
+    SemanticClass.VEHICLE,
+    SemanticClass.PERSON,
+    SemanticClass.TWO_WHEELER,
+    SemanticClass.OBJECT,
+)
 """Classes whose members may move by themselves."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
