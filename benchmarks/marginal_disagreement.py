@@ -32,7 +32,9 @@ ROUNDS = 3
 """How often marginals are taken again at the fused estimate."""
 
 
-def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+def drive(
+    seed: int, cTl: gtsam.Pose3, time_offset_s: float
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """A drive whose matches fit a calibration, solved."""
     rng = np.random.default_rng(seed)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -40,7 +42,7 @@ def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.Nonlinear
     for k in range(6):
         lPs = np.stack([rng.uniform(6, 40, 80), rng.uniform(-6, 6, 80), rng.uniform(-2, 1, 80)], axis=1)
         twist = rng.normal(0.0, 1.0, 6) * [0.3, 0.5, 0.2, 1.0, 0.5, 6.0]
-        moved = gtsam.Pose3.Expmap(-(offset_s - 0.02) * twist) * cTl
+        moved = gtsam.Pose3.Expmap(-(time_offset_s - 0.02) * twist) * cTl
         pixels = CAMERA.project(moved.transformFrom(lPs.T).T) + rng.normal(0.0, 3.0, (80, 2))
         angles, seen = rng.uniform(0.0, 2.0 * np.pi, 80), np.isfinite(pixels).all(axis=1)
         normals = np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -53,10 +55,10 @@ def drive(seed: int, cTl: gtsam.Pose3, offset_s: float) -> tuple[gtsam.Nonlinear
         values.insert(V, twist)
     graph.add(time_offset_prior(bias, 0.0, 1.0))
     graph.add(gtsam.PriorFactorPose3(E, cTl, gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
-    graph.add(time_offset_prior(D, offset_s, 1.0))
+    graph.add(time_offset_prior(D, time_offset_s, 1.0))
     values.insert(bias, np.zeros(1))
     values.insert(E, cTl)
-    values.insert(D, np.array([offset_s]))
+    values.insert(D, np.array([time_offset_s]))
     return graph, gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
 
@@ -80,7 +82,7 @@ def pair(seed: int, apart: float) -> tuple[float, list[float]]:
     )
     misses = [_miss(joint, fused)]
     for _ in range(ROUNDS):
-        at = fused.cTl, fused.offset_s
+        at = fused.cTl, fused.time_offset_s
         again = [marginal_of_graph(graph, values, E, D, at=at) for graph, values in graphs]
         fused = fuse_marginals(again, significance=0.0)
         misses.append(_miss(joint, fused))
@@ -101,7 +103,7 @@ def _length(step: FloatArray, covariance: FloatArray) -> float:
 
 
 def _miss(joint: CalibrationMarginal, fused: CalibrationMarginal) -> float:
-    step = _between(joint.cTl, joint.offset_s, fused.cTl, fused.offset_s)
+    step = _between(joint.cTl, joint.time_offset_s, fused.cTl, fused.time_offset_s)
     return float(np.sqrt(step @ joint.information @ step))
 
 

@@ -45,7 +45,9 @@ def main() -> None:
         )
         source = simulate(street)
         drive = prepare_drive(source, [SemanticClass.VEHICLE], PrepareConfig(use_visual_odometry=False))
-        found = [calibrate_prepared([first(drive, n)], source.truth.cTl, initial_offset_s=0.05) for n in CUTS]
+        found = [
+            calibrate_prepared([first(drive, n)], source.truth.cTl, initial_time_offset_s=0.05) for n in CUTS
+        ]
         record = frames_of(found[0])
         view = np.mean([frame.view for frame in record], axis=0)
         for count, result in zip(CUTS[1:], found[1:], strict=True):

@@ -70,8 +70,8 @@ def single_match_factor(alignment: Alignment, i: int) -> gtsam.CustomFactor:
     sigma, kernel_scale = float(alignment.sigmas_px[i]), alignment.kernel.scale
     zero = np.zeros((2, 3))
 
-    def function(cTl, offset_s, twist, *, jacobians):
-        xi = -offset_s[0] * twist
+    def function(cTl, time_offset_s, twist, *, jacobians):
+        xi = -time_offset_s[0] * twist
         moved = gtsam.Pose3.Expmap(xi) * cTl
         X, Y, Z = cP = moved.transformFrom(lP)
         r = np.array([CAMERA.fx * X / Z + CAMERA.cx - q[0], CAMERA.fy * Y / Z + CAMERA.cy - q[1]]) / sigma
@@ -83,7 +83,7 @@ def single_match_factor(alignment: Alignment, i: int) -> gtsam.CustomFactor:
         by_left = np.hstack([zero, uv_H_cP])
         by_left[:, :3] = np.cross(cP, uv_H_cP)
         by_xi = by_left @ se3_left_jacobian(xi)
-        H = [by_left @ moved.AdjointMap(), -(by_xi @ twist)[:, None], -offset_s[0] * by_xi]
+        H = [by_left @ moved.AdjointMap(), -(by_xi @ twist)[:, None], -time_offset_s[0] * by_xi]
         return root_w * r, H
 
     return custom_factor(gtsam.noiseModel.Unit.Create(2), [E, D, V], function, [6, 1, 6], 2)

@@ -25,7 +25,7 @@ from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.window.epochs import EPOCH_S
 from sst_graph.types import Frame
 
-DRIFT = DriftConfig(enabled=True, rotation_deg=0.05, translation_m=0.0005, offset_s=0.001)
+DRIFT = DriftConfig(enabled=True, rotation_deg=0.05, translation_m=0.0005, time_offset_s=0.001)
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Walk:
     def random(cls, frames: int, seed: int) -> Walk:
         rng, root = np.random.default_rng(seed), np.sqrt(PERIOD_NS * 1e-9)
         yaw = np.radians(DRIFT.rotation_deg) * root * rng.standard_normal(frames)
-        shift = DRIFT.offset_s * root * rng.standard_normal(frames)
+        shift = DRIFT.time_offset_s * root * rng.standard_normal(frames)
         return cls(np.cumsum(yaw), np.cumsum(shift))
 
 

@@ -195,7 +195,7 @@ def main() -> None:
         "chi2_p999": float(np.quantile(chi2, 0.999)) if chi2 else None,
         "rotation_error_deg": float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(error.rotation())))),
         "translation_error_m": float(np.linalg.norm(error.translation())),
-        "time_offset_s": tracker.estimate.point.offset_s,
+        "time_offset_s": tracker.estimate.point.time_offset_s,
         "sigmas": np.sqrt(np.diag(tracker.estimate.covariance)[:7]).tolist(),
     }
     print(json.dumps(report, indent=2))

@@ -73,7 +73,7 @@ def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: Simulat
     """Cells: the alarm's frame; suspected, unconfirmed, silent frames; status, errors and NEES at the end."""
     alarms, suspected, unconfirmed, silent, speed = [], 0, 0, 0, 0.0
     truth = gtsam.Pose3(step.rotation, np.zeros(3)) * drive.truth.cTl
-    offset_s = (drive.truth.time_offset_s or 0.0) - 1e-3 * step.late_ms
+    time_offset_s = (drive.truth.time_offset_s or 0.0) - 1e-3 * step.late_ms
     for k, frame in enumerate(frames):
         assert frame.image is not None
         update = tracker.add(dataclasses.replace(frame, image=step.applied(frame.image, drive)))
@@ -81,7 +81,7 @@ def _frames_of(tracker: Tracker, frames: list[Frame], step: Step, drive: Simulat
         suspected += bool(update.suspected_change)
         unconfirmed += update.status == "unconfirmed"
         error = np.append(
-            gtsam.Pose3.Logmap(update.T_camera_lidar.between(truth)), offset_s - update.time_offset_s
+            gtsam.Pose3.Logmap(update.T_camera_lidar.between(truth)), time_offset_s - update.time_offset_s
         )
         known = np.diag(update.sigmas**2) if update.covariance is None else update.covariance
         nees = error @ np.linalg.solve(known, error) / 7.0

@@ -4,7 +4,7 @@ The cost of a factor is the robust cost sum rho(|r_i| / sigma_i); its linearizat
 w_i of each match. Condensed (the default) it has cols + 2 rows however many matches there are, with the
 cost, gradient and Gauss-Newton Hessian of the stacked factor.
 
-Variables are given by their key; a constant in place of a key fixes the quantity: ``offset_s=0.1`` or
+Variables are given by their key; a constant in place of a key fixes the quantity: ``time_offset_s=0.1`` or
 ``c_twist=np.zeros(6)``. Extrinsic Pose3, offset and bias ``Vector(1)`` or ``double``, twist ``Vector(6)``.
 """
 
@@ -40,7 +40,7 @@ __all__ = [
 ]
 
 FloatArray = NDArray[np.float64]
-_COLUMNS = {"cTl": range(0, 6), "offset_s": range(6, 7), "c_twist": range(7, 13)}
+_COLUMNS = {"cTl": range(0, 6), "time_offset_s": range(6, 7), "c_twist": range(7, 13)}
 """Where each quantity stands among the Jacobian's columns; biases follow, the residual is last."""
 _NAME = "frame_factor"
 
@@ -78,7 +78,7 @@ class LinearTerm:
 def point_to_pixel_factor(
     alignment: Alignment,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float = 0.0,
+    time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
     *,
     condensed: bool = True,
@@ -88,13 +88,13 @@ def point_to_pixel_factor(
     SST-Calib, eq. 2. See :func:`frame_factor` for the arguments.
     """
     _require_points(alignment)
-    return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist, condensed=condensed)
 
 
 def pixel_to_point_factor(
     alignment: Alignment,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float = 0.0,
+    time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
     *,
     condensed: bool = True,
@@ -105,13 +105,13 @@ def pixel_to_point_factor(
     way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weights``.
     """
     _require_points(alignment)
-    return frame_factor([alignment], cTl, offset_s, c_twist, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist, condensed=condensed)
 
 
 def silhouette_factor(
     alignment: Alignment,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float = 0.0,
+    time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
     bias_px: int | float | None = None,
     *,
@@ -129,7 +129,7 @@ def silhouette_factor(
     """
     if alignment.normals is None:
         raise FactorError("alignment of a silhouette", "no normals", "unit normals (n, 2)")
-    return frame_factor([alignment], cTl, offset_s, c_twist, bias_px, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist, bias_px, condensed=condensed)
 
 
 def _require_points(alignment: Alignment) -> None:
@@ -140,7 +140,7 @@ def _require_points(alignment: Alignment) -> None:
 def frame_factor(
     alignments: Sequence[Alignment],
     cTl: int | gtsam.Pose3,
-    offset_s: int | float = 0.0,
+    time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | None = None,
     *,
@@ -152,7 +152,7 @@ def frame_factor(
     Args:
         alignments: one or more, over the same image (one twist).
         cTl: key of the extrinsic, or a fixed pose.
-        offset_s: key of the time offset, or a fixed offset [s] (a float: an int is a key, and 0 is refused).
+        time_offset_s: its key, or a fixed one [s] (a float: an int is a key, and 0 is refused).
         c_twist: key of the image's twist, a fixed twist (6,) [rad/s, m/s], or None for zero.
         biases_px: key of the mask bias, a fixed bias [px], or None; one for all silhouettes, or a sequence
             with one entry for each alignment (None for those that are point-to-pixel; a
@@ -166,7 +166,7 @@ def frame_factor(
     Raises:
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
-    frame = frame_residual(alignments, cTl, offset_s, c_twist, biases_px, terms)
+    frame = frame_residual(alignments, cTl, time_offset_s, c_twist, biases_px, terms)
     rows = row_count(frame.variables, alignments, condensed)
     function = _FrameError(frame, condensed, rows)
     noise = gtsam.noiseModel.Unit.Create(rows)
@@ -257,7 +257,7 @@ class FrameResidual:
 
     parts: tuple[_Part, ...]
     cTl: _Source
-    offset_s: _Source
+    time_offset_s: _Source
     c_twist: _Source
     variables: Variables
 
@@ -266,7 +266,7 @@ class FrameResidual:
         return self.variables.cols
 
     def _state(self, values: Sequence[Any]) -> tuple[gtsam.Pose3, float, FloatArray]:
-        return self.cTl.value(values), _scalar(self.offset_s.value(values)), self.c_twist.value(values)
+        return self.cTl.value(values), _scalar(self.time_offset_s.value(values)), self.c_twist.value(values)
 
     def _weighted(self, part: _Part, values: Sequence[Any]) -> tuple[Evaluated, float]:
         """Weighted [J r] of one alignment and its constant."""
@@ -326,7 +326,7 @@ class FrameResidual:
 def frame_residual(
     alignments: Sequence[Alignment],
     cTl: Any,
-    offset_s: Any,
+    time_offset_s: Any,
     c_twist: Any,
     biases_px: Any,
     terms: Sequence[Sequence[LinearTerm]] | None = None,
@@ -341,13 +341,13 @@ def frame_residual(
         if alignment.c_acceleration.ndim > 1:
             found = f"shape {alignment.c_acceleration.shape}"
             raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")
-    pose, offset = pose_or_key(name, "cTl", cTl), number_or_key(name, "offset_s", offset_s)
+    pose, offset = pose_or_key(name, "cTl", cTl), number_or_key(name, "time_offset_s", time_offset_s)
     twist = _twist_or_key(name, c_twist)
     biases = [_biases_and_groups(name, bias) for bias in _bias_of_each(alignments, biases_px)]
     terms_of_each = _terms_of_each(alignments, terms)
     arguments = [
         Argument("cTl", pose, gtsam.Pose3),
-        Argument("offset_s", offset, Vector(1)),
+        Argument("time_offset_s", offset, Vector(1)),
         Argument("c_twist", twist, Vector(6)),
         *_numbered("bias", [bias for own, _ in biases for bias in own]),
         *_numbered("term", [checked_key(name, "terms", term.key) for own in terms_of_each for term in own]),
@@ -362,7 +362,7 @@ def frame_residual(
     parts = []
     for alignment, (own_biases, groups), own_terms in zip(alignments, biases, terms_of_each, strict=True):
         columns, targets = [], []
-        named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["offset_s"]), (twist, _COLUMNS["c_twist"])]
+        named = [(pose, _COLUMNS["cTl"]), (offset, _COLUMNS["time_offset_s"]), (twist, _COLUMNS["c_twist"])]
         singles = [*(term.key for term in own_terms), *own_biases]
         named += [(value, range(13 + i, 14 + i)) for i, value in enumerate(singles)]
         for value, own in named:

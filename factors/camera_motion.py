@@ -65,7 +65,7 @@ def camera_motion_factor(
     first: Between,
     second: Between,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float,
+    time_offset_s: int | float,
     c1Tc2: gtsam.Pose3,
     covariance: ArrayLike,
     *,
@@ -77,7 +77,7 @@ def camera_motion_factor(
     Args:
         first, second: where the two images fall; they may share poses.
         cTl: key of the extrinsic, or a fixed pose.
-        offset_s: key of the time offset, or a fixed offset [s].
+        time_offset_s: key of the time offset, or a fixed offset [s].
         c1Tc2: measured pose of the camera at image 2 in the camera at image 1; any length where the scale
             is unknown.
         covariance: (6, 6) of it [rot, trans], right perturbation; see
@@ -86,19 +86,19 @@ def camera_motion_factor(
         scale_known: False where the translation's direction alone was measured.
 
     Returns:
-        A factor of 6 rows on the distinct keys: poses of the first, of the second, cTl, offset_s.
+        A factor of 6 rows on the distinct keys: poses of the first, of the second, cTl, time_offset_s.
 
     Raises:
         FactorError: one key for two variables, or a covariance that is none.
     """
     error_of, noise = camera_motion_error(c1Tc2, covariance, scale_known)
-    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
+    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
     arguments = [
         Argument(f"{end} of the {name}", getattr(where, end), gtsam.Pose3, shared_with="X_")
         for name, where in (("first", first), ("second", second))
         for end in ("X_a", "X_b")
     ]
-    arguments += [Argument("cTl", E, gtsam.Pose3), Argument("offset_s", D, Vector(1))]
+    arguments += [Argument("cTl", E, gtsam.Pose3), Argument("time_offset_s", D, Vector(1))]
     variables = Variables.of(_NAME, arguments)
     chain = _Chain(first, second, E, D, body_in_lidar(_NAME, bTl))
     function = partial(_error, variables.keys, chain, error_of)
@@ -120,14 +120,14 @@ class _Chain:
     first: Between
     second: Between
     cTl: int | gtsam.Pose3
-    offset_s: int | float
+    time_offset_s: int | float
     lTb: gtsam.Pose3
 
     def motion(self, named: dict[int, Any], jacobians: bool) -> tuple[gtsam.Pose3, dict[int, FloatArray]]:
         """c1Tc2, and its right derivatives (6, dim) by the variables, where they are asked for."""
-        cTl, offset_s = self.cTl, self.offset_s
+        cTl, time_offset_s = self.cTl, self.time_offset_s
         extrinsic = cTl if isinstance(cTl, gtsam.Pose3) else named[cTl]
-        offset = named[offset_s][0] if isinstance(offset_s, int | np.integer) else offset_s
+        offset = named[time_offset_s][0] if isinstance(time_offset_s, int | np.integer) else time_offset_s
         wTl_1, H_1 = _lidar_at(self.first, named, offset, self.lTb)
         wTl_2, H_2 = _lidar_at(self.second, named, offset, self.lTb)
         l1Tl2 = wTl_1.between(wTl_2)
@@ -142,20 +142,20 @@ class _Chain:
             H[where.X_a] += lead @ L_H[0]
             H[where.X_b] += lead @ L_H[1]
             by_offset[:, 0] += lead @ L_H[2]
-        if isinstance(offset_s, int | np.integer):
-            H[int(offset_s)] = by_offset
+        if isinstance(time_offset_s, int | np.integer):
+            H[int(time_offset_s)] = by_offset
         if not isinstance(cTl, gtsam.Pose3):
             H[int(cTl)] = cAd @ (back - np.eye(6))
         return predicted, H
 
 
 def _lidar_at(
-    where: Between, named: dict[int, Any], offset_s: float, lTb: gtsam.Pose3
+    where: Between, named: dict[int, Any], time_offset_s: float, lTb: gtsam.Pose3
 ) -> tuple[gtsam.Pose3, tuple[FloatArray, FloatArray, FloatArray]]:
     """wTl at an image's instant, and its right derivatives by X_a (6, 6), X_b (6, 6) and the offset (6,)."""
     X_a, X_b = named[where.X_a], named[where.X_b]
     xi = np.asarray(gtsam.Pose3.Logmap(X_a.between(X_b)))
-    s = (where.image_after_a_s + offset_s) / where.seconds
+    s = (where.image_after_a_s + time_offset_s) / where.seconds
     part = gtsam.Pose3.Expmap(s * xi)
     # Log(X_a^-1 X_b Exp(d)) = xi + Jr^-1(xi) d, and by X_a with Jl^-1(xi) = Jr^-1(-xi)
     stretch = s * np.asarray(gtsam.Pose3.ExpmapDerivative(s * xi))

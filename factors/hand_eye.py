@@ -3,8 +3,8 @@
     c1Tc2 = cTl . l1Tl2(d) . cTl^-1,    l1Tl2(d) = Exp(-l_twist_1 d) . l1Tl2 . Exp(l_twist_2 d)
 
 The camera moves from its stamp t1 to t2, on the LiDAR's clock from t1 + D to t2 + D. The LiDAR's motion
-l1Tl2 was measured over [t1 + offset_0, t2 + offset_0] and is carried by d = D - offset_0 at both ends
-with the LiDAR's twist there. Turns determine the rotation, and turns that begin or end the time offset;
+l1Tl2 was measured over [t1 + D0, t2 + D0], D0 = ``time_offset_0_s``, and is carried by d = D - D0 at both
+ends with the LiDAR's twist there. Turns determine the rotation, and turns that begin or end the time offset;
 translation along the axis of a plane motion stays free. Sources: Taylor & Nieto, Motion-based calibration
 of multimodal sensor extrinsics and timing offset estimation, T-RO 2016; Park et al., Spatiotemporal
 camera-LiDAR calibration, 2020.
@@ -41,7 +41,7 @@ def hand_eye_factor(
     l1Tl2: gtsam.Pose3,
     l_twist_1: ArrayLike,
     l_twist_2: ArrayLike,
-    offset_0: float,
+    time_offset_0_s: float,
     covariance: ArrayLike,
     scale_known: bool = True,
 ) -> gtsam.CustomFactor:
@@ -54,15 +54,15 @@ def hand_eye_factor(
         E: extrinsic.
         D: time offset, or None where the motions are known to be synchronous (d = 0).
         c1Tc2: measured pose of the camera at 2 in the camera at 1; any length where the scale is unknown.
-        l1Tl2: measured pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``offset_0``.
+        l1Tl2: measured pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``time_offset_0_s``.
         l_twist_1, l_twist_2: (6,) twist of the LiDAR in its own frame at both ends [rad/s, m/s].
-        offset_0: the time offset at which l1Tl2 was measured [s].
+        time_offset_0_s: the time offset at which l1Tl2 was measured [s].
         covariance: (6, 6) of the error [rot, trans], right perturbation of c1Tc2: both motions' together,
             that of the LiDAR carried to the camera. With an unknown scale its part across the translation,
             divided by the length that c1Tc2 has, is the direction's [rad^2]; that along it is not used.
         scale_known: see above.
     """
-    motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, offset_0)
+    motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, time_offset_0_s)
     motion_error, noise = camera_motion_error(c1Tc2, covariance, scale_known)
     return _factor("hand_eye_factor", E, D, partial(_hand_eye, motion, motion_error), noise, 6)
 
@@ -82,7 +82,7 @@ def rotation_hand_eye(
     l1Rl2: gtsam.Rot3,
     l_omega_1: ArrayLike,
     l_omega_2: ArrayLike,
-    offset_0: float,
+    time_offset_0_s: float,
     covariance: ArrayLike,
 ) -> gtsam.CustomFactor:
     """Log(c1Rc2^-1 . cRl . l1Rl2(d) . cRl^-1) [rad]; arguments as in :func:`hand_eye_factor`, rotation only.
@@ -92,7 +92,7 @@ def rotation_hand_eye(
     twists = [
         np.concatenate([checked_array("l_omega", w, (3,)), np.zeros(3)]) for w in (l_omega_1, l_omega_2)
     ]
-    motion = _LidarMotion(gtsam.Pose3(l1Rl2, np.zeros(3)), twists[0], twists[1], offset_0)
+    motion = _LidarMotion(gtsam.Pose3(l1Rl2, np.zeros(3)), twists[0], twists[1], time_offset_0_s)
     noise = gtsam.noiseModel.Gaussian.Covariance(
         checked_covariance("covariance of the rotation", covariance, 3)
     )
@@ -122,18 +122,20 @@ def _factor(
 class _LidarMotion:
     """l1Tl2(d), and the camera's motion that it predicts."""
 
-    def __init__(self, l1Tl2: gtsam.Pose3, twist_1: ArrayLike, twist_2: ArrayLike, offset_0: float) -> None:
+    def __init__(
+        self, l1Tl2: gtsam.Pose3, twist_1: ArrayLike, twist_2: ArrayLike, time_offset_0_s: float
+    ) -> None:
         self.l1Tl2 = l1Tl2
         self.twist_1 = checked_array("l_twist_1", twist_1, (6,))
         self.twist_2 = checked_array("l_twist_2", twist_2, (6,))
-        self.offset_0 = float(checked_array("offset_0", [offset_0], (1,))[0])
+        self.time_offset_0_s = float(checked_array("time_offset_0_s", [time_offset_0_s], (1,))[0])
 
     def in_camera(
         self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...], jacobians: bool
     ) -> tuple[gtsam.Pose3, list[FloatArray]]:
         """cTl . l1Tl2(d) . cTl^-1, and where they are asked for its Jacobians (6, dim) by cTl [and the
         offset], right perturbations."""
-        d = float(offset[0][0]) - self.offset_0 if offset else 0.0
+        d = float(offset[0][0]) - self.time_offset_0_s if offset else 0.0
         moved = gtsam.Pose3.Expmap(-d * self.twist_1) * self.l1Tl2 * gtsam.Pose3.Expmap(d * self.twist_2)
         predicted = cTl * moved * cTl.inverse()
         if not jacobians:

@@ -136,8 +136,8 @@ class Alignment:
         taus = self.base_taus_s
         return float(taus[0]) if len(taus) and bool((taus == taus[0]).all()) else None
 
-    def taus_s(self, offset_s: float) -> FloatArray | float:
+    def taus_s(self, time_offset_s: float) -> FloatArray | float:
         """Intervals at a time offset: one float where all points share one, else (n,) [s]."""
         if self.common_tau_s is not None:
-            return offset_s + self.common_tau_s
-        return np.asarray(offset_s + self.base_taus_s)
+            return time_offset_s + self.common_tau_s
+        return np.asarray(time_offset_s + self.base_taus_s)

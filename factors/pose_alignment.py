@@ -45,7 +45,7 @@ def pose_alignment_factor(
     X_a: int,
     X_b: int,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float,
+    time_offset_s: int | float,
     seconds: float,
     *,
     X_scan: int | None = None,
@@ -67,7 +67,7 @@ def pose_alignment_factor(
             instant of X_a: ``base_taus_s`` is t_image_stamp - t_a.
         X_a, X_b: keys of wTb before and after (Pose3), distinct.
         cTl: key of the extrinsic, or a fixed pose.
-        offset_s: key of the time offset, or a fixed offset [s].
+        time_offset_s: key of the time offset, or a fixed offset [s].
         seconds: from X_a to X_b, in the LiDAR's clock [s].
         X_scan: key of wTb at the scan's stamp, where that is another pose than X_a.
         bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
@@ -82,14 +82,14 @@ def pose_alignment_factor(
         condensed: False gives one or two rows a match and one more.
 
     Returns:
-        A factor on the distinct keys: X_a, X_b, X_scan, cTl, offset_s, biases; its noise is the unit's or,
-        in all its rows, the given one.
+        A factor on the distinct keys: X_a, X_b, X_scan, cTl, time_offset_s, biases; its noise is the unit's
+        or, in all its rows, the given one.
 
     Raises:
         FactorError: keys or intervals that make no factor; see also :func:`sst_graph.factors.frame_factor`.
     """
     frame = _on_poses(
-        alignments, X_a, X_b, cTl, offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s
+        alignments, X_a, X_b, cTl, time_offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s
     )
     variables = frame.variables
     rows = row_count(variables, alignments, condensed)
@@ -136,7 +136,7 @@ class _PoseFrame:
             twist goes under the key X_a there; the extrinsic is always a variable.
         variables: of the factor.
         X_a, X_b, X_s: keys of the poses.
-        cTl, offset_s: key or constant.
+        cTl, time_offset_s: key or constant.
         lTb: pose of the body in the LiDAR.
         seconds: from X_a to X_b [s].
         c_acceleration: (6,) [rad/s^2, m/s^2], zero where the mean twist is used as it is.
@@ -149,7 +149,7 @@ class _PoseFrame:
     X_b: int
     X_s: int
     cTl: int | gtsam.Pose3
-    offset_s: int | float
+    time_offset_s: int | float
     lTb: gtsam.Pose3
     seconds: float
     c_acceleration: FloatArray
@@ -178,8 +178,10 @@ class _PoseFrame:
 
     def _after_middle_s(self, named: dict[int, Any]) -> float:
         """True time of the image after the middle between X_a and X_b [s]."""
-        offset_s = named[self.offset_s][0] if isinstance(self.offset_s, int) else self.offset_s
-        return float(offset_s) + self.image_after_middle_s
+        time_offset_s = (
+            named[self.time_offset_s][0] if isinstance(self.time_offset_s, int) else self.time_offset_s
+        )
+        return float(time_offset_s) + self.image_after_middle_s
 
     def _step(self, named: dict[int, Any]) -> FloatArray:
         """Log(wTb_a^-1 wTb_b)."""
@@ -225,8 +227,8 @@ class _PoseFrame:
         rows[:, outer[self.X_b]] += scaled @ np.linalg.inv(se3_left_jacobian(-step))
         if isinstance(self.cTl, int):
             rows[:, outer[self.cTl]] -= Ad_cTl @ twist_ad(Ad_lTb @ step / self.seconds)
-        if isinstance(self.offset_s, int):
-            rows[:, outer[self.offset_s]] += self.c_acceleration[:, None]
+        if isinstance(self.time_offset_s, int):
+            rows[:, outer[self.time_offset_s]] += self.c_acceleration[:, None]
 
     def _lift_extrinsic(self, rows: FloatArray, outer: dict[int, slice], named: dict[int, Any]) -> None:
         """By cTl, and where the scan has a pose of its own by X_s and X_a."""
@@ -251,7 +253,7 @@ def _on_poses(
     X_a: int,
     X_b: int,
     cTl: int | gtsam.Pose3,
-    offset_s: int | float,
+    time_offset_s: int | float,
     seconds: float,
     X_scan: int | None,
     bTl: gtsam.Pose3 | None,
@@ -260,14 +262,14 @@ def _on_poses(
 ) -> _PoseFrame:
     X_a, X_b = checked_key(_NAME, "X_a", X_a), checked_key(_NAME, "X_b", X_b)
     X_s = X_a if X_scan is None else checked_key(_NAME, "X_scan", X_scan)
-    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "offset_s", offset_s)
+    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
     inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, name=_NAME)
     arguments = [
         Argument("X_a", X_a, gtsam.Pose3),
         Argument("X_b", X_b, gtsam.Pose3),
         Argument("X_scan", X_s, gtsam.Pose3, shared_with="X_"),
         Argument("cTl", E, gtsam.Pose3),
-        Argument("offset_s", D, Vector(1)),
+        Argument("time_offset_s", D, Vector(1)),
     ]
     arguments += [
         Argument(name, key, Vector(1))

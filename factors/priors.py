@@ -22,11 +22,11 @@ FloatArray = NDArray[np.float64]
 
 
 def time_offset_prior(
-    D_key: int, offset_s: float, sigma_s: float, *, double: bool = False
+    D_key: int, time_offset_s: float, sigma_s: float, *, double: bool = False
 ) -> gtsam.PriorFactorVector | gtsam.PriorFactorDouble:
-    """D - offset_s with sigma_s [s]; ``double``: D is kept as a ``double``."""
+    """D - time_offset_s with sigma_s [s]; ``double``: D is kept as a ``double``."""
     key = checked_key("time_offset_prior", "D_key", D_key)
-    prior = checked_array("offset_s", [offset_s], (1,))
+    prior = checked_array("time_offset_s", [time_offset_s], (1,))
     noise = gtsam.noiseModel.Isotropic.Sigma(1, checked_positive("sigma_s", sigma_s))
     if double:
         return gtsam.PriorFactorDouble(key, float(prior[0]), noise)

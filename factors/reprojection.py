@@ -34,7 +34,7 @@ FloatArray = NDArray[np.float64]
 def residuals(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
     jacobians: Literal[True] = True,
@@ -43,7 +43,7 @@ def residuals(
 def residuals(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
     *,
@@ -52,7 +52,7 @@ def residuals(
 def residuals(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
     jacobians: bool = True,
@@ -62,7 +62,7 @@ def residuals(
     Args:
         alignment: n matches.
         cTl: pose of the LiDAR in the camera.
-        offset_s: time offset [s].
+        time_offset_s: time offset [s].
         c_twist: (6,) camera twist at the image's instant, or (6, n) at the instant of each match's image
             [rad/s, m/s].
         bias_px: silhouettes only: how far the mask's contour lies outside the true outline [px]
@@ -73,7 +73,7 @@ def residuals(
         r (rows,): first all u, then all v (or one row a match); J (rows, 13 [+1]) with columns [rot,
         trans, offset, twist (6), bias] [px/rad, px/m, px/s, ...]. Rows of points behind are zero.
     """
-    evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians)
+    evaluated = evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians)
     if not jacobians:
         return evaluated.rows[-1].reshape(-1), None
     system = evaluated.system()
@@ -83,7 +83,7 @@ def residuals(
 def weighted_residuals(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray, float]:
@@ -93,7 +93,7 @@ def weighted_residuals(
         r and J as :func:`residuals` gives them, each row multiplied by sqrt(weight w_i) / sigma_i, and
         the constant c = 2 cost - |r|^2 >= 0 that makes ``(|r|^2 + c) / 2`` the robust cost.
     """
-    evaluated = evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=True)
+    evaluated = evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians=True)
     constant = weigh(alignment, evaluated)
     system = evaluated.system()
     return system[-1], system[:-1].T, constant
@@ -102,12 +102,12 @@ def weighted_residuals(
 def alignment_cost(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None = None,
 ) -> float:
     """Robust cost: sum weight_i rho(|r_i| / sigma_i), with points behind as the module says."""
-    return cost(alignment, evaluate(alignment, cTl, offset_s, c_twist, bias_px, jacobians=False))
+    return cost(alignment, evaluate(alignment, cTl, time_offset_s, c_twist, bias_px, jacobians=False))
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Evaluated:
 def evaluate(
     alignment: Alignment,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     bias_px: float | FloatArray | None,
     jacobians: bool,
@@ -190,7 +190,7 @@ def evaluate(
             "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
         )
     twist = np.asarray(c_twist, dtype=np.float64)
-    taus_s = alignment.taus_s(float(offset_s))
+    taus_s = alignment.taus_s(float(time_offset_s))
     acceleration, model = alignment.c_acceleration.T, alignment.motion_model
     moved = move_points(cTl, lPs, taus_s, twist, acceleration, model, alignment.velocity_columns)
     X, Y, Z = moved.cPs

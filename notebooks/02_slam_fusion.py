@@ -145,7 +145,7 @@ print(alone.status, alone.sigmas())
 
 def places(values):
     """For every image: the poses around its true time, the LiDAR's twist there and its rate of change."""
-    offset_s = float(values.atVector(D)[0])
+    time_offset_s = float(values.atVector(D)[0])
     poses = [values.atPose3(X(k)) for k in range(N)]
     middles = 0.5 * (stamps_s[1:] + stamps_s[:-1])
     steps = [gtsam.Pose3.Logmap(a.between(b)) for a, b in itertools.pairwise(poses)]
@@ -153,9 +153,9 @@ def places(values):
     rates = np.gradient(twists, middles, axis=0)
     found = []
     for stamp_s in stamps_s:
-        a = int(np.clip(np.searchsorted(stamps_s, stamp_s + offset_s, "right") - 1, 0, N - 2))
+        a = int(np.clip(np.searchsorted(stamps_s, stamp_s + time_offset_s, "right") - 1, 0, N - 2))
         between = Between(X(a), X(a + 1), stamps_s[a + 1] - stamps_s[a], stamp_s - stamps_s[a])
-        twist = twists[a] + (stamp_s + offset_s - middles[a]) * rates[a]
+        twist = twists[a] + (stamp_s + time_offset_s - middles[a]) * rates[a]
         found.append((a, between, twist, rates[a], stamp_s - middles[a]))
     return found
 
@@ -201,11 +201,11 @@ def add_silhouettes(graph, values, where, kernel_px):
 
 def add_visual_odometry(graph, values, where):
     """The camera's motions, metric by the depth that the present calibration gives to image features."""
-    cTl, offset_s = values.atPose3(E), float(values.atVector(D)[0])
+    cTl, time_offset_s = values.atPose3(E), float(values.atVector(D)[0])
 
     def depth(k):
         a, between, twist, *_ = where[k]
-        moved = cTl * gtsam.Pose3.Expmap(-(between.image_after_a_s + offset_s) * twist)
+        moved = cTl * gtsam.Pose3.Expmap(-(between.image_after_a_s + time_offset_s) * twist)
         return moved.transformFrom(prepared.scans[a].depth_lPs.T.astype(float)).T
 
     # between two poses the body does not quite move with one twist
@@ -264,12 +264,12 @@ def trajectory_errors(values):
     }
 
 
-def calibration_errors(cTl, offset_s):
+def calibration_errors(cTl, time_offset_s):
     d = drive.truth.cTl.localCoordinates(cTl)
     return {
         "rotation_deg": float(np.degrees(np.linalg.norm(d[:3]))),
         "translation_cm": float(100 * np.linalg.norm(d[3:])),
-        "offset_ms": float(1e3 * abs(offset_s - drive.truth.time_offset_s)),
+        "offset_ms": float(1e3 * abs(time_offset_s - drive.truth.time_offset_s)),
     }
 
 

@@ -55,9 +55,9 @@ fused = fuse_marginals([marginal_of_result(result) for result in alone])
 both = sst_graph.calibrate(parts, parts[0].nominal)
 
 
-def error_and_sigma(cTl, offset_s, covariance):
+def error_and_sigma(cTl, time_offset_s, covariance):
     """Errors [deg, cm, ms] and the sigmas that go with them."""
-    d = np.append(truth.cTl.localCoordinates(cTl), offset_s - truth.time_offset_s)
+    d = np.append(truth.cTl.localCoordinates(cTl), time_offset_s - truth.time_offset_s)
     parts_of = slice(0, 3), slice(3, 6), slice(6, 7)
     units = np.degrees(1.0), 100.0, 1e3
     found = [u * np.linalg.norm(d[p]) for u, p in zip(units, parts_of, strict=True)]

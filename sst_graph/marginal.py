@@ -2,7 +2,7 @@
 
 The cost of a calibration (cTl, offset), in the tangent space of the linearization point:
 
-    0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - offset_0]
+    0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - time_offset_0_s]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
 docs/export.md shows how a C++ program rebuilds it from the JSON.
@@ -37,7 +37,7 @@ EXTRINSIC = int(gtsam.symbol("E", 0))
 TIME_OFFSET = int(gtsam.symbol("D", 0))
 """Default key of the time offset (``Vector(1)``)."""
 
-_ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "offset_s"]
+_ORDER = ["rot_x_rad", "rot_y_rad", "rot_z_rad", "trans_x_m", "trans_y_m", "trans_z_m", "time_offset_s"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,14 +45,14 @@ class CalibrationMarginal(ByValue):
     """A quadratic cost on extrinsic and time offset; the equation is the module's.
 
     Attributes:
-        cTl, offset_s: linearization point.
+        cTl, time_offset_s: linearization point.
         information: (7, 7) symmetric, positive semi-definite.
         vector: (7,) information times the optimum's d; zero where the point is the optimum.
         constant: twice the cost at d = 0.
     """
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
     information: FloatArray
     vector: FloatArray
     constant: float = 0.0
@@ -69,7 +69,7 @@ class CalibrationMarginal(ByValue):
         """The linearization point as values."""
         values = gtsam.Values()
         values.insert(E_key, self.cTl)
-        values.insert(D_key, np.array([self.offset_s]))
+        values.insert(D_key, np.array([self.time_offset_s]))
         return values
 
     def covariance(self) -> FloatArray:
@@ -87,11 +87,11 @@ class CalibrationMarginal(ByValue):
             EstimationError: a direction without information.
         """
         d = self.covariance() @ self.vector
-        return self.cTl.retract(d[:6]), self.offset_s + float(d[6])
+        return self.cTl.retract(d[:6]), self.time_offset_s + float(d[6])
 
     def plus(self, other: CalibrationMarginal) -> CalibrationMarginal:
         """Both costs together, at this one's linearization point; exact where the two share it."""
-        there = other if self.shares_point(other) else carried(other, self.cTl, self.offset_s)
+        there = other if self.shares_point(other) else carried(other, self.cTl, self.time_offset_s)
         return replace(
             self,
             information=self.information + there.information,
@@ -101,7 +101,7 @@ class CalibrationMarginal(ByValue):
 
     def shares_point(self, other: CalibrationMarginal) -> bool:
         """Whether both are linearized at the very same point."""
-        return self.offset_s == other.offset_s and self.cTl.equals(other.cTl, 0.0)
+        return self.time_offset_s == other.time_offset_s and self.cTl.equals(other.cTl, 0.0)
 
     def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:
         """The marginal as documented in docs/export.md."""
@@ -116,7 +116,7 @@ class CalibrationMarginal(ByValue):
             "conventions": "p_camera = T_camera_lidar * p_lidar; t_lidar = t_camera_stamp + time_offset_s",
             "linearization_point": {
                 "T_camera_lidar": self.cTl.matrix().tolist(),
-                "time_offset_s": self.offset_s,
+                "time_offset_s": self.time_offset_s,
             },
             "information": self.information.tolist(),
             "vector": self.vector.tolist(),
@@ -136,7 +136,7 @@ class CalibrationMarginal(ByValue):
         point = table.table("linearization_point")
         return CalibrationMarginal(
             point.pose("T_camera_lidar"),
-            point.offset_s("time_offset_s"),
+            point.time_offset_s("time_offset_s"),
             _information(table),
             _bounded(table, "vector", table.matrix("vector", (7,))),
             float(_bounded(table, "constant", np.array(table.number("constant")))),
@@ -180,15 +180,15 @@ def _information(table: JsonTable) -> FloatArray:
     return L
 
 
-def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> CalibrationMarginal:
+def carried(marginal: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> CalibrationMarginal:
     """The same cost, expanded about another point: d_0 = shift + J d, J the derivative of Log(T0^-1 T
     Exp(d))."""
     J = np.eye(7)
     step, J[:6, :6] = _log(marginal.cTl.between(cTl))
-    shift = np.append(step, offset_s - marginal.offset_s)
+    shift = np.append(step, time_offset_s - marginal.time_offset_s)
     L, g = marginal.information, marginal.vector
     constant = marginal.constant - 2.0 * float(g @ shift) + float(shift @ L @ shift)
-    return CalibrationMarginal(cTl, offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant)
+    return CalibrationMarginal(cTl, time_offset_s, J.T @ L @ J, J.T @ (g - L @ shift), constant)
 
 
 def _log(pose: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:

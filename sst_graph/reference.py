@@ -31,7 +31,7 @@ def read_reference(path: Path, camera: str = "image_2") -> GroundTruth:
     _check_camera(document.get("camera"), camera, path)
     table = JsonTable(document, str(path))
     known = document.get("time_offset_s") is not None
-    return GroundTruth(table.pose("T_camera_lidar"), table.offset_s("time_offset_s") if known else None)
+    return GroundTruth(table.pose("T_camera_lidar"), table.time_offset_s("time_offset_s") if known else None)
 
 
 def _check_camera(found: object, camera: str, path: Path) -> None:

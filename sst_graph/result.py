@@ -107,7 +107,7 @@ class CalibrationResult:
         method: name of the method.
         config: its settings, as a JSON-able dictionary.
         initial: where the estimation started, or None without a guess.
-        initial_offset_s: time offset at the start [s].
+        initial_time_offset_s: time offset at the start [s].
         read_as: how the drives were read, by option: what pairs of scans and images the result holds for.
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
@@ -126,7 +126,7 @@ class CalibrationResult:
     method: str = "joint"
     config: Mapping[str, Any] = field(default_factory=dict)
     initial: gtsam.Pose3 | None = None
-    initial_offset_s: float = 0.0
+    initial_time_offset_s: float = 0.0
     read_as: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
@@ -186,7 +186,7 @@ class CalibrationResult:
     def _initial_document(self) -> dict[str, Any] | None:
         if self.initial is None:
             return None
-        return {"T_camera_lidar": self.initial.matrix(), "time_offset_s": self.initial_offset_s}
+        return {"T_camera_lidar": self.initial.matrix(), "time_offset_s": self.initial_time_offset_s}
 
     @staticmethod
     def from_json(text: str, place: str | Path = "calibration.json") -> CalibrationResult:
@@ -201,7 +201,7 @@ class CalibrationResult:
         try:
             return CalibrationResult(
                 T_camera_lidar=reader.pose("T_camera_lidar"),
-                time_offset_s=reader.offset_s("time_offset_s"),
+                time_offset_s=reader.time_offset_s("time_offset_s"),
                 covariance=_covariance(reader),
                 status=cast(Status, reader.text("status")),
                 camera=_camera(camera),
@@ -213,13 +213,15 @@ class CalibrationResult:
                     for frame in reader.tables("frames_used")
                 ),
                 drive_offsets=tuple(
-                    DriveOffset(drive.text("drive"), drive.offset_s("time_offset_s"), drive.number("sigma_s"))
+                    DriveOffset(
+                        drive.text("drive"), drive.time_offset_s("time_offset_s"), drive.number("sigma_s")
+                    )
                     for drive in reader.tables("drive_offsets")
                 ),
                 method=reader.text("method", "joint"),
                 config=reader.mapping("config"),
                 initial=None if initial is None else initial.pose("T_camera_lidar"),
-                initial_offset_s=0.0 if initial is None else initial.offset_s("time_offset_s"),
+                initial_time_offset_s=0.0 if initial is None else initial.time_offset_s("time_offset_s"),
                 read_as=reader.mapping("read_as"),
                 diagnostics=reader.mapping("diagnostics"),
                 versions=_versions(reader),

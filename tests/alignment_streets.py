@@ -38,7 +38,7 @@ class Street:
     images: tuple[ImageFeatures, ...]
     motions: tuple[RelativeMotion, ...]
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -54,7 +54,7 @@ class Street:
                 0.075 * translation / np.linalg.norm(translation),
             ]
         )
-        return self.cTl.retract(off), self.offset_s + 0.03 * float(rng.choice([-1.0, 1.0]))
+        return self.cTl.retract(off), self.time_offset_s + 0.03 * float(rng.choice([-1.0, 1.0]))
 
     def term(self, k: int, keys: AlignmentKeys) -> AlignmentTerm:
         """Image k with the scans around it."""
@@ -111,14 +111,16 @@ class Street:
     def errors(self, values: gtsam.Values) -> tuple[float, float, float]:
         """Rotation [deg], translation [m] and offset [s] from the truth."""
         d = self.cTl.localCoordinates(values.atPose3(E))
-        off = abs(float(values.atVector(D)[0]) - self.offset_s)
+        off = abs(float(values.atVector(D)[0]) - self.time_offset_s)
         return float(np.degrees(np.linalg.norm(d[:3]))), float(np.linalg.norm(d[3:])), off
 
     def nees(
         self, values: gtsam.Values, covariance: np.ndarray, truth_sigmas: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> float:
         """Squared error of all seven in units of covariance and the truth's own sigmas [rad, m, s]."""
-        d = np.append(self.cTl.localCoordinates(values.atPose3(E)), values.atVector(D)[0] - self.offset_s)
+        d = np.append(
+            self.cTl.localCoordinates(values.atPose3(E)), values.atVector(D)[0] - self.time_offset_s
+        )
         own = np.diag(np.repeat(truth_sigmas, (3, 3, 1)) ** 2)
         return float(d @ np.linalg.solve(covariance + own, d))
 

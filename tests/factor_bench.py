@@ -30,14 +30,14 @@ class Bench:
     """One scene, and every factor on given keys."""
 
     def __init__(self, make_scene):
-        self.points, self.cTl, self.offset_s, self.twist = make_scene(3)
+        self.points, self.cTl, self.time_offset_s, self.twist = make_scene(3)
         self.contour, *_ = make_scene(3, normals=True)
 
     def values(self, offset=None):
         """All variables; the offset as a Vector(1), or as it is given."""
         values = gtsam.Values()
         values.insert(E, self.cTl)
-        values.insert(D, np.array([self.offset_s]) if offset is None else offset)
+        values.insert(D, np.array([self.time_offset_s]) if offset is None else offset)
         values.insert(B, np.array([0.5]))
         for k in range(3):
             values.insert(V[k], self.twist + 0.01 * k)

@@ -114,10 +114,10 @@ def checkpoint_of(tracker: Tracker) -> bytes:
         return path.read_bytes()
 
 
-def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, offset_s: float) -> float:
+def sigmas_apart(tracker: Tracker, cTl: gtsam.Pose3, time_offset_s: float) -> float:
     """Mahalanobis distance of a tracker's estimate from a calibration."""
     point = tracker.estimate.point
-    step = np.append(gtsam.Pose3.Logmap(point.cTl.between(cTl)), offset_s - point.offset_s)
+    step = np.append(gtsam.Pose3.Logmap(point.cTl.between(cTl)), time_offset_s - point.time_offset_s)
     return float(np.sqrt(step @ np.linalg.solve(tracker.estimate.covariance[:7, :7], step)))
 
 

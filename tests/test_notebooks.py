@@ -52,6 +52,6 @@ def test_two_drives_determine_more_than_one(monkeypatch: pytest.MonkeyPatch, tmp
     fused, both = found["fused"], found["both"]
     for result in found["alone"]:
         assert (np.diag(fused.covariance()) < np.diag(result.covariance)).all()
-    cTl, offset_s = fused.best()
-    d = np.append(both.T_camera_lidar.localCoordinates(cTl), offset_s - both.time_offset_s)
+    cTl, time_offset_s = fused.best()
+    d = np.append(both.T_camera_lidar.localCoordinates(cTl), time_offset_s - both.time_offset_s)
     assert d @ np.linalg.solve(both.covariance, d) < 14.1  # 95 % of chi^2 with 7 degrees of freedom

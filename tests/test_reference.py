@@ -26,11 +26,11 @@ def _write(path: Path, **values: Any) -> Path:
 
 def test_kitti_calibration_of_any_camera(kitti_drive: Path) -> None:
     # P2 = K [I | K^-1 (35 0 0)'] shifts by 35 / 700 = 0.05 m, P3 by -0.5 m; Tr stands at y -0.08, z -0.27.
-    second, offset_s = load_initial(kitti_drive / "calib.txt")
+    second, time_offset_s = load_initial(kitti_drive / "calib.txt")
     third, _ = load_initial(kitti_drive / "calib.txt", "image_3")
     assert second.translation() == pytest.approx([0.05, -0.08, -0.27])
     assert third.translation() == pytest.approx([-0.5, -0.08, -0.27])
-    assert offset_s == 0.0
+    assert time_offset_s == 0.0
     assert read_reference(kitti_drive / "calib.txt").time_offset_s is None
 
 
@@ -44,8 +44,8 @@ def test_result_as_a_start(tmp_path: Path) -> None:
     result = CalibrationResult(POSE, -0.2, np.eye(7), "ok", camera, "image_3")
     path = tmp_path / "calibration.json"
     path.write_text(result.to_json())
-    cTl, offset_s = load_initial(path, "image_3")
-    assert cTl.equals(POSE, 1e-12) and offset_s == -0.2
+    cTl, time_offset_s = load_initial(path, "image_3")
+    assert cTl.equals(POSE, 1e-12) and time_offset_s == -0.2
 
 
 def test_an_unknown_offset_stays_unknown(tmp_path: Path) -> None:

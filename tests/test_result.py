@@ -41,7 +41,7 @@ def _result(**changes: Any) -> CalibrationResult:
         "method": "joint",
         "config": {"method": "joint", "inner": {"sigma_px": 1.5}},
         "initial": gtsam.Pose3(gtsam.Rot3.RzRyRx(0.41, -0.2, 1.0), [0.1, -0.2, 0.3]),
-        "initial_offset_s": 0.05,
+        "initial_time_offset_s": 0.05,
         "diagnostics": {"iterations": 12},
         "versions": {"gtsam": "4.3.0"},
     }
@@ -72,7 +72,7 @@ def test_round_trip_is_exact() -> None:
 
 def test_round_trip_without_a_start() -> None:
     back = CalibrationResult.from_json(_result(initial=None).to_json())
-    assert back.initial is None and back.initial_offset_s == 0.0
+    assert back.initial is None and back.initial_time_offset_s == 0.0
 
 
 def test_sigmas_in_human_units() -> None:

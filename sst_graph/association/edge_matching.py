@@ -169,10 +169,10 @@ class PairedEdges:
         """(n, ...) the value of each point's group, from those of the groups (g, ...)."""
         return np.repeat(np.asarray(of_groups), np.diff(self.bounds), axis=0)
 
-    def projected(self, lPs: FloatArray, cTl: gtsam.Pose3, offset_s: float) -> FloatArray:
+    def projected(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
         """(n, 2) pixels of points (n, 3) of the groups, moved to their images' instant; NaN behind the
         camera."""
-        columns, taus = np.ascontiguousarray(lPs.T), offset_s + self.base_taus_s
+        columns, taus = np.ascontiguousarray(lPs.T), time_offset_s + self.base_taus_s
         if self.velocities is not None:
             columns = columns + taus * self.velocities.T
         groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
@@ -251,7 +251,7 @@ class ScanWithImage:
 def match_silhouettes(
     pair: ScanWithImage,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     biases_px: Mapping[SemanticClass, float],
     kernel: RobustKernel,
     config: MatchConfig,
@@ -284,7 +284,7 @@ def match_silhouettes(
         np.array([biases_px.get(c, 0.0) for c in classes]),
         moving,
     )
-    found = match_edges(paired, cTl, offset_s, kernel, config)
+    found = match_edges(paired, cTl, time_offset_s, kernel, config)
     return {
         c: SilhouetteMatches(
             found.alignment if b - a == len(found.index) else found.alignment.take(np.arange(a, b)),
@@ -311,7 +311,7 @@ def numbered_through(objects: Sequence[IntArray]) -> IntArray:
 def match_edges(
     paired: PairedEdges,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     kernel: RobustKernel,
     config: MatchConfig,
     deviation: PointDeviation | None = None,
@@ -324,10 +324,10 @@ def match_edges(
             camera.
     """
     # 1. Project the points into their images.
-    uvs, shift = paired.projected(paired.points.lPs, cTl, offset_s), None
+    uvs, shift = paired.projected(paired.points.lPs, cTl, time_offset_s), None
     if deviation is not None:
         paired = _deviated(paired, deviation, uvs)
-        ideal = paired.projected(paired.points.lPs, cTl, offset_s)
+        ideal = paired.projected(paired.points.lPs, cTl, time_offset_s)
         shift = _pixel_shift(deviation, paired, ideal)
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
@@ -344,7 +344,7 @@ def match_edges(
     paired, uvs, index = paired.take(near), uvs[near], index[near]
     normals, pixels = feet.normals[near], feet.feet[near]
     # 3. Keep contours that face the outward direction of the object.
-    tips = paired.projected(paired.points.outward, cTl, offset_s)
+    tips = paired.projected(paired.points.outward, cTl, time_offset_s)
     if shift is not None and deviation is not None:
         shift = shift[index]
         tips = tips + _pixel_shift(deviation.take(index), paired, tips)

@@ -127,7 +127,7 @@ class NearestMatches:
 def match_nearest(
     view: ClassView,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray,
     pixel_weight: float,
     max_px: float = np.inf,
@@ -142,7 +142,7 @@ def match_nearest(
         pixel_weight: w_l; 0 leaves the pixels out.
         max_px: points farther than this from their pixel are left out [px].
     """
-    tau_s = offset_s + view.base_tau_s
+    tau_s = time_offset_s + view.base_tau_s
     cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), _MOTION_MODEL).cPs.T
     uvs = view.camera.project(cPs)
     on_image = np.flatnonzero(view.camera.in_front(cPs) & view.camera.in_image(uvs))

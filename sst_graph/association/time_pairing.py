@@ -26,7 +26,7 @@ class Pair:
 
 
 def pair_by_time(
-    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], offset_s: float, max_interval_s: float
+    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], time_offset_s: float, max_interval_s: float
 ) -> list[Pair]:
     """Each scan with the image closest to it in true time, under a time offset (sign: :mod:`factors`).
 
@@ -35,7 +35,7 @@ def pair_by_time(
         max_interval_s: pairs farther apart in true time are left out [s].
     """
     images, base_taus_s = nearest_images(
-        scan_stamps_ns, image_stamps_ns, np.array([offset_s]), max_interval_s
+        scan_stamps_ns, image_stamps_ns, np.array([time_offset_s]), max_interval_s
     )
     return [
         Pair(scan, int(images[0, scan]), float(base_taus_s[0, scan]))

@@ -36,12 +36,12 @@ class Calibration:
     """An extrinsic and a time offset [s]."""
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
 
     def to(self, other: Calibration) -> FloatArray:
         """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""
         xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
-        return np.append(np.asarray(xi, dtype=np.float64), other.offset_s - self.offset_s)
+        return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
 
 
 @dataclass(frozen=True)
@@ -140,7 +140,7 @@ def frame_alignments(
     found = []
     for frame in frames:
         matches = [
-            match_nearest(view, at.cTl, at.offset_s, frame.c_twist, pixel_weight, max_px=max_px)
+            match_nearest(view, at.cTl, at.time_offset_s, frame.c_twist, pixel_weight, max_px=max_px)
             for view in frame.views
         ]
         alignments = [a for match in matches if match is not None for a in match.alignments]
@@ -173,19 +173,21 @@ def step_once(
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for frame, alignments in frame_alignments(frames, at, pixel_weight, max_px):
         graph.add(
-            frame_factor(alignments, EXTRINSIC, TIME_OFFSET if offset_free else at.offset_s, frame.c_twist)
+            frame_factor(
+                alignments, EXTRINSIC, TIME_OFFSET if offset_free else at.time_offset_s, frame.c_twist
+            )
         )
     values.insert(EXTRINSIC, at.cTl)
     if beta is not None:
         graph.add(beta)
     if offset_free:
-        graph.add(time_offset_prior(TIME_OFFSET, at.offset_s, TIME_OFFSET_SIGMA_S))
-        values.insert(TIME_OFFSET, np.array([at.offset_s]))
+        graph.add(time_offset_prior(TIME_OFFSET, at.time_offset_s, TIME_OFFSET_SIGMA_S))
+        values.insert(TIME_OFFSET, np.array([at.time_offset_s]))
     optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, _single_step())
     optimizer.iterate()
     moved = optimizer.values()
     return Calibration(
-        moved.atPose3(EXTRINSIC), float(moved.atVector(TIME_OFFSET)[0]) if offset_free else at.offset_s
+        moved.atPose3(EXTRINSIC), float(moved.atVector(TIME_OFFSET)[0]) if offset_free else at.time_offset_s
     )
 
 
@@ -208,7 +210,7 @@ def frozen_covariance(
     matched = frame_alignments(frames, at, pixel_weight, max_px)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     values.insert(EXTRINSIC, at.cTl)
-    values.insert(TIME_OFFSET, np.array([at.offset_s]))
+    values.insert(TIME_OFFSET, np.array([at.time_offset_s]))
     fitted = gtsam.NonlinearFactorGraph()
     for frame, alignments in matched:
         fitted.add(frame_factor(alignments, EXTRINSIC, TIME_OFFSET, frame.c_twist))
@@ -217,7 +219,7 @@ def frozen_covariance(
     for frame, alignments in matched:
         scaled = [replace(a, weights=np.asarray(a.weights) / mean_square) for a in alignments]
         graph.add(frame_factor(scaled, EXTRINSIC, TIME_OFFSET, frame.c_twist))
-    graph.add(time_offset_prior(TIME_OFFSET, at.offset_s, TIME_OFFSET_SIGMA_S))
+    graph.add(time_offset_prior(TIME_OFFSET, at.time_offset_s, TIME_OFFSET_SIGMA_S))
     rest = gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, at.cTl, rest))
     covariance = marginal_covariance(graph, values, Unknowns((EXTRINSIC, TIME_OFFSET)))

@@ -73,7 +73,7 @@ def search_again(
     own = spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
     chosen = [_search_frame(frame, result) for frame in own]
     camera = drives[richest].camera
-    problem = SearchProblem(chosen, camera, classes, result.cTl, result.offset_s, config)
+    problem = SearchProblem(chosen, camera, classes, result.cTl, result.time_offset_s, config)
     best = run_to_end(search_steps(problem, FINE))[0]
     rng = np.random.default_rng(config.seed)
     points = LabelledPoints.sampled(chosen, camera, classes, POINTS_PER_CLASS, rng)
@@ -87,7 +87,7 @@ def _states(calibrations: Sequence[Calibration]) -> States:
     return States(
         np.stack([c.cTl.rotation().matrix() for c in calibrations]),
         np.stack([c.cTl.translation() for c in calibrations]),
-        np.array([c.offset_s for c in calibrations]),
+        np.array([c.time_offset_s for c in calibrations]),
     )
 
 

@@ -46,7 +46,7 @@ def solve_semalign(problem: PaperProblem, guess: Calibration) -> NearestSolution
         scores += truncated_distances(frame, poses)
         if progress is not None:
             progress("sampled starts", done, len(still.frames))
-    at = Calibration(poses[int(scores.argmin())], guess.offset_s)
+    at = Calibration(poses[int(scores.argmin())], guess.time_offset_s)
     remaining = np.zeros(7)
     for iteration in range(_ITERATIONS):
         last, at = at, step_once(still.frames, at, 0.0, max_px=TRUNCATION_PX)

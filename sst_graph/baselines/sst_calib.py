@@ -258,7 +258,7 @@ class _Depth:
         cPs = np.asarray(self._at.cTl.transformFrom(scan.depth_lPs.T.astype(np.float64))).T
         if not self._former:
             return cPs
-        tau_s = self._at.offset_s + (image.stamp_ns - scan.stamp_ns) * 1e-9
+        tau_s = self._at.time_offset_s + (image.stamp_ns - scan.stamp_ns) * 1e-9
         return np.asarray(cPs - tau_s * velocity_at(self._former, position))
 
 
@@ -300,5 +300,5 @@ def _joint_stage(
         remaining = _JOINT_ITERATIONS * last.to(at)
         if problem.progress is not None:
             problem.progress("joint stage", iteration + 1, _JOINT_ITERATIONS)
-    _LOG.info("paper: offset %.4f s after %d joint iterations", at.offset_s, _JOINT_ITERATIONS)
+    _LOG.info("paper: offset %.4f s after %d joint iterations", at.time_offset_s, _JOINT_ITERATIONS)
     return at, remaining, moving

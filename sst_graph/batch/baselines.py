@@ -54,13 +54,13 @@ def _checked(
     """
     if guess.cTl is None:
         raise EstimationError(f"method {config.method} needs a guess to start from: it has no search")
-    start = Calibration(guess.cTl, guess.offset_s)
+    start = Calibration(guess.cTl, guess.time_offset_s)
     solution = solve(problem, start)
     at, step = solution.calibration, solution.remaining_step
     second = search_again(solution.frames, problem.drives, config.classes, start, at, config.search)
     return MethodEstimate(
         at.cTl,
-        at.offset_s,
+        at.time_offset_s,
         solution.covariance + np.outer(step, step),
         tuple(frame.id for frame in solution.frames),
         reasons=(*second.reasons, *_unfinished(solution, config)),
@@ -83,7 +83,7 @@ def _unfinished(solution: NearestSolution, config: CalibrationConfig) -> list[st
     if (
         np.degrees(rotation) <= limits.rotation_deg
         and translation <= limits.translation_m
-        and offset <= limits.offset_s
+        and offset <= limits.time_offset_s
     ):
         return []
     return [

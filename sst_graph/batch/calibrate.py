@@ -46,7 +46,7 @@ def calibrate(
     initial: gtsam.Pose3 | None = None,
     config: CalibrationConfig | None = None,
     *,
-    initial_offset_s: float = 0.0,
+    initial_time_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """Extrinsic, time offset and covariance from one drive or several.
@@ -56,7 +56,7 @@ def calibrate(
             share one extrinsic.
         initial: rough guess of cTl, or None when nothing is known.
         config: settings; the defaults fit driving data.
-        initial_offset_s: rough guess of the time offset [s].
+        initial_time_offset_s: rough guess of the time offset [s].
         progress: called with (stage, steps done, steps in all).
 
     Returns:
@@ -72,7 +72,9 @@ def calibrate(
     began = time.perf_counter()
     drives = prepare_drives(sources, config, progress)
     seconds = time.perf_counter() - began
-    result = calibrate_prepared(drives, initial, config, initial_offset_s=initial_offset_s, progress=progress)
+    result = calibrate_prepared(
+        drives, initial, config, initial_time_offset_s=initial_time_offset_s, progress=progress
+    )
     timing = {"prepare": seconds, **result.diagnostics["seconds"]}
     return replace(result, diagnostics={**result.diagnostics, "seconds": timing})
 
@@ -99,12 +101,12 @@ def calibrate_prepared(
     initial: gtsam.Pose3 | None = None,
     config: CalibrationConfig | None = None,
     *,
-    initial_offset_s: float = 0.0,
+    initial_time_offset_s: float = 0.0,
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
     config = config or CalibrationConfig()
-    guess = Guess(initial, initial_offset_s)
+    guess = Guess(initial, initial_time_offset_s)
     began = time.perf_counter()
     try:
         estimate = _METHODS[config.method](drives, guess, config, progress)

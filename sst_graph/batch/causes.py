@@ -57,23 +57,23 @@ def _suspected(
     """What explains a result that is missing, may be wrong, or agrees with few of the labels."""
     fit = fit_labels(config)
     if not result.frames_used or result.status == "not_converged":
-        return likely_causes(drives, guess.cTl, guess.offset_s, fit)
+        return likely_causes(drives, guess.cTl, guess.time_offset_s, fit)
     explained, concentration = (float(result.diagnostics[key]) for key in ("explained", "concentration"))
     if explained * concentration < _AGREED:
         solved = Fit(result.T_camera_lidar, result.time_offset_s, explained, concentration)
-        return mirror(drives, guess.cTl, guess.offset_s, fit, solved)
+        return mirror(drives, guess.cTl, guess.time_offset_s, fit, solved)
     return ()
 
 
 def fit_labels(config: CalibrationConfig) -> Fitter:
     """Search and short solution on a few scans of one drive, with a calibration's own settings."""
 
-    def fit(drive: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit | None:
+    def fit(drive: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Fit | None:
         step = -(-len(drive.scans) // _SCANS)
         tracks = Tracks([drive])
         few = [replace(drive, scans=drive.scans[::step])]
         joint = replace(config.joint, max_outer=len(NARROW_KERNELS_PX))
-        search = StartProblem(few, tracks, config.classes, guess, offset_s)
+        search = StartProblem(few, tracks, config.classes, guess, time_offset_s)
         try:
             selection = run_to_end(
                 select_start_steps(search, joint.graph, config.search, _SCANS, _CANDIDATES)

@@ -39,7 +39,7 @@ class Guess:
     """Initial guess: an extrinsic, or None, and a time offset [s]."""
 
     cTl: gtsam.Pose3 | None
-    offset_s: float = 0.0
+    time_offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class MethodEstimate:
     """The estimate of a method, and what it reports.
 
     Attributes:
-        cTl, offset_s: the estimate.
+        cTl, time_offset_s: the estimate.
         covariance: (7, 7), see :class:`~sst_graph.result.CalibrationResult`.
         frames: that took part.
         reasons: why the estimate may be wrong altogether; any makes the status ``not_converged``.
@@ -74,7 +74,7 @@ class MethodEstimate:
     """
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
     covariance: FloatArray
     frames: tuple[FrameId, ...]
     reasons: tuple[str, ...] = ()
@@ -97,7 +97,7 @@ def result_of(
     sentences = (f"{direction.sentence}: {direction.advice}" for direction in weak)
     return CalibrationResult(
         T_camera_lidar=estimate.cTl,
-        time_offset_s=estimate.offset_s,
+        time_offset_s=estimate.time_offset_s,
         covariance=estimate.covariance,
         status=status,
         camera=drives[0].camera,
@@ -108,7 +108,7 @@ def result_of(
         method=config.method,
         config=to_dict(config),
         initial=guess.cTl,
-        initial_offset_s=guess.offset_s,
+        initial_time_offset_s=guess.time_offset_s,
         diagnostics={**estimate.diagnostics, **sweeps_of(drives)},
         versions=_versions(),
     )
@@ -177,7 +177,7 @@ def guess_as_result(
     sigmas = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
     return CalibrationResult(
         T_camera_lidar=guess.cTl or gtsam.Pose3(),
-        time_offset_s=guess.offset_s,
+        time_offset_s=guess.time_offset_s,
         covariance=np.diag(sigmas**2),
         status="unobservable",
         camera=drives[0].camera,
@@ -185,7 +185,7 @@ def guess_as_result(
         method=config.method,
         config=to_dict(config),
         initial=guess.cTl,
-        initial_offset_s=guess.offset_s,
+        initial_time_offset_s=guess.time_offset_s,
         versions=_versions(),
     )
 

@@ -101,8 +101,8 @@ def fuse_motion(
     sigmas = np.sqrt(np.diag(motion.covariance))
     facts = {
         "chi2_of_7": chi2,
-        "offset_s": motion.state.time_offsets_s[0],
-        "sigma_offset_s": float(sigmas[6]),
+        "time_offset_s": motion.state.time_offsets_s[0],
+        "sigma_time_offset_s": float(sigmas[6]),
     }
     if chi2 > MAX_DISAGREEMENT_CHI2 or not motion.converged:
         return WithMotion(labels, _contradiction(step, chi2, motion.converged), facts)

@@ -23,7 +23,7 @@ def motion_method(
     Raises:
         EstimationError: too few consecutive frames with known motion.
     """
-    solutions = solve_motion(drives, guess.cTl, guess.offset_s, config.search.time_offset_s, progress)
+    solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, config.search.time_offset_s, progress)
     best = solutions[0]
     pairs = [term.pair for term in best.terms]
     frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)

@@ -103,14 +103,16 @@ class CalibrationProblem:
         """
         clocks = len(self.drives) if self.config.time_offset_per_drive else 1
         kernels_px = NARROW_KERNELS_PX if self.config.search.enabled else KERNELS_PX
-        starts = [State(cTl, (offset_s,) * clocks) for cTl, offset_s in selection.starts]
+        starts = [State(cTl, (time_offset_s,) * clocks) for cTl, time_offset_s in selection.starts]
         centred = [(start, self.prior_centre(start)) for start in starts]
         return solve_all(self.joint(), centred, kernels_px, self.progress)
 
     def _start_problem(self) -> StartProblem:
         """What a start is searched for, without the tracks of objects."""
         guess = self.guess
-        return StartProblem(self.drives, Tracks(self.drives), self.config.classes, guess.cTl, guess.offset_s)
+        return StartProblem(
+            self.drives, Tracks(self.drives), self.config.classes, guess.cTl, guess.time_offset_s
+        )
 
 
 @dataclass(frozen=True)

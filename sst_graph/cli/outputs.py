@@ -115,7 +115,7 @@ def _same(a: Path, b: Path) -> bool:
 
 def _before(result: CalibrationResult, source: Source) -> Placement | None:
     if result.initial is not None:
-        return Placement(result.initial, result.initial_offset_s, "before (start)")
+        return Placement(result.initial, result.initial_time_offset_s, "before (start)")
     return None if source.nominal is None else Placement(source.nominal, 0.0, "before (nominal)")
 
 

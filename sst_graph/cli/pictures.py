@@ -47,12 +47,12 @@ def overlay(
         DataError: the frame lacks its scan or its image.
     """
     camera = drive.source.camera
-    offset_s = _offset_of(result, drive.source)
+    time_offset_s = _offset_of(result, drive.source)
     c_twist = camera_twist(drive, position, result.T_camera_lidar)
-    frame, other_image = _at_true_time(drive, position, offset_s)
+    frame, other_image = _at_true_time(drive, position, time_offset_s)
     caption = "after (image closest in time)" if other_image else "after"
     own = _whole(drive, drive.frame(position), 0.0)
-    after = draw_overlay(frame, camera, result.T_camera_lidar, offset_s, c_twist, caption)
+    after = draw_overlay(frame, camera, result.T_camera_lidar, time_offset_s, c_twist, caption)
     if before is None:
         return after
     start = own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
@@ -65,24 +65,24 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     return bytes(data)
 
 
-def _at_true_time(drive: RecentReader, position: int, offset_s: float) -> tuple[Frame, bool]:
+def _at_true_time(drive: RecentReader, position: int, time_offset_s: float) -> tuple[Frame, bool]:
     """The frame, with the image that shows the instant of its scan best, and whether that is another one."""
     frame = drive.frame(position)
     if frame.scan is None or frame.image is None:
-        return _whole(drive, frame, offset_s), False
+        return _whole(drive, frame, time_offset_s), False
     neighbour = drive.scan(position - 1 if position else min(1, len(drive) - 1))
     scan, image = frame.scan, frame.image
     if neighbour is None or neighbour.stamp_ns == scan.stamp_ns:
         return frame, False
     period_s = abs(scan.stamp_ns - neighbour.stamp_ns) * 1e-9
-    guess = position - round(offset_s / period_s)
+    guess = position - round(time_offset_s / period_s)
     nearby = range(max(0, guess - 1), min(len(drive), guess + 2))
     images = [image, *(other for other in map(drive.image, nearby) if other is not None)]
-    best = min(images, key=lambda other: abs(other.stamp_ns * 1e-9 + offset_s - scan.stamp_ns * 1e-9))
+    best = min(images, key=lambda other: abs(other.stamp_ns * 1e-9 + time_offset_s - scan.stamp_ns * 1e-9))
     return replace(frame, image=best), best.stamp_ns != image.stamp_ns
 
 
-def _whole(drive: RecentReader, frame: Frame, offset_s: float) -> Frame:
+def _whole(drive: RecentReader, frame: Frame, time_offset_s: float) -> Frame:
     """The frame; a part that it lacks is that of the source's frames of the other sensor closest in time.
 
     Where a source's frames may have both, nothing is added.
@@ -91,10 +91,12 @@ def _whole(drive: RecentReader, frame: Frame, offset_s: float) -> Frame:
     images, scans = image_positions(drive.source), scan_positions(drive.source)
     if frame.scan is not None and frame.image is None and apart:
         return replace(
-            frame, image=_closest(drive.image, images, frame.scan.stamp_ns - round(offset_s * 1e9))
+            frame, image=_closest(drive.image, images, frame.scan.stamp_ns - round(time_offset_s * 1e9))
         )
     if frame.image is not None and frame.scan is None and apart:
-        return replace(frame, scan=_closest(drive.scan, scans, frame.image.stamp_ns + round(offset_s * 1e9)))
+        return replace(
+            frame, scan=_closest(drive.scan, scans, frame.image.stamp_ns + round(time_offset_s * 1e9))
+        )
     return frame
 
 

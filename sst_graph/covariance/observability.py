@@ -71,7 +71,7 @@ class ObservabilityConfig(Settings):
         doc="Largest standard deviation of any translation of a result that is ok. Lower it where the"
         " use needs more.",
     )
-    offset_s: float = setting(
+    time_offset_s: float = setting(
         0.01,
         at_least=1e-30,
         at_most=1000.0,
@@ -145,7 +145,9 @@ def involves_offset(direction: WeakDirection) -> bool:
 
 def limits_of_unknowns(covariance: FloatArray, config: ObservabilityConfig) -> FloatArray:
     """(7,) largest standard deviations [rad, m, s] that a covariance may have."""
-    limits = np.array([np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.offset_s])
+    limits = np.array(
+        [np.radians(config.rotation_deg)] * 3 + [config.translation_m] * 3 + [config.time_offset_s]
+    )
     if _paired(covariance) >= _PAIR_CORRELATION:
         limits[3:] *= _PAIR_SHARE
     return limits
@@ -175,7 +177,7 @@ def _describe(step: FloatArray, cTl: gtsam.Pose3, advice: Advice) -> WeakDirecti
 
 
 def _words(
-    rotation: FloatArray, c_translation: FloatArray, offset_s: float, vector: FloatArray, advice: Advice
+    rotation: FloatArray, c_translation: FloatArray, time_offset_s: float, vector: FloatArray, advice: Advice
 ) -> tuple[str, str]:
     """What one sigma along a weak direction means, and what to record."""
     parts = {
@@ -186,17 +188,17 @@ def _words(
     translation_m = float(np.linalg.norm(c_translation))
     words = _axis_words(c_translation)
     if parts["offset"] > _TAKES_PART and parts["translation"] > _TAKES_PART:
-        rate_ms = abs(offset_s) * 1e3 / translation_m if translation_m else 0.0
-        sign = "later" if offset_s > 0 else "earlier"
+        rate_ms = abs(time_offset_s) * 1e3 / translation_m if translation_m else 0.0
+        sign = "later" if time_offset_s > 0 else "earlier"
         return (
             f"the LiDAR {words} cannot be distinguished from the image taken {sign}: "
             f"1 m equals {rate_ms:.0f} ms of time offset (one sigma: {100 * translation_m:.1f} cm, "
-            f"{abs(offset_s) * 1e3:.1f} ms)",
+            f"{abs(time_offset_s) * 1e3:.1f} ms)",
             advice.together,
         )
     if parts["offset"] >= max(parts["rotation"], parts["translation"]):
         return (
-            f"the time offset is known to {abs(offset_s) * 1e3:.1f} ms only (one sigma)",
+            f"the time offset is known to {abs(time_offset_s) * 1e3:.1f} ms only (one sigma)",
             advice.offset,
         )
     if parts["rotation"] > parts["translation"]:

@@ -43,31 +43,31 @@ def _preflight(
 
 
 def likely_causes(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, time_offset_s: float, fit: Fitter
 ) -> tuple[Finding, ...]:
     """Why the labels do not agree, for a result that is missing or may be wrong; empty where they do agree.
 
     Args:
-        guess, offset_s: where the calibration started.
+        guess, time_offset_s: where the calibration started.
         fit: how well labels agree, by the calibration's own search.
     """
     drive = max(drives, key=lambda one: len(one.scans))
     certain = labels.foreign_masks(labels.shift(drives)) or units.axes(drive, guess)
     if certain is not None:
         return (certain,)
-    given = fit(drive, guess, offset_s)
+    given = fit(drive, guess, time_offset_s)
     if given is not None and given.quality > WELL:
         return ()
-    cause = best_hypothesis(drive, guess, offset_s, fit, given)
+    cause = best_hypothesis(drive, guess, time_offset_s, fit, given)
     if cause is None and guess is not None:
-        cause = wrong_start(guess, fit(drive, None, offset_s))
+        cause = wrong_start(guess, fit(drive, None, time_offset_s))
     if cause is None and (given is None or given.quality < LEAST_QUALITY):
         cause = _nothing_in_common(given)
     return () if cause is None else (cause,)
 
 
 def mirror(
-    drives: Sequence[Drive], guess: gtsam.Pose3 | None, offset_s: float, fit: Fitter, result: Fit
+    drives: Sequence[Drive], guess: gtsam.Pose3 | None, time_offset_s: float, fit: Fitter, result: Fit
 ) -> tuple[Finding, ...]:
     """Whether mirrored data would agree better, for a result without any other reason against it.
 
@@ -76,7 +76,7 @@ def mirror(
     """
     drive = max(drives, key=lambda one: len(one.scans))
     around = result.cTl if guess is None else guess
-    cause = mirrored(drive, around, offset_s, fit, result, sideways=guess is not None)
+    cause = mirrored(drive, around, time_offset_s, fit, result, sideways=guess is not None)
     return () if cause is None else (cause,)
 
 

@@ -27,13 +27,13 @@ class Fit:
     """How well the labels of both sensors agree after a search and a short solution.
 
     Attributes:
-        cTl, offset_s: where it ended.
+        cTl, time_offset_s: where it ended.
         explained: share of the boundary points in view that meet a contour.
         concentration: share of the matches that are close.
     """
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
     explained: float
     concentration: float
 

@@ -53,7 +53,7 @@ class Jump:
     chi2: float
 
     @property
-    def offset_s(self) -> float:
+    def time_offset_s(self) -> float:
         """By how much the time offset changes where the clock was set [s]."""
         return self.seconds if self.sensor == "scan" else -self.seconds
 

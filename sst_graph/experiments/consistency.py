@@ -116,9 +116,9 @@ def _run(drive: Mapping[str, Any], seed: int, config: ConsistencyConfig) -> Run:
     return Run(error, result.covariance, not_converged, offset_observable=drive["motion"] != "standing")
 
 
-def _error(cTl: gtsam.Pose3, offset_s: float, truth: GroundTruth) -> FloatArray:
+def _error(cTl: gtsam.Pose3, time_offset_s: float, truth: GroundTruth) -> FloatArray:
     """Truth minus estimate in the estimate's tangent space (7,) [rad, m, s]."""
-    return np.append(gtsam.Pose3.Logmap(cTl.between(truth.cTl)), (truth.time_offset_s or 0.0) - offset_s)
+    return np.append(gtsam.Pose3.Logmap(cTl.between(truth.cTl)), (truth.time_offset_s or 0.0) - time_offset_s)
 
 
 _HEADER = (

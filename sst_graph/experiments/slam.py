@@ -183,13 +183,13 @@ def trajectory_errors(values: gtsam.Values, source: SimulatedDrive) -> dict[str,
     return dict(zip(list(MEASURES)[:3], map(float, sizes), strict=True))
 
 
-def calibration_errors(cTl: gtsam.Pose3, offset_s: float, source: SimulatedDrive) -> dict[str, float]:
+def calibration_errors(cTl: gtsam.Pose3, time_offset_s: float, source: SimulatedDrive) -> dict[str, float]:
     """Sizes of the errors of extrinsic and time offset."""
     d = source.truth.cTl.localCoordinates(cTl)
     sizes = (
         np.degrees(np.linalg.norm(d[:3])),
         100.0 * np.linalg.norm(d[3:]),
-        1e3 * abs(offset_s - source.config.time_offset_s),
+        1e3 * abs(time_offset_s - source.config.time_offset_s),
     )
     return dict(zip(list(MEASURES)[3:], map(float, sizes), strict=True))
 

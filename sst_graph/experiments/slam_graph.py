@@ -247,11 +247,11 @@ def _add_visual_odometry(
     config: CameraGraphConfig,
 ) -> None:
     """Motions of the camera, metric by the depth that the present calibration gives to its features."""
-    cTl, offset_s = values.atPose3(EXTRINSIC), float(values.atVector(TIME_OFFSET)[0])
+    cTl, time_offset_s = values.atPose3(EXTRINSIC), float(values.atVector(TIME_OFFSET)[0])
 
     def depth(position: int) -> FloatArray:
         place = places[position]
-        tau = place.between.image_after_a_s + offset_s
+        tau = place.between.image_after_a_s + time_offset_s
         cTscan = cTl * gtsam.Pose3.Expmap(-tau * place.twist)
         lPs = drive.scans[place.scan].depth_lPs.astype(np.float64)
         return np.asarray(cTscan.transformFrom(lPs.T)).T

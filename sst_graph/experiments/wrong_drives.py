@@ -95,8 +95,8 @@ def with_line_delay(street: SimulatedDrive, drive: KeptDrive, size: float) -> Ke
     frames = list(drive.frames)
     for rows in bands:
         late_s = size * (float(rows.mean()) - 0.5 * (height - 1))
-        offset_s = street.config.time_offset_s + late_s
-        then = replace(street, config=replace(street.config, time_offset_s=offset_s))
+        time_offset_s = street.config.time_offset_s + late_s
+        then = replace(street, config=replace(street.config, time_offset_s=time_offset_s))
         for position, frame in enumerate(frames):
             seen = then.image(position)
             if frame.image is not None:

@@ -2,7 +2,7 @@
 
 The cost of a calibration (cTl, offset), in the tangent space of the linearization point:
 
-    0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - offset_0]
+    0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - time_offset_0_s]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
 docs/export.md describes how a C++ program rebuilds it from the JSON.
@@ -154,10 +154,10 @@ def fuse_graphs(
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
-        point = fused.cTl, fused.offset_s
+        point = fused.cTl, fused.time_offset_s
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
         fused = fuse_marginals(parts, significance=significance)
-        step = np.append(fused.cTl.localCoordinates(point[0]), fused.offset_s - point[1])
+        step = np.append(fused.cTl.localCoordinates(point[0]), fused.time_offset_s - point[1])
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
     raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")
@@ -192,10 +192,10 @@ def fuse_marginals(
         raise EstimationError(f"found {len(names)} names, expected {len(marginals)}, one a marginal")
     fused = marginals[0]
     for _ in range(_MAX_ROUNDS):
-        parts = [_carried(marginal, fused.cTl, fused.offset_s) for marginal in marginals]
+        parts = [_carried(marginal, fused.cTl, fused.time_offset_s) for marginal in marginals]
         total = CalibrationMarginal(
             fused.cTl,
-            fused.offset_s,
+            fused.time_offset_s,
             sum((part.information for part in parts), np.zeros((7, 7))),
             sum((part.vector for part in parts), np.zeros(7)),
             sum(part.constant for part in parts),

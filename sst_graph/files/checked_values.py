@@ -98,15 +98,15 @@ def check_covariance(place: str, covariance: FloatArray, min_sigma: float = MIN_
         raise DataError(place, found, "a covariance (positive semi-definite)")
 
 
-def checked_offset_s(offset_s: float, place: str) -> float:
+def checked_time_offset_s(time_offset_s: float, place: str) -> float:
     """A time offset [s].
 
     Raises:
         DataError: not finite, or more than MAX_OFFSET_S.
     """
-    if not abs(offset_s) <= MAX_OFFSET_S:
-        raise DataError(place, f"{offset_s:.6g} s", f"a time offset of at most {MAX_OFFSET_S:g} s")
-    return float(offset_s)
+    if not abs(time_offset_s) <= MAX_OFFSET_S:
+        raise DataError(place, f"{time_offset_s:.6g} s", f"a time offset of at most {MAX_OFFSET_S:g} s")
+    return float(time_offset_s)
 
 
 def checked_camera(camera: PinholeCamera, place: str | Path) -> PinholeCamera:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, printable
-from sst_graph.files.checked_values import check_finite, checked_offset_s, checked_pose, checked_text
+from sst_graph.files.checked_values import check_finite, checked_pose, checked_text, checked_time_offset_s
 
 FloatArray = NDArray[np.float64]
 
@@ -116,9 +116,9 @@ class JsonTable:
         """A rigid transform (4, 4)."""
         return checked_pose(self.matrix(key, (4, 4)), self._at(key))
 
-    def offset_s(self, key: str) -> float:
+    def time_offset_s(self, key: str) -> float:
         """A time offset [s]."""
-        return checked_offset_s(self.number(key), self._at(key))
+        return checked_time_offset_s(self.number(key), self._at(key))
 
 
 def _one_line(text: str) -> str:

@@ -124,18 +124,18 @@ def silhouettes_factor(
 
 
 def motion_factor(
-    pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, offset_s: float
+    pair: PairMatches, E: int, D: int, V: int, cTl: gtsam.Pose3, time_offset_s: float
 ) -> gtsam.NonlinearFactor:
     """The LiDAR odometry's measurement of the twist at a pair's image; without odometry a wide prior.
 
     Args:
-        cTl, offset_s: that the matches were made at.
+        cTl, time_offset_s: that the matches were made at.
     """
     if pair.l_twist is None:
         return velocity_factor(V, np.zeros(6), np.diag(UNKNOWN_TWIST_SIGMAS**2))
     covariance = camera_twist(pair.l_twist, cTl).covariance
     twist, acceleration = pair.l_twist.twist, pair.l_twist.acceleration
-    return twist_transfer_factor(V, E, D, twist, acceleration, offset_s, covariance)
+    return twist_transfer_factor(V, E, D, twist, acceleration, time_offset_s, covariance)
 
 
 def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[np.intp] | None]]:
@@ -154,11 +154,11 @@ def _add_calibration(
     sigmas = np.repeat([PRIOR_ROTATION_SIGMA_RAD, PRIOR_TRANSLATION_SIGMA_M], 3)
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, guess.cTl, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     values.insert(EXTRINSIC, state.cTl)
-    for clock, offset_s in enumerate(state.time_offsets_s):
+    for clock, time_offset_s in enumerate(state.time_offsets_s):
         graph.add(
             time_offset_prior(time_offset_key(clock), guess.time_offset_s(clock), config.time_offset_sigma_s)
         )
-        values.insert(time_offset_key(clock), np.array([offset_s]))
+        values.insert(time_offset_key(clock), np.array([time_offset_s]))
 
 
 def _add_nuisances(

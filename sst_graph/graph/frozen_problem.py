@@ -289,9 +289,9 @@ class FrozenProblem:
         """Add the matches of a drive to the normal equations; their cost."""
         # 1. Weighted rows: 13 of the motion, the parameters that are estimated, bias, residual.
         alignment = frames.alignment
-        offset_s, biases_px = point.scalars[frames.clock - 6], point.scalars[frames.biases - 6]
+        time_offset_s, biases_px = point.scalars[frames.clock - 6], point.scalars[frames.biases - 6]
         twists = point.twists[frames.images].T
-        evaluated = evaluate(alignment, point.cTl, float(offset_s), twists, biases_px, True)
+        evaluated = evaluate(alignment, point.cTl, float(time_offset_s), twists, biases_px, True)
         if self._terms:
             steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
             evaluated = evaluated.with_terms(frames.terms, steps, True)
@@ -384,7 +384,7 @@ def _images(matches: Sequence[DriveMatches], state: State, columns: dict[int, in
             covariances = camera_covariances(samples.covariances[pairs], state.cTl)
             information = np.asarray(np.linalg.inv(covariances), np.float64)
         keys = [twist_key(own.number, image) for image in first]
-        offsets_s = np.full(k, own.offset_s)
+        offsets_s = np.full(k, own.time_offset_s)
         parts.append(
             (keys, own.c_twists[pairs], l_twists, l_accelerations, information, np.full(k, clock), offsets_s)
         )

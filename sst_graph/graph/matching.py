@@ -277,8 +277,8 @@ class DriveEdges:
 
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
-        drive, offset_s = self.drive, state.time_offset_s(self.number)
-        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, drive.image_period_s)
+        drive, time_offset_s = self.drive, state.time_offset_s(self.number)
+        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
         # 1. The groups that have an image, and in it a contour of their class.
         numbers = {pair.scan: number for number, pair in enumerate(pairs)}
         groups = [
@@ -295,7 +295,7 @@ class DriveEdges:
         paired, index = self._paired(groups, pairs, motions, state)
         shares = None
         if self.unknown_mps is not None:
-            taus_s = offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
+            taus_s = time_offset_s + paired.repeated([pairs[p].base_tau_s for _, p in groups])
             shares = dynamic_object_weights(self.unknown_mps[index], taus_s, DYNAMIC_REACH_M)
             if not shares.all():
                 kept = np.flatnonzero(shares)
@@ -303,7 +303,7 @@ class DriveEdges:
         # 4. Match them.
         scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
         deviation = deviation_of(state.nuisances, scene)
-        found = match_edges(paired, state.cTl, offset_s, kernel, self.config, deviation)
+        found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
         if len(found.index) == 0:
             return None
         if shares is not None and not (shares == 1.0).all():
@@ -320,7 +320,7 @@ class DriveEdges:
             index[found.index],
             found.index - np.repeat(firsts, np.diff(found.bounds)),
             state.cTl,
-            offset_s,
+            time_offset_s,
         )
 
     def _paired(
@@ -406,7 +406,7 @@ class DriveMatches:
         group_pairs, group_classes: pair and class of each group.
         points: (m,) which of the drive's points each match is, and
         places: (m,) which of the points of its scan and class each match is.
-        cTl, offset_s: extrinsic and time offset that the matches were made at.
+        cTl, time_offset_s: extrinsic and time offset that the matches were made at.
     """
 
     edges: DriveEdges
@@ -418,7 +418,7 @@ class DriveMatches:
     points: IntArray
     places: IntArray
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
 
     def __len__(self) -> int:
         return len(self.points)
@@ -491,7 +491,7 @@ class DriveMatches:
             return {}
         pair = self.pair_of
         base_taus_s = np.array([each.base_tau_s for each in self.pairs])[pair]
-        at = self.cTl, self.offset_s, self.c_twists[pair].T
+        at = self.cTl, self.time_offset_s, self.c_twists[pair].T
         scene = self.motions.scene(self.edges.drive, pair)
         return residual_columns(self.alignment, scene, base_taus_s, at, names)
 

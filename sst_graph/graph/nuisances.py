@@ -127,11 +127,11 @@ def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effec
     return total
 
 
-def _pixels(alignment: Alignment, cTl: gtsam.Pose3, offset_s: float, c_twist: FloatArray) -> FloatArray:
+def _pixels(alignment: Alignment, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray) -> FloatArray:
     """(n, 2) pixels of the matches' points by the ideal camera; NaN behind it."""
     lPs, _, _ = alignment.columns
     velocities = alignment.velocity_columns
-    taus = alignment.taus_s(offset_s)
+    taus = alignment.taus_s(time_offset_s)
     moved = move_points(
         cTl, lPs, taus, c_twist, alignment.c_acceleration.T, alignment.motion_model, velocities
     )

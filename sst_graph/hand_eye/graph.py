@@ -99,10 +99,10 @@ def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
 
 
 def pair_motions(
-    steps: Sequence[CameraStep], paths: Sequence[SensorPath], offset_s: float
+    steps: Sequence[CameraStep], paths: Sequence[SensorPath], time_offset_s: float
 ) -> list[MotionPair]:
     """Each camera motion with the LiDAR's over its stamps + offset, where the path reaches."""
-    shift = round(offset_s * 1e9)
+    shift = round(time_offset_s * 1e9)
     found = ((step, paths[step.drive].step(step.from_ns + shift, step.to_ns + shift)) for step in steps)
     return [MotionPair(step, lidar) for step, lidar in found if lidar is not None]
 
@@ -196,19 +196,19 @@ def _term(pair: MotionPair, state: State) -> HandEyeTerm:
     Ad = np.asarray(state.cTl.AdjointMap())
     covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     # 2. The factor.
-    offset_0, turn = state.time_offsets_s[0], pair.camera.rotation
+    time_offset_0_s, turn = state.time_offsets_s[0], pair.camera.rotation
     if directed:
         measured = gtsam.Pose3(turn, length * motion.direction)
         motions = (measured, step.aTb, step.twist_a, step.twist_b)
         D = time_offset_key()
-        factor = hand_eye_factor(EXTRINSIC, D, *motions, offset_0, covariance, scale_known=False)
+        factor = hand_eye_factor(EXTRINSIC, D, *motions, time_offset_0_s, covariance, scale_known=False)
         noise = factor.noiseModel()
         assert isinstance(noise, gtsam.noiseModel.Gaussian)
         own = np.asarray(noise.covariance())
     else:
         own = covariance[:3, :3]
         turns = (turn, step.aTb.rotation(), step.twist_a[:3], step.twist_b[:3])
-        factor = rotation_hand_eye(EXTRINSIC, time_offset_key(), *turns, offset_0, own)
+        factor = rotation_hand_eye(EXTRINSIC, time_offset_key(), *turns, time_offset_0_s, own)
     # 3. How the LiDAR's noise reaches the residual.
     transfer = np.eye(6)
     d = motion.direction

@@ -39,7 +39,7 @@ class MotionStart:
     """An initial rotation and time offset, and their mean cost of a pair."""
 
     cRl: gtsam.Rot3
-    offset_s: float
+    time_offset_s: float
     cost: float
 
 
@@ -47,7 +47,7 @@ def motion_starts(
     steps: Sequence[CameraStep],
     paths: Sequence[SensorPath],
     guess: gtsam.Rot3 | None,
-    guess_offset_s: float,
+    guess_time_offset_s: float,
     max_offset_s: float = MAX_OFFSET_S,
 ) -> list[MotionStart]:
     """The best starts, one for each minimum over the time offset, cheapest first; none without motion.
@@ -61,12 +61,12 @@ def motion_starts(
     chosen = np.unique(np.linspace(0, len(steps) - 1, min(_MAX_PAIRS, len(steps))).astype(int))
     some = [steps[i] for i in chosen] if steps else []
     count = int(np.ceil(max_offset_s / _STEP_S))
-    grid = guess_offset_s + _STEP_S * np.arange(-count, count + 1)
+    grid = guess_time_offset_s + _STEP_S * np.arange(-count, count + 1)
     found: list[MotionStart | None] = []
-    for offset_s in grid:
-        pairs = pair_motions(some, paths, float(offset_s))
+    for time_offset_s in grid:
+        pairs = pair_motions(some, paths, float(time_offset_s))
         enough = len(pairs) >= max(2, LEAST_SHARE * len(some))
-        found.append(_best_rotation(pairs, float(offset_s), guess) if enough else None)
+        found.append(_best_rotation(pairs, float(time_offset_s), guess) if enough else None)
     return _minima(found)[:_SELECTED]
 
 
@@ -78,7 +78,9 @@ def _minima(found: Sequence[MotionStart | None]) -> list[MotionStart]:
     return sorted((one for one, low in zip(found, lowest, strict=True) if one and low), key=lambda s: s.cost)
 
 
-def _best_rotation(pairs: Sequence[MotionPair], offset_s: float, guess: gtsam.Rot3 | None) -> MotionStart:
+def _best_rotation(
+    pairs: Sequence[MotionPair], time_offset_s: float, guess: gtsam.Rot3 | None
+) -> MotionStart:
     """Robust Kabsch over rotation vectors and directions."""
     l_vectors, c_vectors, sigmas = _vectors(pairs)
     prior = np.zeros((3, 3)) if guess is None else guess.matrix() / _GUESS_SIGMA_RAD**2
@@ -91,7 +93,7 @@ def _best_rotation(pairs: Sequence[MotionPair], offset_s: float, guess: gtsam.Ro
         size = np.linalg.norm(c_vectors - l_vectors @ R.T, axis=1) / sigmas
         weights = 1.0 / (1.0 + (size / _TRUNCATION) ** 2) ** 2
     cost = float(np.minimum(size, _TRUNCATION) @ np.minimum(size, _TRUNCATION)) / len(size)
-    return MotionStart(gtsam.Rot3(R), offset_s, cost)
+    return MotionStart(gtsam.Rot3(R), time_offset_s, cost)
 
 
 def _vectors(pairs: Sequence[MotionPair]) -> tuple[FloatArray, FloatArray, FloatArray]:

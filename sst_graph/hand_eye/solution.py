@@ -80,7 +80,7 @@ class MotionSolution:
 def solve_motion(
     drives: Sequence[Drive],
     guess_cTl: gtsam.Pose3 | None,
-    guess_offset_s: float,
+    guess_time_offset_s: float,
     max_offset_s: float = MAX_OFFSET_S,
     progress: Progress | None = None,
 ) -> list[MotionSolution]:
@@ -98,7 +98,7 @@ def solve_motion(
         raise EstimationError(_too_few(len(steps)))
     # 2. Rotation and time offset on a grid of offsets.
     guess = None if guess_cTl is None else guess_cTl.rotation()
-    starts = motion_starts(steps, paths, guess, guess_offset_s, max_offset_s)
+    starts = motion_starts(steps, paths, guess, guess_time_offset_s, max_offset_s)
     if not starts:
         raise EstimationError(_too_few(len(steps)))
     # 3. The graph from each of them, a few steps; from those that differ and fit alike to the end.
@@ -106,8 +106,8 @@ def solve_motion(
     solutions: list[MotionSolution] = []
     for number, start in enumerate(starts):
         cTl = gtsam.Pose3(start.cRl, translation)
-        centre = State(guess_cTl or cTl, (guess_offset_s,))
-        first = State(cTl, (start.offset_s,))
+        centre = State(guess_cTl or cTl, (guess_time_offset_s,))
+        first = State(cTl, (start.time_offset_s,))
         solution = _solve(steps, paths, first, centre, _FIRST_OUTER)
         if solution is not None:
             solutions.append(solution)

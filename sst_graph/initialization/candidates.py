@@ -49,19 +49,19 @@ class StartProblem:
         tracks: their twists.
         classes: that are compared.
         guess: rough extrinsic, or None when nothing is known.
-        offset_s: rough time offset [s].
+        time_offset_s: rough time offset [s].
     """
 
     drives: Sequence[Drive]
     tracks: Tracks
     classes: Sequence[SemanticClass]
     guess: gtsam.Pose3 | None
-    offset_s: float
+    time_offset_s: float
 
     def centre(self, start: State) -> State:
         """What the weak priors are centred on: the guess, or a start's rotation without a translation."""
         cTl = gtsam.Pose3(start.cTl.rotation(), np.zeros(3)) if self.guess is None else self.guess
-        return State(cTl, (self.offset_s,) * len(start.time_offsets_s))
+        return State(cTl, (self.time_offset_s,) * len(start.time_offsets_s))
 
 
 def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[list[Candidate]]:
@@ -73,9 +73,9 @@ def candidate_steps(problem: StartProblem, config: SearchConfig) -> Stepwise[lis
     if not config.enabled:
         if problem.guess is None:
             raise EstimationError("no guess to start from, and the search is switched off")
-        return [Candidate(problem.guess, problem.offset_s, 0.0)]
+        return [Candidate(problem.guess, problem.time_offset_s, 0.0)]
     frames, camera = _richest_frames(problem, FRAMES)
-    search = SearchProblem(frames, camera, problem.classes, problem.guess, problem.offset_s, config)
+    search = SearchProblem(frames, camera, problem.classes, problem.guess, problem.time_offset_s, config)
     candidates = yield from search_steps(search, COARSE)
     _LOG.info("start: %d frames, best scores %s", len(frames), [round(c.score, 4) for c in candidates[:5]])
     return candidates
@@ -114,8 +114,10 @@ def _richest_frames(problem: StartProblem, most: int) -> tuple[list[SearchFrame]
 
 def _search_frames(problem: StartProblem, number: int, most: int) -> list[SearchFrame]:
     """Frames spread over a drive that show the classes to both sensors."""
-    drive, offset_s, usable = problem.drives[number], problem.offset_s, []
-    for pair in pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, offset_s, drive.image_period_s):
+    drive, time_offset_s, usable = problem.drives[number], problem.time_offset_s, []
+    for pair in pair_by_time(
+        drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s
+    ):
         scan, image = drive.scans[pair.scan], drive.images[pair.image]
         points = int(np.isin(scan.classes, problem.classes).sum())
         if points >= _MIN_CLASS_POINTS and image.contours:
@@ -124,7 +126,7 @@ def _search_frames(problem: StartProblem, number: int, most: int) -> list[Search
     frames = []
     for pair in (usable[i] for i in chosen if usable):
         scan, image = drive.scans[pair.scan], drive.images[pair.image]
-        sample = problem.tracks.at(number, image.stamp_ns + round(offset_s * 1e9))
+        sample = problem.tracks.at(number, image.stamp_ns + round(time_offset_s * 1e9))
         twist = np.zeros(6) if sample is None else sample.twist
         frames.append(SearchFrame(scan.lPs, scan.classes, image.mask, pair.base_tau_s, twist))
     return frames

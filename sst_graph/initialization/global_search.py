@@ -132,7 +132,7 @@ class Candidate:
     """A pose and time offset with its score per cell of the images (0 chance, higher better)."""
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
     score: float
 
 
@@ -145,7 +145,7 @@ class SearchProblem:
         camera: of all of them.
         classes: that are compared.
         guess: a rough pose, or None when nothing is known: rotations from all of SO(3).
-        offset_s: rough time offset [s].
+        time_offset_s: rough time offset [s].
         config: where to search.
     """
 
@@ -153,7 +153,7 @@ class SearchProblem:
     camera: PinholeCamera
     classes: Sequence[SemanticClass]
     guess: gtsam.Pose3 | None
-    offset_s: float
+    time_offset_s: float
     config: SearchConfig
 
     @property
@@ -172,7 +172,7 @@ class SearchProblem:
             rotations = rotation_matrices(vectors) @ np.asarray(self.guess.rotation().matrix())
             translation = np.asarray(self.guess.translation(), dtype=np.float64)
         m = len(rotations)
-        return States(rotations, np.tile(translation, (m, 1)), np.full(m, self.offset_s))
+        return States(rotations, np.tile(translation, (m, 1)), np.full(m, self.time_offset_s))
 
     def in_reach(self, states: States) -> IntArray:
         """Indices of the states whose rotation is in reach of the guess; all of them where none is."""
@@ -279,13 +279,13 @@ class _Region:
     """Box that translations [m] and time offsets [s] stay in.
 
     Attributes:
-        translation, offset_s: its centre.
+        translation, time_offset_s: its centre.
         half_width_m, half_width_s: half its width.
         scale: (7,) standard deviations of the first samples: rotation vector, translation, offset.
     """
 
     translation: FloatArray
-    offset_s: float
+    time_offset_s: float
     half_width_m: float
     half_width_s: float
     scale: FloatArray
@@ -296,14 +296,15 @@ class _Region:
         translation = np.zeros(3) if problem.guess is None else np.asarray(problem.guess.translation())
         half_width_s = problem.config.time_offset_s
         scale = [problem.spacing] * 3 + [0.5 * half_width_m] * 3 + [0.5 * half_width_s * moving]
-        return cls(translation, problem.offset_s, half_width_m, half_width_s, np.array(scale))
+        return cls(translation, problem.time_offset_s, half_width_m, half_width_s, np.array(scale))
 
     def clip(self, states: States) -> States:
         return States(
             states.rotations,
             self.translation
             + np.clip(states.translations - self.translation, -self.half_width_m, self.half_width_m),
-            self.offset_s + np.clip(states.offsets - self.offset_s, -self.half_width_s, self.half_width_s),
+            self.time_offset_s
+            + np.clip(states.offsets - self.time_offset_s, -self.half_width_s, self.half_width_s),
         )
 
 

@@ -105,16 +105,16 @@ def select_start_steps(
     """
     candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
-        start = ((candidates[0].cTl, candidates[0].offset_s),)
+        start = ((candidates[0].cTl, candidates[0].time_offset_s),)
         return Selection(start, start, candidates[0].score)
     candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
     selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
     if problem.guess is not None:
         return selection
     closer = []
-    for cTl, offset_s in selection.distant:
+    for cTl, time_offset_s in selection.distant:
         around = yield from candidate_steps(replace(problem, guess=cTl), config)
-        closer += [Candidate(cTl, offset_s, selection.score), *around[:most_candidates]]
+        closer += [Candidate(cTl, time_offset_s, selection.score), *around[:most_candidates]]
     return (yield from select_among_steps(problem, closer, graph, config, most_scans))
 
 
@@ -135,7 +135,7 @@ def select_among_steps(
     full = RefinementProblem.of(edges_of(few, problem.tracks, graph), graph)
     rough = full.thinned(_WIDE_POINTS)
     yield 10
-    poses = _poses(_with_offsets(candidates, problem.offset_s), full.biases)
+    poses = _poses(_with_offsets(candidates, problem.time_offset_s), full.biases)
     centres = _centres(poses, problem)
     for kernels_px in _WIDE_STAGES:
         poses = yield from refine_steps(rough, poses, centres, kernels_px)
@@ -181,9 +181,9 @@ def _with_alternative(starts: Sequence[_Start], scores: FloatArray) -> tuple[_St
 def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
     """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
     chosen: list[_Start] = []
-    for cTl, offset_s in starts:
+    for cTl, time_offset_s in starts:
         if all(_turn_rad(cTl, other) > _FAR_RAD for other, _ in chosen):
-            chosen.append((cTl, offset_s))
+            chosen.append((cTl, time_offset_s))
     return tuple(chosen[:_DISTANT])
 
 
@@ -195,12 +195,12 @@ def _alike(one: State, other: State) -> bool:
     return near and abs(one.time_offsets_s[0] - other.time_offsets_s[0]) <= _ALIKE_S
 
 
-def _with_offsets(candidates: Sequence[Candidate], guess_offset_s: float) -> list[Candidate]:
+def _with_offsets(candidates: Sequence[Candidate], guess_time_offset_s: float) -> list[Candidate]:
     """The candidates, and the first of them at other time offsets: slow frames hardly determine the
     offset."""
-    if all(candidate.offset_s == guess_offset_s for candidate in candidates):
+    if all(candidate.time_offset_s == guess_time_offset_s for candidate in candidates):
         return list(candidates)
-    others = [replace(candidates[0], offset_s=guess_offset_s + step) for step in (0.0, 0.25, -0.25)]
+    others = [replace(candidates[0], time_offset_s=guess_time_offset_s + step) for step in (0.0, 0.25, -0.25)]
     return [*candidates, *others]
 
 
@@ -214,7 +214,7 @@ def _poses(candidates: Sequence[Candidate], biases: int) -> Poses:
     return Poses(
         np.stack([candidate.cTl.rotation().matrix() for candidate in candidates]),
         np.stack([candidate.cTl.translation() for candidate in candidates]),
-        np.array([candidate.offset_s for candidate in candidates]),
+        np.array([candidate.time_offset_s for candidate in candidates]),
         np.zeros((len(candidates), biases)),
     )
 
@@ -228,7 +228,7 @@ def _cTls(poses: Poses) -> list[gtsam.Pose3]:
 
 def _centres(poses: Poses, problem: StartProblem) -> Poses:
     """What the weak priors of each pose are centred on, as in :meth:`StartProblem.centre`."""
-    offsets, guess = np.full(len(poses), problem.offset_s), problem.guess
+    offsets, guess = np.full(len(poses), problem.time_offset_s), problem.guess
     if guess is None:
         return Poses(poses.rotations, np.zeros_like(poses.translations), offsets, poses.biases)
     rotations = np.broadcast_to(guess.rotation().matrix(), poses.rotations.shape)

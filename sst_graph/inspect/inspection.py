@@ -212,7 +212,7 @@ def weakest_direction(result: CalibrationResult, limits: ObservabilityConfig) ->
     """The direction known worst, each unknown measured in its limit; also where it is within the limits."""
     least = {
         name: max(1e-9 * getattr(limits, name), 1e-30)
-        for name in ("rotation_deg", "translation_m", "offset_s")
+        for name in ("rotation_deg", "translation_m", "time_offset_s")
     }
     tiny = dataclasses.replace(limits, **least)
     return weak_directions(result.covariance, result.T_camera_lidar, tiny)[0]

@@ -157,14 +157,14 @@ def _sigma_ms(result: CalibrationResult) -> str:
     return f"{_short(result.sigmas().time_offset_ms)} ms"
 
 
-def _milliseconds(offset_s: float, sigma_s: float) -> str:
-    return f"{1e3 * offset_s:+.2f} ms +- {_short(1e3 * sigma_s)} ms"
+def _milliseconds(time_offset_s: float, sigma_s: float) -> str:
+    return f"{1e3 * time_offset_s:+.2f} ms +- {_short(1e3 * sigma_s)} ms"
 
 
 def _moved(result: CalibrationResult, initial: gtsam.Pose3) -> str:
     turned = quaternion_angle_deg(result.T_camera_lidar.rotation(), initial.rotation())
     shifted = 100.0 * mean_translation_difference_m(result.T_camera_lidar, initial)
-    later = 1e3 * (result.time_offset_s - result.initial_offset_s)
+    later = 1e3 * (result.time_offset_s - result.initial_time_offset_s)
     return f"from the start by {turned:.2f} deg, {shifted:.1f} cm (mean of x y z), {later:+.1f} ms"
 
 

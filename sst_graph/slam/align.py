@@ -68,7 +68,7 @@ def align_frame(
     image: CameraImage | ImageFeatures,
     camera: PinholeCamera,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     l_twist: ArrayLike,
     *,
     l_acceleration: ArrayLike | None = None,
@@ -85,7 +85,7 @@ def align_frame(
     Args:
         scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
         camera: of the image.
-        cTl, offset_s: current extrinsic, and time offset [s].
+        cTl, time_offset_s: current extrinsic, and time offset [s].
         l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
         l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
         lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
@@ -117,7 +117,7 @@ def align_frame(
         velocities_of_points(_velocities(l_velocities or {}), boundaries),
     )
     place = cTl if lTs is None else cTl * lTs
-    found = match_silhouettes(pair, place, offset_s, biases_px or {}, kernel, config)
+    found = match_silhouettes(pair, place, time_offset_s, biases_px or {}, kernel, config)
     return _frame_alignments(found)
 
 

@@ -107,21 +107,21 @@ class AlignmentKeys:
     Attributes:
         trajectory: poses wTb of the body, one at each scan's stamp.
         cTl: key of the extrinsic, or a fixed pose.
-        offset_s: key of the time offset (``Vector(1)`` or ``double``), or a fixed offset [s].
+        time_offset_s: key of the time offset (``Vector(1)`` or ``double``), or a fixed offset [s].
         biases_px: by class, key of its mask bias or a fixed bias [px]; none where a class is missing.
         bTl: pose of the LiDAR in the body; None where the poses are the LiDAR's own.
     """
 
     trajectory: Trajectory
     cTl: int | gtsam.Pose3
-    offset_s: int | float
+    time_offset_s: int | float
     biases_px: Mapping[SemanticClass, int | float] = field(default_factory=dict)
     bTl: gtsam.Pose3 | None = None
 
     def __post_init__(self) -> None:
         place = "AlignmentKeys"
         object.__setattr__(self, "cTl", pose_or_key(place, "cTl", self.cTl))
-        object.__setattr__(self, "offset_s", number_or_key(place, "offset_s", self.offset_s))
+        object.__setattr__(self, "time_offset_s", number_or_key(place, "time_offset_s", self.time_offset_s))
         biases = {c: number_or_key(place, "biases_px", bias) for c, bias in self.biases_px.items()}
         object.__setattr__(self, "biases_px", biases)
 
@@ -129,7 +129,7 @@ class AlignmentKeys:
         return self.cTl if isinstance(self.cTl, gtsam.Pose3) else values.atPose3(self.cTl)
 
     def offset(self, values: gtsam.Values) -> float:
-        return number(values, self.offset_s)
+        return number(values, self.time_offset_s)
 
     def bias(self, values: gtsam.Values, semantic_class: SemanticClass) -> float:
         return number(values, self.biases_px.get(semantic_class, 0.0))
@@ -137,7 +137,7 @@ class AlignmentKeys:
     @property
     def variables(self) -> tuple[int, ...]:
         """Keys of extrinsic and time offset, those of the two that are variables."""
-        return tuple(key for key in (self.cTl, self.offset_s) if isinstance(key, int))
+        return tuple(key for key in (self.cTl, self.time_offset_s) if isinstance(key, int))
 
     @property
     def lasting(self) -> tuple[int, ...]:
@@ -151,8 +151,8 @@ class AlignmentKeys:
         rows = dict(zip(self.lasting, self._first_rows(), strict=True))
         if isinstance(self.cTl, int):
             A[rows[self.cTl] : rows[self.cTl] + 6, :6] = np.eye(6)
-        if isinstance(self.offset_s, int):
-            A[rows[self.offset_s], 6] = 1.0
+        if isinstance(self.time_offset_s, int):
+            A[rows[self.time_offset_s], 6] = 1.0
         for c, key in self.biases_px.items():
             if isinstance(key, int):
                 A[rows[key], bias_column(c)] = 1.0
@@ -165,7 +165,7 @@ class AlignmentKeys:
     def keeps_double(self, values: gtsam.Values) -> bool:
         """Whether the time offset is kept as a ``double``."""
         try:
-            values.atDouble(int(self.offset_s))
+            values.atDouble(int(self.time_offset_s))
         except RuntimeError:
             return False
         return True

@@ -307,7 +307,7 @@ class AlignmentTerm:
             place.X_a,
             place.X_b,
             self.keys.cTl,
-            self.keys.offset_s,
+            self.keys.time_offset_s,
             place.seconds,
             X_scan=place.X_scan,
             bTl=self.keys.bTl,
@@ -322,18 +322,18 @@ class AlignmentTerm:
         place = matches.place
         if place is None:
             return []
-        cTl, offset_s = self.keys.extrinsic(values), self.keys.offset(values)
+        cTl, time_offset_s = self.keys.extrinsic(values), self.keys.offset(values)
         a, b = values.atPose3(place.X_a), values.atPose3(place.X_b)
         c_twist = cTl.AdjointMap() @ self._in_lidar(
             np.asarray(gtsam.Pose3.Logmap(a.between(b))) / place.seconds
         )
         lTs = self._lTs(values, place)
         moved = cTl if lTs is None else cTl * lTs
-        late_s = offset_s + place.image_after_a_s - 0.5 * place.seconds
+        late_s = time_offset_s + place.image_after_a_s - 0.5 * place.seconds
         found = []
         for alignment in matches.found.alignments:
             twist = c_twist + late_s * alignment.c_acceleration
-            r, J = residuals(alignment, moved, offset_s, twist)
+            r, J = residuals(alignment, moved, time_offset_s, twist)
             # cTl Exp(d) lTs = cTl lTs Exp(Ad(lTs^-1) d)
             by_cTl = J[:, :6] if lTs is None else J[:, :6] @ lTs.inverse().AdjointMap()
             found.append((r, np.column_stack([by_cTl, J[:, 6]])))

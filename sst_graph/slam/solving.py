@@ -175,7 +175,7 @@ def proximal(
     if isinstance(keys.cTl, int):
         noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas[:6])
         graph.add(gtsam.PriorFactorPose3(keys.cTl, values.atPose3(keys.cTl), noise))
-    if isinstance(keys.offset_s, int):
+    if isinstance(keys.time_offset_s, int):
         double = keys.keeps_double(values)
-        graph.add(time_offset_prior(keys.offset_s, keys.offset(values), float(sigmas[6]), double=double))
+        graph.add(time_offset_prior(keys.time_offset_s, keys.offset(values), float(sigmas[6]), double=double))
     return graph

@@ -68,7 +68,7 @@ class StampOrder:
         return step <= _FARTHEST_NS and (self.may_be_late or step >= _CLOSEST_NS)
 
 
-def check_lateness(image: CameraImage, window: Window, offset_s: float, late_s: float) -> None:
+def check_lateness(image: CameraImage, window: Window, time_offset_s: float, late_s: float) -> None:
     """An image that is not far behind the newest scan in true time.
 
     Raises:
@@ -77,6 +77,6 @@ def check_lateness(image: CameraImage, window: Window, offset_s: float, late_s: 
     newest = window.last_stamp_ns
     if newest is None or not window.images:
         return
-    late = (newest - image.stamp_ns) * 1e-9 - offset_s
+    late = (newest - image.stamp_ns) * 1e-9 - time_offset_s
     if late > late_s and image.stamp_ns < window.images[-1].stamp_ns:
         raise DataError("image", f"one {late:.2f} s behind the newest scan", f"at most {late_s:g} s")

@@ -33,7 +33,7 @@ class DriftConfig(Settings):
         doc="Random walk of the translation, each axis, with drift.enabled. Raise it for mounts that "
         "move faster.",
     )
-    offset_s: float = setting(
+    time_offset_s: float = setting(
         0.0001,
         at_least=1e-8,
         at_most=10.0,

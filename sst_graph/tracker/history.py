@@ -67,7 +67,7 @@ class History:
             total = belief.plus(a).plus(b)
             best = total.mean()
             covariance = scaled_inverse(total.information)[:7, :7]
-            entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.offset_s, covariance))
+            entries.append(HistoryEntry(epoch.start_ns, best.cTl, best.time_offset_s, covariance))
         return entries
 
 

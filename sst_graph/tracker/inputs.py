@@ -89,7 +89,7 @@ class SensorInputs:
         """
         if clock_step_ns:
             self.window.forget_images_before(self.window.next_image)
-        check_lateness(image, self.window, estimate.point.offset_s, self.config.late_s)
+        check_lateness(image, self.window, estimate.point.time_offset_s, self.config.late_s)
         self.image_order.add(image.stamp_ns, clock_step_ns != 0)
         self.stamps.add_image(image.stamp_ns, self.window.place)
         calibration = self.config.calibration
@@ -125,6 +125,6 @@ class SensorInputs:
 
     def _forget_images(self, estimate: OnlineEstimate) -> None:
         """Drop the images that no scan, present or to come, can be paired with."""
-        margin_s = self.config.late_s + max(0.0, estimate.point.offset_s)
+        margin_s = self.config.late_s + max(0.0, estimate.point.time_offset_s)
         margin_s += 0.0 if estimate.exists else _SEARCH_MARGIN_S
         self.window.forget_images(round(1e9 * margin_s), _MAX_IMAGES)

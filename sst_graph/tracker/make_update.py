@@ -39,7 +39,7 @@ def make_update(
     return TrackUpdate(
         stamp_ns=stamp_ns,
         T_camera_lidar=point.cTl,
-        time_offset_s=point.offset_s,
+        time_offset_s=point.time_offset_s,
         covariance=covariance if estimate.exists else None,
         covariance_reason="" if estimate.exists else "no estimate yet: this is the guess",
         status=status,
@@ -50,7 +50,7 @@ def make_update(
         suspected_change=changes.suspected_change,
         alarm=alarm,
         unconfirmed_s=confirmation.turn_s,
-        offset_unconfirmed_s=confirmation.offset_s,
+        time_offset_unconfirmed_s=confirmation.time_offset_s,
         weak_directions=weak,
         contradictions=contradictions,
         estimated=estimate.parameters,

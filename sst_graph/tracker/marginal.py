@@ -26,7 +26,7 @@ class TrackedMarginal(CalibrationMarginal):
 
 
 def tracked_marginal(
-    cTl: gtsam.Pose3, offset_s: float, covariance: FloatArray, start: int
+    cTl: gtsam.Pose3, time_offset_s: float, covariance: FloatArray, start: int
 ) -> TrackedMarginal:
     """An estimate and its covariance (7, 7), about itself.
 
@@ -34,7 +34,7 @@ def tracked_marginal(
         EstimationError: the covariance has no inverse.
     """
     information = inverse(covariance, "covariance of the tracker")
-    return TrackedMarginal(cTl, offset_s, information, np.zeros(7), start=start)
+    return TrackedMarginal(cTl, time_offset_s, information, np.zeros(7), start=start)
 
 
 def moved_to(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMarginal:
@@ -48,14 +48,14 @@ def moved_to(whole: TrackedMarginal, previous: CalibrationMarginal) -> TrackedMa
     xi = np.asarray(gtsam.Pose3.Logmap(step))
     back = np.eye(7)
     back[:6, :6] = np.linalg.inv(np.asarray(gtsam.Pose3.LogmapDerivative(xi)))
-    shift = np.append(xi, whole.offset_s - previous.offset_s)
+    shift = np.append(xi, whole.time_offset_s - previous.time_offset_s)
     information = back.T @ whole.information @ back
     information = 0.5 * (information + information.T)
     vector = information @ shift
     return replace(
         whole,
         cTl=previous.cTl,
-        offset_s=previous.offset_s,
+        time_offset_s=previous.time_offset_s,
         information=information,
         vector=vector,
         constant=float(shift @ vector),

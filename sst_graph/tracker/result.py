@@ -49,7 +49,7 @@ def tracker_result(
         method="track",
         config=to_dict(config),
         initial=guess.cTl,
-        initial_offset_s=guess.offset_s,
+        initial_time_offset_s=guess.time_offset_s,
         diagnostics={
             "scans": window.next_scan,
             "matches": last.matches,
@@ -71,8 +71,8 @@ def _unconfirmed(last: TrackUpdate, new_start: bool) -> tuple[str, ...]:
     if new_start:
         return ("no frames that came after the start have been found to agree with those it was made of",)
     of_offset = (
-        f", nor one of the time offset for {last.offset_unconfirmed_s:.1f} s of driving"
-        if last.offset_unconfirmed_s > 0.0
+        f", nor one of the time offset for {last.time_offset_unconfirmed_s:.1f} s of driving"
+        if last.time_offset_unconfirmed_s > 0.0
         else ""
     )
     return (

@@ -41,8 +41,8 @@ class TrackUpdate(ByValue):
         alarm: this frame raised the alarm: the calibration has changed.
         unconfirmed_s: time since frames last agreed with the estimate that would have shown a turn of the
             camera; above 1 s the status is ``unconfirmed`` [s].
-        offset_unconfirmed_s: time at more than 3 m/s since frames last agreed with it that would have shown a
-            jump of the clock; above 3 s the status is ``unconfirmed`` [s].
+        time_offset_unconfirmed_s: time at more than 3 m/s since frames last agreed with it that would have
+            shown a jump of the clock; above 3 s the status is ``unconfirmed`` [s].
         adopted: the estimate is the calibration in use from now on.
         weak_directions: what is known worse than the limits.
         covariance_reason: why there is no covariance; empty where there is.
@@ -66,7 +66,7 @@ class TrackUpdate(ByValue):
     suspected_change: str = ""
     alarm: bool = False
     unconfirmed_s: float = 0.0
-    offset_unconfirmed_s: float = 0.0
+    time_offset_unconfirmed_s: float = 0.0
     adopted: bool = False
     weak_directions: tuple[WeakDirection, ...] = ()
     covariance_reason: str = ""
@@ -102,7 +102,7 @@ class TrackUpdate(ByValue):
             "suspected_change": self.suspected_change,
             "alarm": self.alarm,
             "unconfirmed_s": self.unconfirmed_s,
-            "offset_unconfirmed_s": self.offset_unconfirmed_s,
+            "time_offset_unconfirmed_s": self.time_offset_unconfirmed_s,
             "adopted": self.adopted,
             "converged": self.converged,
             "contradictions": list(self.contradictions),

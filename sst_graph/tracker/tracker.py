@@ -60,12 +60,12 @@ class Tracker:
         camera: PinholeCamera,
         config: TrackerConfig | None = None,
         initial: gtsam.Pose3 | None = None,
-        initial_offset_s: float = 0.0,
+        initial_time_offset_s: float = 0.0,
     ) -> None:
         """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
-        self.setup = Setup(camera, config or TrackerConfig(), initial, initial_offset_s)
+        self.setup = Setup(camera, config or TrackerConfig(), initial, initial_time_offset_s)
         config = self.setup.config.estimating
-        guess = Guess(initial, initial_offset_s, search=config.calibration.search.enabled)
+        guess = Guess(initial, initial_time_offset_s, search=config.calibration.search.enabled)
         self.inputs = SensorInputs(camera, config, searched_scans(config))
         self.matcher = WindowMatcher(self.inputs.window, config)
         self.initializer = Initializer(guess, config)
@@ -169,7 +169,7 @@ class Tracker:
         if not self.estimate.exists:
             raise EstimationError("the tracker has no estimate yet: no marginal")
         point, starts = self.estimate.point, self.estimate.starts
-        whole = tracked_marginal(point.cTl, point.offset_s, self.estimate.reported_covariance(), starts)
+        whole = tracked_marginal(point.cTl, point.time_offset_s, self.estimate.reported_covariance(), starts)
         if since is None:
             return whole
         if since.start != whole.start:
@@ -249,7 +249,7 @@ class Tracker:
         window, point, guess = self.inputs.window, self.estimate.point, self.initializer.guess
         if clock_step_ns:
             moved = f"the scan stamps moved by {1e-9 * clock_step_ns:+.3f} s and go on from there"
-            near = Guess(point.cTl, point.offset_s, guess.search)
+            near = Guess(point.cTl, point.time_offset_s, guess.search)
             return Restart(
                 near, len(window.scans), f"{moved}: the calibration is estimated again", alarm=True
             )
@@ -264,7 +264,7 @@ class Tracker:
         # Most likely the clock was set.
         changes = self.monitor.changes
         before = changes.before(scan) or point
-        near = Guess(before.cTl, before.offset_s + jump.offset_s, search=changes.far)
+        near = Guess(before.cTl, before.time_offset_s + jump.time_offset_s, search=changes.far)
         return Restart(near, since, jump.sentence, alarm=True, chi2=jump.chi2)
 
     def _restart(self, restart: Restart, stamp_ns: int) -> TrackUpdate:
@@ -296,7 +296,7 @@ class Tracker:
             if self.inputs.failed(why):
                 point, guess = self.estimate.point, self.initializer.guess
                 self.inputs.restart()
-                self._restart(Restart(Guess(point.cTl, point.offset_s, guess.search), 0, why), 0)
+                self._restart(Restart(Guess(point.cTl, point.time_offset_s, guess.search), 0, why), 0)
                 why = f"{why}; the calibration is estimated again"
         stamp_ns = getattr(data, "stamp_ns", 0)
         known = isinstance(stamp_ns, int | np.integer) and abs(int(stamp_ns)) <= LATEST_NS

@@ -63,7 +63,7 @@ def draw_overlay(
     frame: Frame,
     camera: PinholeCamera,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray | None = None,
     caption: str = "",
 ) -> Picture:
@@ -78,7 +78,7 @@ def draw_overlay(
         DataError: the frame lacks its scan or its image, or the image has another size than the camera.
     """
     scan, image = _both(frame, camera)
-    uvs, classes = _projected(scan, image, camera, cTl, offset_s, c_twist)
+    uvs, classes = _projected(scan, image, camera, cTl, time_offset_s, c_twist)
     zoom = -(-MIN_WIDTH_PX // camera.width)
     picture = _enlarged(_backdrop(image), zoom)
     _draw_contours(
@@ -136,13 +136,13 @@ def _projected(
     image: CameraImage,
     camera: PinholeCamera,
     cTl: gtsam.Pose3,
-    offset_s: float,
+    time_offset_s: float,
     c_twist: FloatArray | None,
 ) -> tuple[FloatArray, NDArray[np.uint8]]:
     """Pixels (m, 2) and classes (m,) of the points that fall on the image, far ones first."""
     cPs = _transformed(cTl, scan.points.astype(np.float64))
     if c_twist is not None:
-        tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + offset_s
+        tau = (image.stamp_ns - scan.stamp_ns) * 1e-9 + time_offset_s
         offsets_s = np.zeros(len(cPs)) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
         cPs = _moved(cPs, tau - offsets_s, c_twist)
     uvs = camera.project(cPs)

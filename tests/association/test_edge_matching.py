@@ -58,14 +58,14 @@ def disc() -> ContourMap:
 def match(
     points: Boundaries,
     cTl: gtsam.Pose3 = CTL,
-    offset_s: float = 0.0,
+    time_offset_s: float = 0.0,
     base_tau_s: float = 0.0,
     motion: Motion = STILL,
     bias_px: float = 0.0,
     config: MatchConfig | None = None,
 ) -> SilhouetteMatches:
     pair = ScanWithImage({VEHICLE: points}, {VEHICLE: disc()}, CAMERA, base_tau_s, motion)
-    found = match_silhouettes(pair, cTl, offset_s, {VEHICLE: bias_px}, KERNEL, config or MatchConfig())
+    found = match_silhouettes(pair, cTl, time_offset_s, {VEHICLE: bias_px}, KERNEL, config or MatchConfig())
     return found[VEHICLE]
 
 
@@ -92,10 +92,10 @@ def test_a_shift_shows_with_its_sign() -> None:
 def test_points_move_to_the_images_instant() -> None:
     # The camera moves right at 2 m/s; seen 0.1 s later the points are 6 px to the left of the disc.
     motion = Motion(np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]), np.zeros(6))
-    for offset_s, base_tau_s, delays_s in ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.15, 0.0, 0.05)):
+    for time_offset_s, base_tau_s, delays_s in ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.15, 0.0, 0.05)):
         points = replace(ring(), offsets_s=np.full(90, delays_s))
-        found = match(points, offset_s=offset_s, base_tau_s=base_tau_s, motion=motion)
-        r = residuals(found.alignment, CTL, offset_s, motion.c_twist)[0].ravel()
+        found = match(points, time_offset_s=time_offset_s, base_tau_s=base_tau_s, motion=motion)
+        r = residuals(found.alignment, CTL, time_offset_s, motion.c_twist)[0].ravel()
         assert np.polyfit(found.alignment.normals @ [1.0, 0.0], r, 1)[0] == pytest.approx(-6.0, abs=0.5)
 
 

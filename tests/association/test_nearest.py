@@ -85,21 +85,21 @@ def test_matches_by_hand() -> None:
     np.testing.assert_allclose(i2p.weights, 6.0 * 2 / 12)
 
 
-@pytest.mark.parametrize("offset_s, base_tau_s", [(0.1, 0.0), (0.0, 0.1), (0.3, -0.2)])
-def test_a_camera_that_drives_on_sees_points_come_nearer(offset_s: float, base_tau_s: float) -> None:
+@pytest.mark.parametrize("time_offset_s, base_tau_s", [(0.1, 0.0), (0.0, 0.1), (0.3, -0.2)])
+def test_a_camera_that_drives_on_sees_points_come_nearer(time_offset_s: float, base_tau_s: float) -> None:
     """tau = offset + base_tau, and cP = cTl lP - tau v: 10 m become 9 m after 0.1 s at 10 m/s."""
     mask = np.zeros((48, 64), np.uint8)
     mask[:, 38:] = VEHICLE
     cPs = np.array([[0.98, 0.0, 10.0]])
     c_twist = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
     still = match_nearest(view(mask, cPs), FORWARD, 0.0, c_twist, 0.0)
-    moved = match_nearest(view(mask, cPs, base_tau_s), FORWARD, offset_s, c_twist, 0.0)
+    moved = match_nearest(view(mask, cPs, base_tau_s), FORWARD, time_offset_s, c_twist, 0.0)
     assert still is not None and moved is not None and moved.pixel_to_point is None
     np.testing.assert_allclose(still.point_to_pixel.pixels[0], [38.0, 24.0])  # u = 31.5 + 60 * 0.098 = 37.4
     np.testing.assert_allclose(moved.point_to_pixel.pixels[0], [38.0, 24.0])  # u = 31.5 + 60 * 0.98/9 = 38.03
     values = gtsam.Values()
     values.insert(0, FORWARD)
-    cost = frame_factor([moved.point_to_pixel], 0, offset_s, c_twist).error(values)
+    cost = frame_factor([moved.point_to_pixel], 0, time_offset_s, c_twist).error(values)
     r = np.array([31.5 + 60.0 * 0.98 / 9.0 - 38.0, 23.5 - 24.0])
     assert cost == pytest.approx(0.5 * float(r @ r), rel=1e-9)
 

@@ -60,12 +60,12 @@ def test_many_offsets_at_once_are_each_by_itself() -> None:
     offsets_s = rng.uniform(-0.5, 0.5, 40)
     found, base_taus_s = nearest_images(scans, images, offsets_s, 0.1)
     assert found.shape == base_taus_s.shape == (40, 20)
-    for own, taus, offset_s in zip(found, base_taus_s, offsets_s.tolist(), strict=True):
-        pairs = pair_by_time(scans, images, offset_s, 0.1)
+    for own, taus, time_offset_s in zip(found, base_taus_s, offsets_s.tolist(), strict=True):
+        pairs = pair_by_time(scans, images, time_offset_s, 0.1)
         assert [(p.scan, p.image, p.base_tau_s) for p in pairs] == [
             (k, own[k], taus[k]) for k in np.flatnonzero(own >= 0)
         ]
         # The nearest of all, and only where it is near.
         for k, stamp in enumerate(scans):
-            apart = [abs(1e-9 * (image - stamp) + offset_s) for image in images]
+            apart = [abs(1e-9 * (image - stamp) + time_offset_s) for image in images]
             assert own[k] == (int(np.argmin(apart)) if min(apart) <= 0.1 else -1)

@@ -101,7 +101,7 @@ def test_the_paper_comes_nearer_in_rotation_and_time(drive: Drive, truth: Ground
 @pytest.mark.parametrize("method", ["static", "semalign"])
 def test_space_alone_leaves_the_offset_open(drive: Drive, truth: GroundTruth, method: str) -> None:
     start = off_start(truth)
-    result = calibrate_prepared([drive], start, config_of(method), initial_offset_s=0.02)
+    result = calibrate_prepared([drive], start, config_of(method), initial_time_offset_s=0.02)
     assert errors_of(result, truth).qad_deg < 0.6 * calibration_errors(start, 0.0, truth).qad_deg
     assert result.time_offset_s == 0.02
     assert result.status != "ok" and any("time offset is known to 1000" in r for r in result.reasons)
@@ -120,7 +120,7 @@ def test_one_step_at_a_time_brings_the_delay(drive: Drive, truth: GroundTruth) -
     beta = beta_regularizer(EXTRINSIC, truth.cTl, 1e6, 1e9)
     for _ in range(5):
         moved = step_once(frames, at, 5.0, beta, offset_free=True)
-        assert at.offset_s < moved.offset_s < 1.2 * OFFSET_S
+        assert at.time_offset_s < moved.time_offset_s < 1.2 * OFFSET_S
         assert np.abs(truth.cTl.localCoordinates(moved.cTl)).max() < 0.05
         at = moved
 

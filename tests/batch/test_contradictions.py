@@ -108,15 +108,18 @@ def sliding(frames: Sequence[Frame], pixels: int) -> list[Frame]:
 
 def calibrated(sources: Sequence[Source], config: CalibrationConfig = CONFIG) -> CalibrationResult:
     return calibrate_prepared(
-        prepare_drives(sources, config), street().truth.cTl, config, initial_offset_s=STREET.time_offset_s
+        prepare_drives(sources, config),
+        street().truth.cTl,
+        config,
+        initial_time_offset_s=STREET.time_offset_s,
     )
 
 
-def parts_of(drives: Sequence[Drive], offset_s: float) -> PartSolver:
+def parts_of(drives: Sequence[Drive], time_offset_s: float) -> PartSolver:
     """Ready to be solved, about the truth."""
     truth = street().truth.cTl
-    problem = CalibrationProblem.of(drives, Guess(truth, offset_s), CONFIG)
-    return PartSolver(problem, State(truth, (offset_s,)))
+    problem = CalibrationProblem.of(drives, Guess(truth, time_offset_s), CONFIG)
+    return PartSolver(problem, State(truth, (time_offset_s,)))
 
 
 def first_frame_after(result: CalibrationResult) -> int:
@@ -204,7 +207,7 @@ def test_the_offset_of_every_drive_counts() -> None:
         assert "time offset" in weak.sentence and abs(weak.vector[6]) > 0.9
         assert any("drive 'standing'" in reason for reason in result.reasons)
         offsets = {offset.drive: offset.sigma_s for offset in result.drive_offsets}
-        assert offsets["standing"] > 3.0 * CONFIG.observability.offset_s > offsets["moving"]
+        assert offsets["standing"] > 3.0 * CONFIG.observability.time_offset_s > offsets["moving"]
 
 
 def test_parts_have_the_tracks_of_their_scans() -> None:

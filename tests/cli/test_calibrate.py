@@ -45,12 +45,12 @@ def _strict_json(path: Path) -> Any:
 
 def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "result"
-    code = _calibrate(street, out, "--set", "observability.offset_s=0.05")
+    code = _calibrate(street, out, "--set", "observability.time_offset_s=0.05")
     captured = capsys.readouterr()
     assert (code, captured.err) == (0, "")
     assert "against the truth" in captured.out and "deg (QAD)" in captured.out
     document = _strict_json(out / "calibration.json")
-    assert document["config"]["observability"]["offset_s"] == 0.05
+    assert document["config"]["observability"]["time_offset_s"] == 0.05
     assert document["camera"]["name"] == "image_2"
     assert {frame["drive"] for frame in document["frames_used"]} == {"street/00"}
     assert sorted(path.suffix for path in out.glob("[!.]*")) == [".json", ".md", *[".png"] * 3]
@@ -90,7 +90,7 @@ def test_a_result_is_a_start(street: Path, tmp_path: Path) -> None:
         assert _calibrate(street, tmp_path / name, *ONE_FRAME, "--init", start) == 3
     first, second = (read_result(tmp_path / name / "calibration.json") for name in ("first", "second"))
     assert second.initial is not None and second.initial.equals(first.T_camera_lidar, 1e-9)
-    assert second.initial_offset_s == first.time_offset_s
+    assert second.initial_time_offset_s == first.time_offset_s
 
 
 def test_no_guess_at_all(street: Path, tmp_path: Path) -> None:

@@ -107,5 +107,5 @@ def test_the_weakest_first_and_only_past_the_limits() -> None:
     found = weak_directions(np.diag(sigmas**2), CTL, CONFIG)
     # 0.3 m is six times its limit, 0.02 rad 2.3 times.
     assert [int(np.abs(weak.vector).argmax()) for weak in found] == [3, 2]
-    wide = ObservabilityConfig(rotation_deg=2.0, translation_m=0.5, offset_s=0.01)
+    wide = ObservabilityConfig(rotation_deg=2.0, translation_m=0.5, time_offset_s=0.01)
     assert weak_directions(np.diag(sigmas**2), CTL, wide) == ()

@@ -135,13 +135,13 @@ def street(drive: SimulatedDrive) -> TwoClockSource:
 def errors(result: CalibrationResult, drive: SimulatedDrive) -> tuple[float, float, float]:
     """Rotation [deg], translation [m], time offset [s]."""
     step = np.asarray(gtsam.Pose3.Logmap(drive.truth.cTl.between(result.T_camera_lidar)))
-    offset_s = result.time_offset_s - drive.config.time_offset_s
-    return float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:])), abs(offset_s)
+    time_offset_s = result.time_offset_s - drive.config.time_offset_s
+    return float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:])), abs(time_offset_s)
 
 
 def test_a_camera_of_30_hz_with_a_lidar_of_10_hz() -> None:
     drive = simulated(FAST_STREET)
     result = calibrate(street(drive), drive.nominal)
     assert result.status == "ok"
-    rotation_deg, translation_m, offset_s = errors(result, drive)
-    assert rotation_deg < 0.08 and translation_m < 0.017 and offset_s < 0.007
+    rotation_deg, translation_m, time_offset_s = errors(result, drive)
+    assert rotation_deg < 0.08 and translation_m < 0.017 and time_offset_s < 0.007

@@ -171,12 +171,12 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
     """Of a street whose intrinsics have half the focal length: an inverted start fits well by chance."""
     right = prepared().camera
 
-    def fit(one: Drive, guess: gtsam.Pose3 | None, offset_s: float) -> Fit:
+    def fit(one: Drive, guess: gtsam.Pose3 | None, time_offset_s: float) -> Fit:
         if one.camera.fx > 1.5 * right.fx:
-            return Fit(CTL, offset_s, 0.68, 0.86)
+            return Fit(CTL, time_offset_s, 0.68, 0.86)
         if guess is not None and guess.equals(CTL.inverse(), 1e-9):
-            return Fit(CTL, offset_s, 0.53, 0.78)
-        return Fit(CTL, offset_s, 0.22, 0.47)
+            return Fit(CTL, time_offset_s, 0.53, 0.78)
+        return Fit(CTL, time_offset_s, 0.22, 0.47)
 
     found = best_hypothesis(prepared(), CTL, 0.0, fit, fit(prepared(), CTL, 0.0))
     assert found is not None and NAMED["half the focal length"] in found.cause

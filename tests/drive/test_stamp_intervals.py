@@ -119,7 +119,7 @@ def test_a_jump_of_either_sensor_changes_the_offset(sensor: str) -> None:
     ((at, jump),) = together(*(later(steady(), 40, steps[name]) for name in ("image", "scan")))
     assert jump.sensor == sensor and jump.place[1] == 40 and at < 50
     # Images stamped earlier show the world later than they say.
-    assert jump.offset_s == pytest.approx(0.03 if sensor == "image" else -0.03)
+    assert jump.time_offset_s == pytest.approx(0.03 if sensor == "image" else -0.03)
 
 
 @pytest.mark.parametrize("behind", [0, 1])

@@ -16,9 +16,9 @@ from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import CalibrationErrors, Nees
 
 
-def outcome(run: str, qad_deg: float, offset_s: float, status: str = "ok") -> Outcome:
+def outcome(run: str, qad_deg: float, time_offset_s: float, status: str = "ok") -> Outcome:
     return Outcome(
-        run, CalibrationErrors(qad_deg, qad_deg, 0.02, offset_s, Nees(6.0, 3.0, 2.0, 1.0)), status, 1.5
+        run, CalibrationErrors(qad_deg, qad_deg, 0.02, time_offset_s, Nees(6.0, 3.0, 2.0, 1.0)), status, 1.5
     )
 
 

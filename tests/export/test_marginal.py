@@ -93,10 +93,10 @@ def solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> tuple[gts
     return cTl, float(values.atVector(TIME_OFFSET)[0] + at[TIME_OFFSET][0])
 
 
-def in_sigmas(found: CalibrationMarginal, cTl: gtsam.Pose3, offset_s: float) -> float:
+def in_sigmas(found: CalibrationMarginal, cTl: gtsam.Pose3, time_offset_s: float) -> float:
     """Distance of the marginal's optimum from an estimate, in the marginal's own sigmas."""
-    best, best_offset_s = found.best()
-    d = np.append(best.localCoordinates(cTl), offset_s - best_offset_s)
+    best, best_time_offset_s = found.best()
+    d = np.append(best.localCoordinates(cTl), time_offset_s - best_time_offset_s)
     return float(np.sqrt(d @ found.information @ d))
 
 
@@ -117,7 +117,7 @@ def test_the_error_is_the_documented_quadratic() -> None:
     d = np.random.default_rng(0).normal(size=7) * 0.01
     values = gtsam.Values()
     values.insert(EXTRINSIC, found.cTl * gtsam.Pose3.Expmap(d[:6]))
-    values.insert(TIME_OFFSET, np.array([found.offset_s + d[6]]))
+    values.insert(TIME_OFFSET, np.array([found.time_offset_s + d[6]]))
     expected = 0.5 * d @ found.information @ d - found.vector @ d + 0.5 * found.constant
     assert found.factor().error(values) == pytest.approx(expected, rel=1e-6)
 
@@ -164,7 +164,7 @@ def test_reads_back_in_a_fresh_process_without_us(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     values = gtsam.Values()
     values.insert(EXTRINSIC, found.cTl.retract(np.full(6, 0.01)))
-    values.insert(TIME_OFFSET, np.array([found.offset_s + 0.01]))
+    values.insert(TIME_OFFSET, np.array([found.time_offset_s + 0.01]))
     assert json.loads(done.stdout) == pytest.approx([found.factor().error(values)] * 3, rel=1e-9)
 
 
@@ -173,7 +173,7 @@ def test_json_reads_back() -> None:
     again = CalibrationMarginal.from_json(found.to_json())
     np.testing.assert_array_equal(again.information, found.information)
     np.testing.assert_array_equal(again.vector, found.vector)
-    assert again.cTl.equals(found.cTl, 1e-12) and again.offset_s == found.offset_s
+    assert again.cTl.equals(found.cTl, 1e-12) and again.time_offset_s == found.time_offset_s
     assert again.constant == found.constant
 
 
@@ -231,8 +231,8 @@ def test_fusing_two_drives_equals_the_joint_batch() -> None:
     for one, start in drives:
         graph.push_back(one)
         values.insert_or_assign(start)
-    cTl, offset_s = solved(graph, values)
-    assert in_sigmas(fused, cTl, offset_s) < 1e-3
+    cTl, time_offset_s = solved(graph, values)
+    assert in_sigmas(fused, cTl, time_offset_s) < 1e-3
     joint = marginal_of_graph(graph, values, EXTRINSIC, TIME_OFFSET)
     # the fused one is written about its own optimum
     J = np.eye(7)
@@ -330,7 +330,7 @@ def test_another_point_moves_the_expansion_and_not_the_cost() -> None:
     best = _optimum(graph, start)
     there = best.atPose3(EXTRINSIC).retract(np.full(6, 1e-4)), float(best.atVector(TIME_OFFSET)[0]) + 1e-4
     about = marginal_of_graph(graph, best, at=there)
-    assert about.cTl.equals(there[0], 1e-9) and about.offset_s == pytest.approx(there[1], abs=1e-12)
+    assert about.cTl.equals(there[0], 1e-9) and about.time_offset_s == pytest.approx(there[1], abs=1e-12)
     assert in_sigmas(about, best.atPose3(EXTRINSIC), float(best.atVector(TIME_OFFSET)[0])) < 2e-3
     alone = fuse_graphs([(graph, start)])[0]
     assert in_sigmas(alone, best.atPose3(EXTRINSIC), float(best.atVector(TIME_OFFSET)[0])) < 1e-3
@@ -373,7 +373,7 @@ def knocked(found: CalibrationMarginal, column: int, size: float) -> Calibration
     """The same about another optimum."""
     d = np.zeros(7)
     d[column] = size
-    return replace(found, cTl=found.cTl.retract(d[:6]), offset_s=found.offset_s + float(d[6]))
+    return replace(found, cTl=found.cTl.retract(d[:6]), time_offset_s=found.time_offset_s + float(d[6]))
 
 
 def agreeing(seed: int) -> CalibrationMarginal:
@@ -419,16 +419,16 @@ def test_a_direction_that_one_marginal_does_not_tell_contradicts_nothing() -> No
     vague = agreeing(4)
     information = vague.information.copy()
     information[6] = information[:, 6] = 0.0
-    vague = replace(vague, information=information, offset_s=vague.offset_s + 0.3)
+    vague = replace(vague, information=information, time_offset_s=vague.time_offset_s + 0.3)
     fused = fuse_marginals([agreeing(5), vague])
-    assert fused.offset_s == pytest.approx(OFFSET_S, abs=0.005)
+    assert fused.time_offset_s == pytest.approx(OFFSET_S, abs=0.005)
 
 
 def test_fusion_ends_at_the_optimum_also_from_far_apart() -> None:
     one, other = agreeing(1), knocked(agreeing(2), 0, np.radians(3.0))
     fused = fuse_marginals([one, other], significance=0.0)
     again = fuse_marginals([other, one], significance=0.0)
-    assert in_sigmas(fused, again.cTl, again.offset_s) < 1e-4
+    assert in_sigmas(fused, again.cTl, again.time_offset_s) < 1e-4
 
 
 def test_graphs_of_drives_with_two_mounts_are_refused() -> None:

@@ -28,13 +28,16 @@ def scene(
     """Matches that fit a random extrinsic, non-zero delay and twist up to ``noise_px``."""
     rng = np.random.default_rng(seed)
     cTl = gtsam.Pose3(FORWARD, np.array([0.06, -0.08, -0.27])).retract(rng.normal(0.0, 0.05, 6))
-    offset_s, twist = float(rng.uniform(0.05, 0.3)), rng.normal(0.0, 1.0, 6) * [0.3, 0.5, 0.2, 1.0, 0.5, 8.0]
+    time_offset_s, twist = (
+        float(rng.uniform(0.05, 0.3)),
+        rng.normal(0.0, 1.0, 6) * [0.3, 0.5, 0.2, 1.0, 0.5, 8.0],
+    )
     lPs = np.stack([rng.uniform(6, 40, n), rng.uniform(-6, 6, n), rng.uniform(-2, 1, n)], axis=1)
     taus = rng.uniform(-0.05, 0.05, n) if per_point else np.full(n, -0.02)
     acceleration = rng.normal(0.0, 0.5, 6)
     cPs = [
         gtsam.Pose3.Expmap(-tau * (twist - 0.5 * tau * acceleration)).transformFrom(cTl.transformFrom(lP))
-        for tau, lP in zip(offset_s + taus, lPs, strict=True)
+        for tau, lP in zip(time_offset_s + taus, lPs, strict=True)
     ]
     pixels = KITTI.project(np.array(cPs).reshape(-1, 3)) + rng.normal(0.0, noise_px, (n, 2))
     angles = rng.uniform(0.0, 2.0 * np.pi, n)
@@ -48,7 +51,7 @@ def scene(
         c_acceleration=acceleration,
         **options,
     )
-    return alignment, cTl, offset_s, twist
+    return alignment, cTl, time_offset_s, twist
 
 
 @pytest.fixture

@@ -29,11 +29,11 @@ CAMERA = PinholeCamera(100.0, 100.0, 50.0, 40.0, 101, 81)
 FACTORIES = {"point_to_pixel": point_to_pixel_factor, "pixel_to_point": pixel_to_point_factor}
 
 
-def nearby(cTl, offset_s, twist, bias=None, seed=0):
+def nearby(cTl, time_offset_s, twist, bias=None, seed=0):
     rng = np.random.default_rng(seed)
     values = gtsam.Values()
     values.insert(E, cTl.retract(rng.normal(0.0, 0.01, 6)))
-    values.insert(D, np.array([offset_s + rng.normal(0.0, 0.01)]))
+    values.insert(D, np.array([time_offset_s + rng.normal(0.0, 0.01)]))
     values.insert(V, twist + rng.normal(0.0, 0.1, 6))
     if bias is not None:
         values.insert(B, np.array([bias]))
@@ -121,8 +121,8 @@ def test_a_gtsam_reprojection_factor_says_the_same(make_scene):
 
 
 def test_constants_stand_in_for_variables(make_scene):
-    alignment, cTl, offset_s, twist = make_scene(6)
-    values = nearby(cTl, offset_s, twist)
+    alignment, cTl, time_offset_s, twist = make_scene(6)
+    values = nearby(cTl, time_offset_s, twist)
     full = point_to_pixel_factor(alignment, E, D, V).linearize(values).augmentedInformation()
     pose, offset, twist = values.atPose3(E), float(values.atVector(D)[0]), values.atVector(V)
     cases = {
@@ -187,19 +187,19 @@ def test_objects_with_a_bias_each_are_alignments_of_their_own(make_scene, per_po
 
 
 def test_extrinsic_and_delay_are_found_again(make_scene):
-    alignment, cTl, offset_s, _ = make_scene(20, 80, noise_px=0.0)
+    alignment, cTl, time_offset_s, _ = make_scene(20, 80, noise_px=0.0)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     rng = np.random.default_rng(0)
     values.insert(E, cTl.retract([0.05, -0.05, 0.04, 0.1, -0.1, 0.1]))
-    values.insert(D, np.array([offset_s + 0.1]))
+    values.insert(D, np.array([time_offset_s + 0.1]))
     for _ in range(5):  # the same scene seen at other speeds
         twist = rng.normal(0.0, 1.0, 6) * [0.2, 0.5, 0.2, 1.0, 0.5, 8.0]
-        pixels, _ = residuals(alignment, cTl, offset_s, twist, jacobians=False)
+        pixels, _ = residuals(alignment, cTl, time_offset_s, twist, jacobians=False)
         seen = replace(alignment, pixels=pixels.reshape(2, -1).T + alignment.pixels, sigmas_px=1.0)
         graph.add(point_to_pixel_factor(seen, E, D, twist))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert np.abs(cTl.localCoordinates(result.atPose3(E))).max() < 1e-6
-    assert abs(result.atVector(D)[0] - offset_s) < 1e-6
+    assert abs(result.atVector(D)[0] - time_offset_s) < 1e-6
 
 
 def test_every_point_behind_the_camera_leaves_a_constant(make_scene):
@@ -245,10 +245,10 @@ def test_outside_is_positive_and_a_dilated_mask_hides_more_of_it():
 
 def test_silhouette_jacobians_at_100_states(make_scene):
     for seed in range(100):
-        alignment, cTl, offset_s, twist = make_scene(seed, 4, normals=True, per_point=bool(seed % 2))
+        alignment, cTl, time_offset_s, twist = make_scene(seed, 4, normals=True, per_point=bool(seed % 2))
         values = gtsam.Values()
         values.insert(E, cTl.retract(np.full(6, 0.01)))
-        values.insert(D, np.array([offset_s + 0.01]))
+        values.insert(D, np.array([time_offset_s + 0.01]))
         values.insert(V, twist)
         values.insert(B, np.array([0.4]))
         check_jacobians(silhouette_factor(alignment, E, D, V, B, condensed=False), values, 1e-6)
@@ -293,8 +293,8 @@ def test_offset_and_twist_are_zero_where_they_are_not_given(make_scene):
 
 
 def test_one_bias_belongs_to_the_silhouettes_alone(make_scene):
-    (points, cTl, offset_s, twist), (contour, *_) = make_scene(3), make_scene(3, normals=True)
-    values = nearby(cTl, offset_s, twist, 0.7)
+    (points, cTl, time_offset_s, twist), (contour, *_) = make_scene(3), make_scene(3, normals=True)
+    values = nearby(cTl, time_offset_s, twist, 0.7)
     alone = frame_factor([points, contour], E, D, V, [None, B])
     both = frame_factor([points, contour], E, D, V, B)
     assert both.error(values) == alone.error(values)

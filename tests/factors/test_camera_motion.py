@@ -17,14 +17,14 @@ COVARIANCE = np.diag([1e-6] * 3 + [1e-4] * 3)
 PERIOD_S = 0.1
 
 
-def values_of(poses, cTl=None, offset_s=None):
+def values_of(poses, cTl=None, time_offset_s=None):
     values = gtsam.Values()
     for key, pose in zip(X, poses, strict=False):
         values.insert(key, pose)
     if cTl is not None:
         values.insert(E, cTl)
-    if offset_s is not None:
-        values.insert(D, np.array([offset_s]))
+    if time_offset_s is not None:
+        values.insert(D, np.array([time_offset_s]))
     return values
 
 
@@ -43,7 +43,7 @@ def test_by_hand():
     seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.4]))
     first, second = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
     factor = camera_motion_factor(first, second, gtsam.Pose3(OPTICAL, np.zeros(3)), D, seen, COVARIANCE)
-    error = factor.unwhitenedError(values_of(poses, offset_s=0.03))
+    error = factor.unwhitenedError(values_of(poses, time_offset_s=0.03))
     np.testing.assert_allclose(error, [0, 0, 0, 0, 0, 0.1], atol=1e-12)
 
 
@@ -70,13 +70,13 @@ def test_jacobians_at_100_states(scale_known):
 
 
 def test_camera_poses_worked_out_one_by_one_say_the_same():
-    poses, offset_s = wandering(3), 0.04
+    poses, time_offset_s = wandering(3), 0.04
     measured = gtsam.Pose3.Expmap(np.array([0.02, -0.1, 0.05, 0.1, 0.2, 0.9]))
     places = Between(X[0], X[1], 0.12, 0.01), Between(X[2], X[3], 0.1, 0.05)
     factor = camera_motion_factor(*places, E, D, measured, COVARIANCE, bTl=BTL)
     cameras = []
     for (a, b), place in zip(((0, 1), (2, 3)), places, strict=True):
-        s = (place.image_after_a_s + offset_s) / place.seconds
+        s = (place.image_after_a_s + time_offset_s) / place.seconds
         wTb = poses[a] * gtsam.Pose3.Expmap(s * gtsam.Pose3.Logmap(poses[a].between(poses[b])))
         cameras.append(wTb * BTL * CTL.inverse())
     graph = gtsam.NonlinearFactorGraph()
@@ -85,7 +85,9 @@ def test_camera_poses_worked_out_one_by_one_say_the_same():
     expected = gtsam.Values()
     expected.insert(1, cameras[0])
     expected.insert(2, cameras[1])
-    assert factor.error(values_of(poses, CTL, offset_s)) == pytest.approx(graph.error(expected), rel=1e-9)
+    assert factor.error(values_of(poses, CTL, time_offset_s)) == pytest.approx(
+        graph.error(expected), rel=1e-9
+    )
 
 
 def test_is_the_hand_eye_factor_where_the_trajectory_is_known():
@@ -99,8 +101,8 @@ def test_is_the_hand_eye_factor_where_the_trajectory_is_known():
     known = hand_eye_factor(
         E, D, measured, poses[0].between(poses[1]), twist, twist, 0.0, COVARIANCE, scale_known=True
     )
-    for offset_s in (0.0, 0.03, -0.06):
-        values = values_of(poses, CTL.retract(np.full(6, 0.01)), offset_s)
+    for time_offset_s in (0.0, 0.03, -0.06):
+        values = values_of(poses, CTL.retract(np.full(6, 0.01)), time_offset_s)
         assert ours.error(values) == pytest.approx(known.error(values), rel=1e-9)
         np.testing.assert_allclose(
             ours.linearize(values).jacobian()[0][:, -7:],
@@ -126,7 +128,7 @@ def slam(lidar_sigmas, offset):
 
     ``offset``: a key, or held at a value; the truth is 0.04 s.
     """
-    count, offset_s, rng = 40, 0.04, np.random.default_rng(0)
+    count, time_offset_s, rng = 40, 0.04, np.random.default_rng(0)
     poses, keys = weaving(count), [gtsam.symbol("p", k) for k in range(count)]
     rough = np.repeat(lidar_sigmas, 3)
     fine = np.repeat([np.radians(0.03), 0.005], 3)
@@ -141,7 +143,7 @@ def slam(lidar_sigmas, offset):
 
     def camera(k):
         xi = gtsam.Pose3.Logmap(poses[k].between(poses[k + 1]))
-        return poses[k] * gtsam.Pose3.Expmap(offset_s / PERIOD_S * xi) * CTL.inverse()
+        return poses[k] * gtsam.Pose3.Expmap(time_offset_s / PERIOD_S * xi) * CTL.inverse()
 
     for k in range(count - 2):
         measured = camera(k).between(camera(k + 1)).retract(rng.normal(0.0, fine))
@@ -171,8 +173,8 @@ def test_improves_a_rough_trajectory_through_a_calibration_that_is_roughly_known
 
 
 def test_finds_the_delay_by_a_good_trajectory():
-    alone, both, offset_s = slam([np.radians(0.01), 0.001], D)
-    assert abs(offset_s - 0.04) < 0.001 and both < 1.1 * alone
+    alone, both, time_offset_s = slam([np.radians(0.01), 0.001], D)
+    assert abs(time_offset_s - 0.04) < 0.001 and both < 1.1 * alone
 
 
 def test_refuses_what_makes_no_factor():

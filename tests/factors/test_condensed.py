@@ -50,16 +50,16 @@ def test_exact_data_and_empty_systems():
 def graph_of(scenes, bias, condensed):
     """Several frames on one extrinsic, one delay and one bias; a twist each."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    _, cTl, offset_s, _ = scenes[0][0]
+    _, cTl, time_offset_s, _ = scenes[0][0]
     values.insert(E, cTl.retract(np.full(6, 0.01)))
-    values.insert(D, np.array([offset_s + 0.01]))
+    values.insert(D, np.array([time_offset_s + 0.01]))
     values.insert(B, np.array([bias]))
     for k, ((points, _, _, twist), (contour, *_)) in enumerate(scenes):
         V = gtsam.symbol("v", k)
         values.insert(V, twist + 0.05)
         graph.add(frame_factor([points, contour], E, D, V, [None, B], condensed=condensed))
         graph.add(velocity_factor(V, twist, 0.01 * np.eye(6)))
-    graph.add(time_offset_prior(D, offset_s, 0.05))
+    graph.add(time_offset_prior(D, time_offset_s, 0.05))
     return graph, values
 
 

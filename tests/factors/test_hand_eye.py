@@ -25,10 +25,10 @@ def l_twist(t, h=1e-5):
     return gtsam.Pose3.Logmap(wTl(t - h).between(wTl(t + h))) / (2.0 * h)
 
 
-def pair(t1, t2, offset_true, offset_0):
-    """Camera motion over its stamps, LiDAR motion over the interval that offset_0 takes for it."""
+def pair(t1, t2, offset_true, time_offset_0_s):
+    """Camera motion over its stamps, LiDAR motion over the interval that time_offset_0_s takes for it."""
     c1Tc2 = TRUE * wTl(t1 + offset_true).between(wTl(t2 + offset_true)) * TRUE.inverse()
-    ends = t1 + offset_0, t2 + offset_0
+    ends = t1 + time_offset_0_s, t2 + time_offset_0_s
     return c1Tc2, wTl(ends[0]).between(wTl(ends[1])), l_twist(ends[0]), l_twist(ends[1])
 
 
@@ -78,16 +78,18 @@ def test_jacobians_at_100_states(kind, with_offset):
 
 @pytest.mark.parametrize("kind", ["full", "direction"])
 def test_a_weaving_drive_gives_extrinsic_and_delay_back(kind):
-    offset_true, offset_0, pose = 0.08, 0.0, TRUE.retract(np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.1]))
-    values = at(pose, offset_0)
+    offset_true, time_offset_0_s, pose = 0.08, 0.0, TRUE.retract(np.array([0.1, -0.1, 0.05, 0.2, -0.1, 0.1]))
+    values = at(pose, time_offset_0_s)
     for _ in range(3):  # outer loop: the LiDAR's motion is taken again over the interval found
-        graph, offset_0 = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
+        graph, time_offset_0_s = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
         for t1 in np.arange(0.0, 12.0, 0.5):
-            c1Tc2, *lidar = pair(t1, t1 + 0.5, offset_true, offset_0)
+            c1Tc2, *lidar = pair(t1, t1 + 0.5, offset_true, time_offset_0_s)
             if kind == "direction":
                 t = c1Tc2.translation()
                 c1Tc2 = gtsam.Pose3(c1Tc2.rotation(), t / np.linalg.norm(t))
-            graph.add(hand_eye_factor(E, D, c1Tc2, *lidar, offset_0, COVARIANCE, scale_known=kind == "full"))
+            graph.add(
+                hand_eye_factor(E, D, c1Tc2, *lidar, time_offset_0_s, COVARIANCE, scale_known=kind == "full")
+            )
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert values.atVector(D)[0] == pytest.approx(offset_true, abs=1e-4)
     error = TRUE.localCoordinates(values.atPose3(E))
@@ -96,16 +98,16 @@ def test_a_weaving_drive_gives_extrinsic_and_delay_back(kind):
 
 
 def test_rotation_only_gives_rotation_and_delay_back():
-    values, offset_0 = at(TRUE.retract(np.array([0.1, -0.1, 0.05, 0.0, 0.0, 0.0])), 0.0), 0.0
+    values, time_offset_0_s = at(TRUE.retract(np.array([0.1, -0.1, 0.05, 0.0, 0.0, 0.0])), 0.0), 0.0
     for _ in range(3):
-        graph, offset_0 = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
+        graph, time_offset_0_s = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
         graph.add(
             gtsam.PriorFactorPose3(E, TRUE, gtsam.noiseModel.Diagonal.Sigmas(np.repeat([10.0, 0.1], 3)))
         )
         for t1 in np.arange(0.0, 12.0, 0.5):
-            c1Tc2, l1Tl2, twist_1, twist_2 = pair(t1, t1 + 0.5, 0.08, offset_0)
+            c1Tc2, l1Tl2, twist_1, twist_2 = pair(t1, t1 + 0.5, 0.08, time_offset_0_s)
             motions = c1Tc2.rotation(), l1Tl2.rotation(), twist_1[:3], twist_2[:3]
-            graph.add(rotation_hand_eye(E, D, *motions, offset_0, COVARIANCE[:3, :3]))
+            graph.add(rotation_hand_eye(E, D, *motions, time_offset_0_s, COVARIANCE[:3, :3]))
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert values.atVector(D)[0] == pytest.approx(0.08, abs=1e-4)
     assert np.abs(TRUE.localCoordinates(values.atPose3(E))[:3]).max() < 1e-4

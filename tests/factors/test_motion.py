@@ -110,17 +110,23 @@ def test_an_object_that_drives_along_stays_where_it_is():
 def test_derivatives_at_100_points(model, rigid, speed, objects):
     rng = np.random.default_rng(11)
     cTl, twist = gtsam.Pose3.Expmap(rng.normal(size=6)), speed * rng.normal(size=6)
-    acceleration, offset_s = speed * rng.normal(size=6), 0.13
+    acceleration, time_offset_s = speed * rng.normal(size=6), 0.13
     lPs = rng.normal(0.0, 10.0, (3, 100))
     base = -0.04 if rigid else rng.uniform(-0.2, 0.2, 100)
     velocities = rng.normal(0.0, 10.0, (3, 100)) if objects else None
 
     def cPs(x):
         return move_points(
-            cTl.retract(x[:6]), lPs, offset_s + x[6] + base, twist + x[7:], acceleration, model, velocities
+            cTl.retract(x[:6]),
+            lPs,
+            time_offset_s + x[6] + base,
+            twist + x[7:],
+            acceleration,
+            model,
+            velocities,
         ).cPs
 
-    point = move_points(cTl, lPs, offset_s + base, twist, acceleration, model, velocities)
+    point = move_points(cTl, lPs, time_offset_s + base, twist, acceleration, model, velocities)
     g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()
     lifted = rigid and not objects
     rows = np.empty((6 if lifted else 13, 3, 100))

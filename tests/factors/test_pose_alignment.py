@@ -26,7 +26,7 @@ BTL = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))
 SECONDS = 0.12
 
 
-def trajectory(seed, cTl, offset_s, bTl, bias=0.3):
+def trajectory(seed, cTl, time_offset_s, bTl, bias=0.3):
     """Values: three poses of the body, about 1 m and 2 deg apart, and the calibration."""
     rng = np.random.default_rng(seed)
     values = gtsam.Values()
@@ -36,7 +36,7 @@ def trajectory(seed, cTl, offset_s, bTl, bias=0.3):
         pose = pose * gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6) * [0.03, 0.03, 0.03, 0.3, 0.3, 0.3])
         pose = pose * bTl * gtsam.Pose3(gtsam.Rot3(), np.array([0.8, 0.0, 0.0])) * bTl.inverse()
     values.insert(E, cTl.retract(rng.normal(0.0, 0.01, 6)))
-    values.insert(D, np.array([offset_s + rng.normal(0.0, 0.01)]))
+    values.insert(D, np.array([time_offset_s + rng.normal(0.0, 0.01)]))
     values.insert(B, np.array([bias]))
     return values
 
@@ -77,7 +77,7 @@ def test_sign_of_a_scan_at_another_pose_by_hand():
 @pytest.mark.parametrize("normals", [False, True])
 def test_jacobians_at_100_states(make_scene, normals):
     for seed in range(100):
-        alignment, cTl, offset_s, _ = make_scene(seed, 4, per_point=bool(seed % 2), normals=normals)
+        alignment, cTl, time_offset_s, _ = make_scene(seed, 4, per_point=bool(seed % 2), normals=normals)
         bTl = BTL if seed % 3 else gtsam.Pose3()
         factor = pose_alignment_factor(
             [alignment],
@@ -92,13 +92,13 @@ def test_jacobians_at_100_states(make_scene, normals):
             image_after_middle_s=-0.03 if seed % 5 else None,
             condensed=False,
         )
-        check_jacobians(factor, trajectory(seed, cTl, offset_s, bTl), 1e-6)
+        check_jacobians(factor, trajectory(seed, cTl, time_offset_s, bTl), 1e-6)
 
 
 @pytest.mark.parametrize("kind", ["none", "geman_mcclure"])
 def test_condensed_gradient_is_that_of_the_robust_cost(make_scene, kind):
     for seed in range(6):
-        alignment, cTl, offset_s, _ = make_scene(
+        alignment, cTl, time_offset_s, _ = make_scene(
             seed, 25, normals=True, per_point=bool(seed % 2), kernel=RobustKernel(kind, 4.0)
         )
         factor = pose_alignment_factor(
@@ -115,16 +115,16 @@ def test_condensed_gradient_is_that_of_the_robust_cost(make_scene, kind):
         )
         # a kernel's second derivative jumps: a short step there
         step = 1e-3 if kind == "none" else 1e-6
-        check_gradient(factor, trajectory(seed, cTl, offset_s, BTL), 1e-5, step=step)
+        check_gradient(factor, trajectory(seed, cTl, time_offset_s, BTL), 1e-5, step=step)
 
 
 @pytest.mark.parametrize("elsewhere", [False, True])
 def test_a_gtsam_camera_at_the_interpolated_pose_says_the_same(make_scene, elsewhere):
-    alignment, cTl, offset_s, _ = make_scene(4, 12)
+    alignment, cTl, time_offset_s, _ = make_scene(4, 12)
     alignment = replace(alignment, c_acceleration=np.zeros(6), sigmas_px=1.0)
     camera = alignment.camera
     K = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    values = trajectory(7, cTl, offset_s, BTL)
+    values = trajectory(7, cTl, time_offset_s, BTL)
     tau = float(values.atVector(D)[0]) + float(alignment.base_taus_s[0])
     between = values.atPose3(X[0]).between(values.atPose3(X[1]))
     wTb = values.atPose3(X[0]) * gtsam.Pose3.Expmap(tau / SECONDS * gtsam.Pose3.Logmap(between))
@@ -149,8 +149,8 @@ def test_a_gtsam_camera_at_the_interpolated_pose_says_the_same(make_scene, elsew
 
 def test_the_twist_is_that_of_the_frame_factor(make_scene):
     # same cost as the factor on a twist variable, with the mean twist carried to the image's instant
-    alignment, cTl, offset_s, _ = make_scene(5, 20, normals=True)
-    values = trajectory(5, cTl, offset_s, BTL)
+    alignment, cTl, time_offset_s, _ = make_scene(5, 20, normals=True)
+    values = trajectory(5, cTl, time_offset_s, BTL)
     factor = pose_alignment_factor(
         [alignment], X[0], X[1], E, D, SECONDS, bTl=BTL, biases_px=B, image_after_middle_s=-0.04
     )
@@ -161,8 +161,8 @@ def test_the_twist_is_that_of_the_frame_factor(make_scene):
 
 
 def test_constants_stand_in_for_the_calibration(make_scene):
-    alignment, cTl, offset_s, _ = make_scene(6, 10)
-    values = trajectory(6, cTl, offset_s, BTL)
+    alignment, cTl, time_offset_s, _ = make_scene(6, 10)
+    values = trajectory(6, cTl, time_offset_s, BTL)
     pose, offset = values.atPose3(E), float(values.atVector(D)[0])
     full = pose_alignment_factor([alignment], X[0], X[1], E, D, SECONDS, bTl=BTL)
     fixed = pose_alignment_factor([alignment], X[0], X[1], pose, offset, SECONDS, bTl=BTL)
@@ -174,12 +174,12 @@ def test_constants_stand_in_for_the_calibration(make_scene):
 
 def street(make_scene, frames=6):
     """A graph with odometry, and alignments that fit the true calibration exactly; the truth."""
-    base, cTl, offset_s, _ = make_scene(20, 60, noise_px=0.0)
+    base, cTl, time_offset_s, _ = make_scene(20, 60, noise_px=0.0)
     base = replace(base, c_acceleration=np.zeros(6), sigmas_px=1.0)
     rng = np.random.default_rng(1)
     truth = gtsam.Values()
     truth.insert(E, cTl)
-    truth.insert(D, np.array([offset_s]))
+    truth.insert(D, np.array([time_offset_s]))
     poses = [gtsam.Pose3()]
     for _ in range(frames):
         poses.append(poses[-1] * gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6) * [0.05, 0.05, 0.1, 1, 0.1, 0.1]))

@@ -67,12 +67,12 @@ class Drive:
 
 @pytest.fixture
 def drive(make_scene):
-    base, cTl, offset_s, _ = make_scene(20, 60, noise_px=0.0)
-    offset_s = 0.06
+    base, cTl, time_offset_s, _ = make_scene(20, 60, noise_px=0.0)
+    time_offset_s = 0.06
     base = replace(base, c_acceleration=np.zeros(6), sigmas_px=1.0)
     truth = gtsam.Values()
     truth.insert(E, cTl)
-    truth.insert(D, np.array([offset_s]))
+    truth.insert(D, np.array([time_offset_s]))
     state = gtsam.NavState(
         gtsam.Pose3(gtsam.Rot3.RzRyRx(0.02, 0.01, 0.3), np.zeros(3)), np.array([8.0, 2, 0])
     )

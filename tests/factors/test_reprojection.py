@@ -54,16 +54,16 @@ def test_a_later_image_sees_a_point_further_out():
 @pytest.mark.parametrize("per_point", [False, True])
 @pytest.mark.parametrize("model", ["se3", "translation"])
 def test_jacobian_at_100_points(make_scene, normals, per_point, model):
-    alignment, cTl, offset_s, twist = make_scene(
+    alignment, cTl, time_offset_s, twist = make_scene(
         5, 100, normals=normals, per_point=per_point, motion_model=model
     )
     bias = 0.4 if normals else None
-    _, J = residuals(alignment, cTl, offset_s, twist, bias)
+    _, J = residuals(alignment, cTl, time_offset_s, twist, bias)
     assert J.shape == (100 if normals else 200, 14 if normals else 13)
 
     def r(x):
         moved_bias = bias + x[13] if normals else None
-        state = cTl.retract(x[:6]), offset_s + x[6], twist + x[7:13], moved_bias
+        state = cTl.retract(x[:6]), time_offset_s + x[6], twist + x[7:13], moved_bias
         return residuals(alignment, *state, jacobians=False)[0]
 
     for column in range(J.shape[1]):
@@ -76,11 +76,11 @@ def test_jacobian_at_100_points(make_scene, normals, per_point, model):
 
 @pytest.mark.parametrize("per_point", [False, True])
 def test_pixels_are_those_of_a_gtsam_camera(make_scene, per_point):
-    alignment, cTl, offset_s, twist = make_scene(8, per_point=per_point)
-    r, _ = residuals(alignment, cTl, offset_s, twist)
+    alignment, cTl, time_offset_s, twist = make_scene(8, per_point=per_point)
+    r, _ = residuals(alignment, cTl, time_offset_s, twist)
     camera = alignment.camera
     K = gtsam.Cal3_S2(camera.fx, camera.fy, 0.0, camera.cx, camera.cy)
-    for i, tau in enumerate(offset_s + alignment.base_taus_s):
+    for i, tau in enumerate(time_offset_s + alignment.base_taus_s):
         motion = gtsam.Pose3.Expmap(tau * (twist - 0.5 * tau * alignment.c_acceleration))
         lTc = cTl.inverse() * motion  # pose of the camera at its instant in the LiDAR at the point's
         expected = gtsam.PinholeCameraCal3_S2(lTc, K).project(alignment.lPs[i]) - alignment.pixels[i]
@@ -163,7 +163,7 @@ def test_many_images_at_once_are_each_by_itself(make_scene, normals, per_point, 
     """Residuals and derivatives of three images' matches in one alignment, a twist for each match."""
     options = {"normals": normals, "per_point": per_point, "motion_model": model}
     parts = [make_scene(seed, 30 + 10 * seed, **options) for seed in range(3)]
-    _, cTl, offset_s, _ = parts[0]
+    _, cTl, time_offset_s, _ = parts[0]
     counts = [len(alignment) for alignment, *_ in parts]
 
     def column(name):
@@ -180,20 +180,20 @@ def test_many_images_at_once_are_each_by_itself(make_scene, normals, per_point, 
     )
     twists = np.repeat([twist for *_, twist in parts], counts, axis=0).T
     bias = np.linspace(-1.0, 1.0, len(together)) if normals else None
-    r, J = residuals(together, cTl, offset_s, twists, bias)
+    r, J = residuals(together, cTl, time_offset_s, twists, bias)
     rows = together.rows_per_match
     r, J = r.reshape(rows, -1), J.reshape(rows, len(together), -1)
     start = 0
     for (alignment, _, _, twist), count in zip(parts, counts, strict=True):
         own = slice(start, start + count)
-        expected, H = residuals(alignment, cTl, offset_s, twist, None if bias is None else bias[own])
+        expected, H = residuals(alignment, cTl, time_offset_s, twist, None if bias is None else bias[own])
         np.testing.assert_allclose(r[:, own], expected.reshape(rows, -1), atol=1e-10)
         scale = np.maximum(np.abs(H).max(axis=0), 1.0)
         np.testing.assert_allclose(J[:, own] / scale, H.reshape(rows, count, -1) / scale, atol=1e-12)
         # And apart again.
         back = together.of_one_image(own, alignment.c_acceleration)
         np.testing.assert_array_equal(
-            residuals(back, cTl, offset_s, twist)[0], residuals(alignment, cTl, offset_s, twist)[0]
+            residuals(back, cTl, time_offset_s, twist)[0], residuals(alignment, cTl, time_offset_s, twist)[0]
         )
         start += count
     assert together.take(np.arange(5)).c_acceleration.shape == (5, 6)

@@ -14,11 +14,11 @@ from sst_graph.factors.velocity import transferred
 V, E, D = gtsam.symbol("V", 0), gtsam.symbol("E", 0), gtsam.symbol("D", 0)
 
 
-def values_at(twist: np.ndarray, cTl: gtsam.Pose3, offset_s: float) -> gtsam.Values:
+def values_at(twist: np.ndarray, cTl: gtsam.Pose3, time_offset_s: float) -> gtsam.Values:
     values = gtsam.Values()
     values.insert(V, twist)
     values.insert(E, cTl)
-    values.insert(D, np.array([offset_s]))
+    values.insert(D, np.array([time_offset_s]))
     return values
 
 
@@ -97,11 +97,11 @@ def test_bad_arguments(twist: np.ndarray, rate: np.ndarray, covariance: np.ndarr
 def test_many_images_at_once_are_each_by_itself() -> None:
     rng = np.random.default_rng(5)
     l_twists, rates, c_twists = rng.normal(0.0, 3.0, (3, 7, 6))
-    cTl, offset_s = random_pose(rng), 0.13
-    found = transferred(l_twists, rates, np.full((7, 1), offset_s - 0.1), c_twists, cTl, True)
+    cTl, time_offset_s = random_pose(rng), 0.13
+    found = transferred(l_twists, rates, np.full((7, 1), time_offset_s - 0.1), c_twists, cTl, True)
     for k, (error, by_cTl, by_offset) in enumerate(zip(*found, strict=True)):
         factor = twist_transfer_factor(V, E, D, l_twists[k], rates[k], 0.1, np.eye(6))
-        values = values_at(c_twists[k], cTl, offset_s)
+        values = values_at(c_twists[k], cTl, time_offset_s)
         np.testing.assert_allclose(error, factor.unwhitenedError(values), atol=1e-12)
         linear = factor.linearize(values)
         A, _ = linear.jacobian()

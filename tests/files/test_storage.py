@@ -161,7 +161,7 @@ def test_objects_of_the_package() -> None:
     point = Point.unbiased(gtsam.Pose3(), 0.1, (VEHICLE,))
     found = _again({"a": point, "config": TrackerConfig(window=17), "kernel": RobustKernel("huber", 2.0)})
     assert found["config"] == TrackerConfig(window=17) and found["kernel"] == RobustKernel("huber", 2.0)
-    assert isinstance(found["a"], Point) and found["a"].offset_s == 0.1
+    assert isinstance(found["a"], Point) and found["a"].time_offset_s == 0.1
     assert isinstance(_again(MotionSmoother(3)), MotionSmoother)
 
 

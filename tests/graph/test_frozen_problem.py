@@ -117,11 +117,11 @@ def test_normal_equations_are_the_graphs(rolling: bool, by_object: bool, config:
 
 
 @pytest.mark.parametrize("rolling", [False, True])
-@pytest.mark.parametrize("offset_s", [0.012, -0.12])
-def test_all_scans_are_matched_as_each_by_itself(rolling: bool, offset_s: float) -> None:
+@pytest.mark.parametrize("time_offset_s", [0.012, -0.12])
+def test_all_scans_are_matched_as_each_by_itself(rolling: bool, time_offset_s: float) -> None:
     drive = moving(rolling)
     values = {"range_scale": -0.001, "k1": 0.01, "skew": 1e-3}
-    state = State(standing_street().truth.cTl, (offset_s,), {(0, VEHICLE): 0.4}, {}, values)
+    state = State(standing_street().truth.cTl, (time_offset_s,), {(0, VEHICLE): 0.4}, {}, values)
     tracks, objects = Tracks([drive], [object_tracks(drive)]), object_tracks(drive)
     together = {pair.pair.scan: pair for pair in associate([drive], tracks, state, KERNEL, FREE)}
     assert len(together) >= 2

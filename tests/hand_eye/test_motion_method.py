@@ -197,7 +197,7 @@ def test_start_without_a_guess() -> None:
     drive = made_drive(weaving)
     starts = motion_starts(camera_steps([drive]), lidar_paths([drive]), None, 0.0)
     best = starts[0]
-    assert abs(best.offset_s - OFFSET_S) <= 0.02
+    assert abs(best.time_offset_s - OFFSET_S) <= 0.02
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(best.cRl.between(TRUE.rotation())))) < 2.0
     assert all(a.cost <= b.cost for a, b in pairwise(starts))
 

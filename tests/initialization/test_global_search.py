@@ -95,7 +95,7 @@ def test_from_15_degrees_to_below_4() -> None:
     for candidate in found:
         assert angle_deg(candidate.cTl, guess) <= 1.4 * SMALL.rotation_deg + 1e-3
         shift = np.abs(candidate.cTl.translation() - guess.translation()).max()
-        assert shift <= SMALL.translation_m + 1e-9 and candidate.offset_s == 0.0
+        assert shift <= SMALL.translation_m + 1e-9 and candidate.time_offset_s == 0.0
     near = np.abs(found[0].cTl.translation() - guess.translation()).max()
     assert near <= 0.1 + 1e-9
 

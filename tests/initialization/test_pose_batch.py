@@ -30,11 +30,11 @@ def kernel(scale_px: float) -> RobustKernel:
     return RobustKernel("geman_mcclure", scale_px)
 
 
-def poses(*cTls: gtsam.Pose3, offset_s: float = 0.0) -> Poses:
+def poses(*cTls: gtsam.Pose3, time_offset_s: float = 0.0) -> Poses:
     return Poses(
         np.stack([cTl.rotation().matrix() for cTl in cTls]),
         np.stack([cTl.translation() for cTl in cTls]),
-        np.full(len(cTls), offset_s),
+        np.full(len(cTls), time_offset_s),
         np.zeros((len(cTls), 1)),
     )
 
@@ -91,7 +91,7 @@ def test_what_is_far_or_faces_the_other_way_is_no_match() -> None:
     assert equations(*left_edge(199.5), poses(gtsam.Pose3())).support[0] > 10.0
     assert equations(*left_edge(199.5, turned=True), poses(gtsam.Pose3())).support[0] == 0.0
     # An offset of half a second leaves the scan without an image.
-    assert equations(*left_edge(199.5), poses(gtsam.Pose3(), offset_s=0.5)).seen[0] == 0.0
+    assert equations(*left_edge(199.5), poses(gtsam.Pose3(), time_offset_s=0.5)).seen[0] == 0.0
 
 
 def test_a_moving_edge_by_hand() -> None:
@@ -106,7 +106,7 @@ def test_a_moving_edge_by_hand() -> None:
         images=(image, replace(image, index=1, stamp_ns=3 * PERIOD_NS)),  # so far apart, they reach so far
         lidar_motions=tuple(motions),
     )
-    found = equations(drive, config, poses(gtsam.Pose3(), offset_s=0.1))
+    found = equations(drive, config, poses(gtsam.Pose3(), time_offset_s=0.1))
     # r = 10 px/m * 2 m/s * 0.2 s = 4 px and dr / doffset = 20 px/s: g[offset] / g[x] = 20 / -10.
     assert found.g[0, 6] / found.g[0, 3] == pytest.approx(-2.0, rel=1e-2)
     assert found.g[0, 7] / found.H[0, 7, 7] == pytest.approx(4.0, rel=1e-2)

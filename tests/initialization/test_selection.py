@@ -46,9 +46,9 @@ VEHICLE = SemanticClass.VEHICLE
 JOINT, START = JointConfig(), SearchConfig()
 
 
-def start_problem(guess: gtsam.Pose3 | None, offset_s: float = 0.0) -> StartProblem:
+def start_problem(guess: gtsam.Pose3 | None, time_offset_s: float = 0.0) -> StartProblem:
     drives = [prepared_street()]
-    return StartProblem(drives, Tracks(drives), [VEHICLE], guess, offset_s)
+    return StartProblem(drives, Tracks(drives), [VEHICLE], guess, time_offset_s)
 
 
 def poses_of(cTls: list[gtsam.Pose3], offsets: list[float]) -> Poses:

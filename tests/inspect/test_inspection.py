@@ -116,7 +116,7 @@ def test_the_weakest_direction_within_the_limits_too() -> None:
     weak = weakest_direction(result_of(np.diag(SIGMAS**2)), ObservabilityConfig())
     # Over their limits: 0.3 of 0.5 deg, 3 of 5 cm, 1 of 5 ms, and the rest less.
     assert int(np.abs(weak.vector).argmax()) in (2, 5)
-    tight = weakest_direction(result_of(np.diag(SIGMAS**2)), ObservabilityConfig(offset_s=1e-4))
+    tight = weakest_direction(result_of(np.diag(SIGMAS**2)), ObservabilityConfig(time_offset_s=1e-4))
     assert tight.vector[6] == pytest.approx(1.0)
 
 

@@ -182,7 +182,7 @@ def test_the_fewest_frames_that_are_enough() -> None:
     assert predict(C, one, 4, LIMITS).worst <= 1.0 < predict(C, one, 3, LIMITS).worst
     assert predict(C, replace(one, information=np.zeros((7, 7))), 1, LIMITS).enough is None
     assert predict(C, one, 1, LIMITS, search=False).enough is None
-    wide = ObservabilityConfig(offset_s=0.1)
+    wide = ObservabilityConfig(time_offset_s=0.1)
     assert predict(C, one, 1, wide).enough == 0
 
 
@@ -222,11 +222,11 @@ def test_views_are_ranked_by_what_they_would_bring() -> None:
     [
         ({}, LIMITS),
         (
-            {"observability": {"rotation_deg": 0.1, "translation_m": 0.02, "offset_s": 0.002}},
+            {"observability": {"rotation_deg": 0.1, "translation_m": 0.02, "time_offset_s": 0.002}},
             (0.1, 0.02, 0.002),
         ),
-        ({"calibration": {"observability": {"offset_s": 0.001}}}, (0.5, 0.05, 0.001)),
-        ({"observability": {"offset_s": 0.0, "rotation_deg": "x"}}, LIMITS),
+        ({"calibration": {"observability": {"time_offset_s": 0.001}}}, (0.5, 0.05, 0.001)),
+        ({"observability": {"time_offset_s": 0.0, "rotation_deg": "x"}}, LIMITS),
         ({"observability": None, "calibration": 3}, LIMITS),
     ],
 )

@@ -28,7 +28,7 @@ RESULT = CalibrationResult(
     weak_directions=(WeakDirection(np.eye(7)[6], 90.0, "1 m ahead equals 118 ms.", "Record a stop."),),
     frames_used=(FrameId("a/00", 1), FrameId("a/00", 2), FrameId("b/00", 1)),
     initial=POSE * gtsam.Pose3(gtsam.Rot3.Rz(np.radians(5.0)), [0.0, 0.0, 0.0]),
-    initial_offset_s=0.1,
+    initial_time_offset_s=0.1,
 )
 
 

@@ -54,8 +54,10 @@ def l_twist(position: int) -> np.ndarray:
     return np.asarray(gtsam.Pose3.Logmap(a.between(b)) / (stamps[1] - stamps[0]))
 
 
-def mean_size_px(found: FrameAlignments, cTl: gtsam.Pose3, offset_s: float, twist: np.ndarray) -> float:
-    sizes = [np.abs(residuals(a, cTl, offset_s, cTl.AdjointMap() @ twist, 0.0)[0]) for a in found.alignments]
+def mean_size_px(found: FrameAlignments, cTl: gtsam.Pose3, time_offset_s: float, twist: np.ndarray) -> float:
+    sizes = [
+        np.abs(residuals(a, cTl, time_offset_s, cTl.AdjointMap() @ twist, 0.0)[0]) for a in found.alignments
+    ]
     return float(np.median(np.concatenate(sizes)))
 
 
@@ -118,11 +120,11 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
 def test_a_moving_vehicle_is_moved_with_its_velocity() -> None:
     # moved by hand to where it is when the image is taken, it meets the same contours
     scan, image = frame(2)
-    truth, camera, velocity, offset_s = drive().truth, drive().camera, np.array([0.8, -1.5, 0.1]), 0.05
+    truth, camera, velocity, time_offset_s = drive().truth, drive().camera, np.array([0.8, -1.5, 0.1]), 0.05
     features = scan_features(2, scan, [VEHICLE], PrepareConfig())
-    points, late_s = features.boundaries[VEHICLE], offset_s + 1e-9 * (image.stamp_ns - scan.stamp_ns)
+    points, late_s = features.boundaries[VEHICLE], time_offset_s + 1e-9 * (image.stamp_ns - scan.stamp_ns)
     number = int(np.bincount(points.objects).argmax())
-    arguments = (image, camera, truth.cTl, offset_s, l_twist(2))
+    arguments = (image, camera, truth.cTl, time_offset_s, l_twist(2))
     found = sst_graph.align_frame(features, *arguments, l_velocities={(VEHICLE, number): velocity})
     shift = np.where(points.objects[:, None] == number, late_s * velocity, 0.0)
     carried = replace(points, lPs=points.lPs + shift, outward=points.outward + shift)

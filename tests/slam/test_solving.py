@@ -54,9 +54,9 @@ def solver_of(kind: str, lag_s: float) -> Solver:
 
 
 def test_levenberg_marquardt_comes_to_the_truth(street: Street, solution: RematchSolution) -> None:
-    rotation_deg, translation_m, offset_s = street.errors(solution.values)
+    rotation_deg, translation_m, time_offset_s = street.errors(solution.values)
     assert solution.converged
-    assert rotation_deg < 0.1 and translation_m < 0.02 and offset_s < 0.002
+    assert rotation_deg < 0.1 and translation_m < 0.02 and time_offset_s < 0.002
     assert street.nees(solution.values, solution.covariance) < 14.0
 
 
@@ -83,7 +83,7 @@ def test_wide_priors_give_a_warning_and_narrow_ones_do_not(street: Street, solut
 
 
 def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
-    _, values = street.whole((street.cTl, street.offset_s))
+    _, values = street.whole((street.cTl, street.time_offset_s))
     matches = terms_of(street)[8].matched(values, 5.0)
     sigma = 1e-3
     covariance = np.zeros((7, 7))
@@ -101,9 +101,9 @@ def test_the_predicted_sigma_is_that_of_the_pixels(street: Street) -> None:
 @pytest.mark.parametrize("kind", ["isam2", "smoother"])
 def test_incremental_solvers_come_to_the_truth(street: Street, kind: str) -> None:
     found = street.frame_by_frame(solver_of(kind, 1.25), street.start(1))
-    rotation_deg, translation_m, offset_s = street.errors(found.values)
+    rotation_deg, translation_m, time_offset_s = street.errors(found.values)
     assert found.converged and found.kernel_px == 4.0
-    assert rotation_deg < 0.1 and translation_m < 0.02 and offset_s < 0.002
+    assert rotation_deg < 0.1 and translation_m < 0.02 and time_offset_s < 0.002
     assert street.nees(found.values, found.covariance) < 14.0
     assert found.values.exists(X(0)) == (kind == "isam2")
 
@@ -135,14 +135,14 @@ def test_wide_priors_give_a_warning_at_the_first_matches(street: Street) -> None
 def test_a_term_moves_to_the_poses_of_its_time(street: Street) -> None:
     keys = AlignmentKeys(street.trajectory(), E, D)
     term = street.term(4, keys)
-    _, values = street.whole((street.cTl, street.offset_s))
+    _, values = street.whole((street.cTl, street.time_offset_s))
     period_s = 1e-9 * (street.stamps_ns[5] - street.stamps_ns[4])
     matches = term.matched(values, 5.0)
     assert matches.state is TermState.MATCHED and matches.factor is not None and matches.place is not None
     assert (matches.place.X_a, matches.place.X_b) == (X(4), X(5))
     assert matches.left_interval_s(values) == 0.0
-    values.update(D, np.array([street.offset_s + 2.0 * period_s]))
-    assert matches.left_interval_s(values) == pytest.approx(street.offset_s + period_s, abs=2e-3)
+    values.update(D, np.array([street.time_offset_s + 2.0 * period_s]))
+    assert matches.left_interval_s(values) == pytest.approx(street.time_offset_s + period_s, abs=2e-3)
     again = term.matched(values, 5.0)
     assert again.place is not None and (again.place.X_a, again.place.X_b) == (X(6), X(7))
     assert again.left_interval_s(values) == 0.0
@@ -150,23 +150,23 @@ def test_a_term_moves_to_the_poses_of_its_time(street: Street) -> None:
 
 def test_the_scan_nearest_in_true_time_is_taken(street: Street) -> None:
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
-    _, values = street.whole((street.cTl, street.offset_s))
+    _, values = street.whole((street.cTl, street.time_offset_s))
     for shift, expected in ((0.0, (4, 5)), (0.1, (5, 6)), (-0.1, (3, 4))):
-        values.update(D, np.array([street.offset_s + shift]))
+        values.update(D, np.array([street.time_offset_s + shift]))
         place = term.place(values)
         assert not isinstance(place, TermMatches)
         assert place.X_scan in {X(k) for k in expected}
 
 
 @pytest.mark.parametrize(
-    ("offset_s", "state", "sign"),
+    ("time_offset_s", "state", "sign"),
     [(100.0, TermState.AFTER_TRAJECTORY, 1.0), (-100.0, TermState.BEFORE_TRAJECTORY, -1.0)],
 )
 def test_an_image_beyond_the_trajectory_is_reported(
-    street: Street, offset_s: float, state: TermState, sign: float
+    street: Street, time_offset_s: float, state: TermState, sign: float
 ) -> None:
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
-    _, values = street.whole((street.cTl, offset_s))
+    _, values = street.whole((street.cTl, time_offset_s))
     matches = term.matched(values, 5.0)
     assert matches.state is state and matches.factor is None
     assert sign * matches.outside_s > 90.0
@@ -174,7 +174,7 @@ def test_an_image_beyond_the_trajectory_is_reported(
 
 
 def test_missing_poses_are_reported(street: Street) -> None:
-    _, values = street.whole((street.cTl, street.offset_s))
+    _, values = street.whole((street.cTl, street.time_offset_s))
     other = Trajectory([X(k) for k in range(24)], [stamp + 1 for stamp in street.stamps_ns])
     assert street.term(4, AlignmentKeys(other, E, D)).matched(values, 5.0).state is TermState.NO_SCAN_POSE
     values.erase(X(5))
@@ -185,7 +185,7 @@ def test_missing_poses_are_reported(street: Street) -> None:
 def test_few_matches_are_reported(street: Street) -> None:
     term = street.term(4, AlignmentKeys(street.trajectory(), E, D))
     term = replace(term, config=TermConfig(min_matches=10_000))
-    _, values = street.whole((street.cTl, street.offset_s))
+    _, values = street.whole((street.cTl, street.time_offset_s))
     assert term.matched(values, 5.0).state is TermState.FEW_MATCHES
 
 
@@ -198,16 +198,16 @@ def test_keys_may_be_constants_a_double_or_of_a_body(street: Street) -> None:
         wTb = starts.atPose3(X(k)) * bTl.inverse()
         values.insert(X(k), wTb)
         graph.add(gtsam.PriorFactorPose3(X(k), wTb, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
-    cTl, offset_s = street.start(1)
+    cTl, time_offset_s = street.start(1)
     values.insert(E, cTl)
-    values.insert(D, offset_s)
+    values.insert(D, time_offset_s)
     graph.add(gtsam.PriorFactorPose3(E, cTl, gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
-    graph.add(time_offset_prior(D, offset_s, 1.0, double=True))
+    graph.add(time_offset_prior(D, time_offset_s, 1.0, double=True))
     keys = AlignmentKeys(street.trajectory(), E, D, bTl=bTl)
     terms = [street.term(k, keys) for k in range(len(street.images))]
     found = solve_with_terms(graph, values, terms).values
     assert street.cTl.equals(found.atPose3(E), 0.02)
-    assert found.atDouble(D) == pytest.approx(street.offset_s, abs=0.005)
+    assert found.atDouble(D) == pytest.approx(street.time_offset_s, abs=0.005)
 
 
 def test_a_known_extrinsic_leaves_the_offset(street: Street) -> None:
@@ -218,11 +218,11 @@ def test_a_known_extrinsic_leaves_the_offset(street: Street) -> None:
         graph.add(
             gtsam.PriorFactorPose3(X(k), starts.atPose3(X(k)), gtsam.noiseModel.Isotropic.Sigma(6, 1e-3))
         )
-    values.insert(D, np.array([street.offset_s + 0.03]))
-    graph.add(time_offset_prior(D, street.offset_s + 0.03, 1.0))
+    values.insert(D, np.array([street.time_offset_s + 0.03]))
+    graph.add(time_offset_prior(D, street.time_offset_s + 0.03, 1.0))
     keys = AlignmentKeys(street.trajectory(), street.cTl, D)
     solution = solve_with_terms(graph, values, [street.term(k, keys) for k in range(len(street.images))])
-    assert solution.values.atVector(D)[0] == pytest.approx(street.offset_s, abs=0.005)
+    assert solution.values.atVector(D)[0] == pytest.approx(street.time_offset_s, abs=0.005)
     assert np.count_nonzero(solution.covariance) == 1 and 0.0 < solution.covariance[6, 6] < 0.01**2
 
 
@@ -230,7 +230,7 @@ def test_refuses_what_is_no_term(street: Street) -> None:
     graph, values = street.whole(street.start(1))
     with pytest.raises(EstimationError, match="no term"):
         solve_with_terms(graph, values, [])
-    far = replace(street, offset_s=500.0).whole((street.cTl, 500.0))
+    far = replace(street, time_offset_s=500.0).whole((street.cTl, 500.0))
     with pytest.raises(EstimationError, match=r"no factor in 24 terms .* lies after the last pose"):
         solve_with_terms(*far, terms_of(street))
     with pytest.raises(DataError, match="a stamp after 5 ns"):
@@ -271,8 +271,8 @@ def test_a_real_drive(stop: Street, kind: str) -> None:
     else:
         found = stop.frame_by_frame(solver_of(kind, 4.05), start)
         values, covariance = found.values, found.covariance
-    rotation_deg, translation_m, offset_s = stop.errors(values)
-    assert rotation_deg < 0.25 and translation_m < 0.02 and offset_s < 0.015
+    rotation_deg, translation_m, time_offset_s = stop.errors(values)
+    assert rotation_deg < 0.25 and translation_m < 0.02 and time_offset_s < 0.015
     assert stop.nees(values, covariance, KITTI_TRUTH) < 14.0
     sigmas = np.sqrt(np.diag(covariance))
     assert (sigmas[:3] < np.radians(0.5)).all() and (sigmas[3:6] < 0.05).all() and sigmas[6] < 0.02
@@ -295,7 +295,7 @@ def test_a_drive_at_one_speed_gives_a_warning_and_its_covariance_holds(with_bias
     assert weak and "cannot be distinguished from the image taken later" in weak[0].detail
     off = np.append(
         drive.cTl.localCoordinates(solution.values.atPose3(E)),
-        solution.values.atVector(D)[0] - drive.offset_s,
+        solution.values.atVector(D)[0] - drive.time_offset_s,
     )
     assert np.abs(off[[3, 6]] / np.sqrt(np.diag(solution.covariance)[[3, 6]])).max() < 3.0
     assert drive.nees(solution.values, solution.covariance, KITTI_TRUTH) < 18.5  # 99 % of 7

@@ -110,7 +110,9 @@ def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -
     entries = dict(sorted(optimized.estimate.smoother.entries.items()))
     assert list(entries) == list(range(len(entries))) and not optimized.estimate.smoother.sums.recent
     pairs, state = [entry.pair for entry in entries.values()], _state(optimized)
-    guess = State(optimized.initializer.guess.cTl or gtsam.Pose3(), (optimized.initializer.guess.offset_s,))
+    guess = State(
+        optimized.initializer.guess.cTl or gtsam.Pose3(), (optimized.initializer.guess.time_offset_s,)
+    )
     graph, values = joint_graph(pairs, state, optimized.matcher.graph, guess)
     robust = robust_covariance(
         graph, values, pairs, state, [optimized.inputs.window.objects_of(list(entries))[0]]

@@ -63,7 +63,7 @@ def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     solution = solve_joint(problem, below.solutions[0].state, KERNELS_PX[-1:], step_sigmas=0.02)
     state = solution.state
     turn = gtsam.Pose3.Logmap(tracker.estimate.point.cTl.between(state.cTl))
-    step = np.append(turn, state.time_offset_s(0) - tracker.estimate.point.offset_s)
+    step = np.append(turn, state.time_offset_s(0) - tracker.estimate.point.time_offset_s)
     sigmas = np.sqrt(np.diag(tracker.estimate.covariance)[:7])
     assert np.abs(step / sigmas).max() == pytest.approx(0.0, abs=0.3), np.round(step / sigmas, 2)
     if not by_object:

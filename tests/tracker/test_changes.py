@@ -123,10 +123,10 @@ def test_stamps_that_jump_against_their_interval_are_an_alarm(
     alarm = updates[alarms[0]]
     assert f"{sensor} stamps jumped" in alarm.reason and alarm.status == "alarm"
     assert alarm.chi2 is not None and alarm.chi2 > tracker.setup.config.alarm.chi2
-    offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
+    time_offset_s = 0.03 + (-1e-3 if sensor == "image" else 1e-3) * jump_ms
     assert (
         tracker.estimate.exists
-        and abs(updates[-1].time_offset_s - offset_s) < 2.0 * updates[-1].sigmas[6] < 0.03
+        and abs(updates[-1].time_offset_s - time_offset_s) < 2.0 * updates[-1].sigmas[6] < 0.03
     )
 
 
@@ -211,7 +211,7 @@ def test_what_one_object_alone_contradicts_is_suspected(street: SimulatedDrive, 
 
 def _sure_tracker(street: SimulatedDrive) -> Tracker:
     """A tracker that calls any estimate observable."""
-    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, offset_s=10.0)
+    limits = ObservabilityConfig(rotation_deg=90.0, translation_m=10.0, time_offset_s=10.0)
     calibration = dataclasses.replace(EARLY_START.calibration, observability=limits)
     return tracker_from_truth(street, dataclasses.replace(EARLY_START, calibration=calibration))
 
@@ -257,7 +257,7 @@ def test_frames_that_show_nothing_let_the_estimate_age(
             tracker.save(tmp_path / "tracker.npz")
             resumed = current_update(Tracker.load(tmp_path / "tracker.npz"))
             assert resumed.unconfirmed_s == update.unconfirmed_s > 0.5
-            assert resumed.offset_unconfirmed_s == update.offset_unconfirmed_s > 0.5
+            assert resumed.time_offset_unconfirmed_s == update.time_offset_unconfirmed_s > 0.5
     assert status[CHECKED - 5 : CHECKED] == ["unconfirmed"] * 5
     assert "unconfirmed" not in status[CHECKED : STEP + 8]
     assert status[STEP + 11] == "unconfirmed"

@@ -59,7 +59,7 @@ def test_the_parts_together_are_the_whole(
     scale = np.sqrt(np.outer(np.diag(whole.information), np.diag(whole.information)))
     np.testing.assert_allclose(fused.information / scale, whole.information / scale, atol=1e-6)
     assert fused.cTl.equals(whole.cTl, 1e-9)
-    assert fused.offset_s == pytest.approx(whole.offset_s, abs=1e-9)
+    assert fused.time_offset_s == pytest.approx(whole.time_offset_s, abs=1e-9)
     np.testing.assert_allclose(whole.covariance(), current_update(tracker).covariance, rtol=1e-6)
     # And it did grow on the way.
     assert np.linalg.slogdet(whole.information)[1] > np.linalg.slogdet(first.information)[1] + 1.0
@@ -90,7 +90,9 @@ def test_a_part_is_exact_however_far_the_estimate_has_moved(seed: int) -> None:
     part = increment(after, before)
     fused = fuse_marginals([before, part], significance=0.0)
     np.testing.assert_allclose(fused.information, after.information, rtol=1e-6, atol=1e-3)
-    assert fused.cTl.equals(after.cTl, 1e-9) and fused.offset_s == pytest.approx(after.offset_s, abs=1e-10)
+    assert fused.cTl.equals(after.cTl, 1e-9) and fused.time_offset_s == pytest.approx(
+        after.time_offset_s, abs=1e-10
+    )
     again = moved_to(after, after)
     np.testing.assert_allclose(again.information, after.information, rtol=1e-12)
     # Some of it is taken back: that is no answer to compare with others.

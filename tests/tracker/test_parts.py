@@ -48,7 +48,7 @@ def test_the_factor_is_the_gaussian() -> None:
     np.testing.assert_allclose(H, gaussian.information, atol=1e-9)
     np.testing.assert_allclose(g, gaussian.vector, atol=1e-9)
     optimum = gtsam.GaussNewtonOptimizer(graph, values).optimize()
-    assert optimum.atVector(3)[0] == pytest.approx(gaussian.mean().offset_s, abs=1e-6)
+    assert optimum.atVector(3)[0] == pytest.approx(gaussian.mean().time_offset_s, abs=1e-6)
 
 
 def test_a_random_walk_adds_its_variance() -> None:
@@ -156,12 +156,12 @@ def test_turn_and_offset_are_confirmed_apart() -> None:
     found.unreliable.add(3)
     found.wait(2.0, moving=True)
     found.wait(1.0, moving=False)
-    assert (found.turn_s, found.offset_s) == (3.0, 2.0)
+    assert (found.turn_s, found.time_offset_s) == (3.0, 2.0)
     found.add(np.array([True, False, True]))
-    assert (found.turn_s, found.offset_s) == (3.0, 0.0) and found.unreliable
+    assert (found.turn_s, found.time_offset_s) == (3.0, 0.0) and found.unreliable
     found.wait(2.0, moving=True)
     found.add(np.array([True, True, False]))
-    assert (found.turn_s, found.offset_s) == (0.0, 2.0) and not found.unreliable
+    assert (found.turn_s, found.time_offset_s) == (0.0, 2.0) and not found.unreliable
     turned = T.retract(steps(T, 0.01, 0.02)[:6, 1])
     assert turned.equals(gtsam.Pose3(gtsam.Rot3.Ry(0.01), np.zeros(3)) * T, 1e-9)
     assert steps(T, 0.01, 0.02)[6].tolist() == [0.0, 0.0, 0.02]

@@ -68,7 +68,7 @@ def test_the_window_is_relinearized_with_the_frames_that_come(begun: tuple[Path,
     assert tracker.inputs.window.leaving() == [oldest, oldest + 1]
     found, covariance = tracker.estimate.point, tracker.estimate.covariance.copy()
     assert tracker.optimize().converged
-    assert sigmas_apart(tracker, found.cTl, found.offset_s) < 1.0
+    assert sigmas_apart(tracker, found.cTl, found.time_offset_s) < 1.0
     np.testing.assert_allclose(np.diag(tracker.estimate.covariance), np.diag(covariance), rtol=0.5)
 
 
@@ -84,4 +84,4 @@ def test_a_relinearization_that_was_begun_again_ends_alike(begun: tuple[Path, li
         if once.estimate.relinearization is None and again.estimate.relinearization is None:
             break
     assert once.estimate.relinearization is None and again.estimate.relinearization is None
-    assert sigmas_apart(once, again.estimate.point.cTl, again.estimate.point.offset_s) < 0.5
+    assert sigmas_apart(once, again.estimate.point.cTl, again.estimate.point.time_offset_s) < 0.5

@@ -38,7 +38,7 @@ def test_the_estimate_comes_some_frames_later_and_is_the_same(
     assert len(spread.inputs.window.scans) == len(frames) == spread.inputs.window.next_scan
     for tracker in (at_once, spread):
         tracker.optimize()
-    assert sigmas_apart(at_once, spread.estimate.point.cTl, spread.estimate.point.offset_s) < 0.3
+    assert sigmas_apart(at_once, spread.estimate.point.cTl, spread.estimate.point.time_offset_s) < 0.3
 
 
 def test_stored_and_rolled_back_on_the_way(
@@ -61,7 +61,7 @@ def test_stored_and_rolled_back_on_the_way(
             other, saved = Tracker.load(path), saved + 1
         assert other.estimate.exists == kept.estimate.exists
     assert saved > 1 and kept.estimate.exists
-    assert sigmas_apart(kept, other.estimate.point.cTl, other.estimate.point.offset_s) < 1e-5
+    assert sigmas_apart(kept, other.estimate.point.cTl, other.estimate.point.time_offset_s) < 1e-5
 
 
 def test_a_drive_that_ends_before_the_start_is_done(street: SimulatedDrive, frames: list[Frame]) -> None:

@@ -76,7 +76,7 @@ def test_a_real_drive_three_images_off_starts_in_the_right_basin() -> None:
     def turn() -> np.ndarray:
         return np.asarray(gtsam.Rot3.Logmap(tracker.estimate.point.cTl.between(truth.cTl).rotation()))
 
-    late = tracker.estimate.point.offset_s - (truth.time_offset_s or 0.0)
+    late = tracker.estimate.point.time_offset_s - (truth.time_offset_s or 0.0)
     assert abs(late) < 3.0 * np.sqrt(tracker.estimate.covariance[6, 6])
     assert (
         turn() @ np.linalg.solve(tracker.estimate.covariance[:3, :3], turn()) < 16.3

@@ -82,7 +82,7 @@ def test_what_leaves_the_window_still_counts(street: SimulatedDrive, frames: lis
         short.add(frame)
     assert short.estimate.smoother is not None and whole.estimate.smoother is not None
     assert len(short.estimate.smoother.entries) <= 10 < len(whole.estimate.smoother.entries)
-    assert sigmas_apart(whole, short.estimate.point.cTl, short.estimate.point.offset_s) < 2.5
+    assert sigmas_apart(whole, short.estimate.point.cTl, short.estimate.point.time_offset_s) < 2.5
     ratio = np.sqrt(np.diag(short.estimate.covariance) / np.diag(whole.estimate.covariance))
     assert ratio.min() > 0.7 and ratio.max() < 1.5
 
@@ -177,7 +177,7 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     kept.save(tmp_path / "tracker.npz")
     resumed = Tracker.load(tmp_path / "tracker.npz")
     assert resumed.estimate.point.cTl.equals(kept.estimate.point.cTl, 1e-12)
-    assert resumed.estimate.point.offset_s == kept.estimate.point.offset_s
+    assert resumed.estimate.point.time_offset_s == kept.estimate.point.time_offset_s
     np.testing.assert_allclose(resumed.estimate.covariance, kept.estimate.covariance, rtol=1e-12)
     assert resumed.matcher.graph == kept.matcher.graph and kept.matcher.graph.lower_edges
     for (_, a), (_, b) in zip(resumed.inputs.window.scans, kept.inputs.window.scans, strict=True):
@@ -187,7 +187,7 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     for frame in frames[20:]:
         kept.add(frame)
         resumed.add(frame)
-        assert sigmas_apart(kept, resumed.estimate.point.cTl, resumed.estimate.point.offset_s) < 1e-5
+        assert sigmas_apart(kept, resumed.estimate.point.cTl, resumed.estimate.point.time_offset_s) < 1e-5
     np.testing.assert_allclose(resumed.estimate.covariance, kept.estimate.covariance, rtol=1e-5)
     assert (
         resumed.monitor.changes.statistic.recent
@@ -207,7 +207,7 @@ def test_saving_hardly_moves_what_follows(
             before = saved.estimate.point
             saved.save(tmp_path / "tracker.npz")
             assert saved.estimate.point is before
-    assert sigmas_apart(unsaved, saved.estimate.point.cTl, saved.estimate.point.offset_s) < 0.2
+    assert sigmas_apart(unsaved, saved.estimate.point.cTl, saved.estimate.point.time_offset_s) < 0.2
 
 
 def test_a_broken_checkpoint_is_named(tmp_path: Path, running: Path) -> None:

@@ -39,8 +39,8 @@ def run(args: argparse.Namespace) -> int:
         read_as = options_of(args)
         sources = open_drives(args)
         warn_of_other_pairs(args.init, read_as)
-        initial, offset_s = starting_point(args.init, sources[0], args.camera)
-        result, against = calibrate_drives(sources, initial, offset_s, config, args.camera)
+        initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
+        result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
         result = dataclasses.replace(result, read_as=read_as)
         # The numbers first: what follows may find the disk full.
         mention(summary(result, against))
@@ -52,13 +52,15 @@ def run(args: argparse.Namespace) -> int:
 def calibrate_drives(
     sources: Sequence[Source],
     initial: gtsam.Pose3 | None,
-    initial_offset_s: float,
+    initial_time_offset_s: float,
     config: CalibrationConfig,
     camera: str,
 ) -> tuple[CalibrationResult, Comparison | None]:
     """The calibration of ``sources``, with progress on stderr, and its errors where they can be known."""
     with ProgressBar() as progress:
-        result = calibrate(sources, initial, config, initial_offset_s=initial_offset_s, progress=progress)
+        result = calibrate(
+            sources, initial, config, initial_time_offset_s=initial_time_offset_s, progress=progress
+        )
     for stage, seconds in result.diagnostics.get(WALL_CLOCK, {}).items():
         logger.info("%s took %.1f s", stage, seconds)
     result = dataclasses.replace(result, camera_name=camera)

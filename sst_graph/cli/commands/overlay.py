@@ -42,10 +42,10 @@ def _before(choice: str, result: CalibrationResult, source: Source) -> Placement
     if choice == "initial":
         if result.initial is None:
             return None
-        return Placement(result.initial, result.initial_offset_s, "before (start)")
+        return Placement(result.initial, result.initial_time_offset_s, "before (start)")
     if choice == "dataset":
         if source.nominal is None:
             raise ConfigError(f"{source.name} brings no nominal calibration to compare with")
         return Placement(source.nominal, 0.0, "before (nominal)")
-    cTl, offset_s = load_initial(Path(choice), result.camera_name)
-    return Placement(cTl, offset_s, f"before ({Path(choice).name})")
+    cTl, time_offset_s = load_initial(Path(choice), result.camera_name)
+    return Placement(cTl, time_offset_s, f"before ({Path(choice).name})")

@@ -123,18 +123,18 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))
     if not (args.resume and args.checkpoint.exists()):
-        initial, offset_s = starting_point(args.init or "dataset", source, args.camera)
-        tracker = Tracker(source.camera, config, initial, offset_s)
+        initial, time_offset_s = starting_point(args.init or "dataset", source, args.camera)
+        tracker = Tracker(source.camera, config, initial, time_offset_s)
         swept = with_sweep(source, config.calibration.decide_sweep)
         return tracker, swept, iter(swept)
     tracker = Tracker.load(args.checkpoint)
     made = tracker.setup
-    initial, offset_s = made.initial, made.initial_offset_s
+    initial, time_offset_s = made.initial, made.initial_time_offset_s
     if args.init is not None:
-        initial, offset_s = starting_point(args.init, source, args.camera)
+        initial, time_offset_s = starting_point(args.init, source, args.camera)
     # What is not asked for is the checkpoint's.
     asked = settings(made.config, args, flags)
-    check_setup(tracker, Setup(source.camera, asked, initial, offset_s), args.checkpoint)
+    check_setup(tracker, Setup(source.camera, asked, initial, time_offset_s), args.checkpoint)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 

@@ -56,9 +56,9 @@ def read_truth(path: Path) -> StoredTruth | None:
     if not isinstance(values, dict):
         raise DataError(path, f"a JSON {type(values).__name__}", _EXPECTED)
     table = JsonTable(values, str(path))
-    offset_s = None if values.get("time_offset_s") is None else table.offset_s("time_offset_s")
+    time_offset_s = None if values.get("time_offset_s") is None else table.time_offset_s("time_offset_s")
     rows = values.get("T_camera_lidar")
     matrix = table.matrix("T_camera_lidar", (len(rows) if isinstance(rows, list) else 4, 4))
     camera = values.get("camera")
-    truth = GroundTruth(pose_from(matrix, f"{path} (T_camera_lidar)"), offset_s)
+    truth = GroundTruth(pose_from(matrix, f"{path} (T_camera_lidar)"), time_offset_s)
     return StoredTruth(truth, camera if isinstance(camera, str) else "image_2")

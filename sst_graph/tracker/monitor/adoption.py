@@ -103,5 +103,7 @@ def mean_cost(
         cost += worst * (total - len(pair))
         for c, matches in pair.matches.items():
             bias = float(point.biases_px[classes.index(c)])
-            cost += alignment_cost(matches.alignment, point.cTl, point.offset_s, pair.motion.c_twist, bias)
+            cost += alignment_cost(
+                matches.alignment, point.cTl, point.time_offset_s, pair.motion.c_twist, bias
+            )
     return cost / count if count else None

@@ -28,29 +28,29 @@ class Confirmation:
 
     Attributes:
         turn_s: seconds since a frame last confirmed the camera's orientation.
-        offset_s: seconds in motion since one last confirmed the time offset; at rest nothing can.
+        time_offset_s: seconds in motion since one last confirmed the time offset; at rest nothing can.
         unreliable: tracks of objects that contradicted the estimate until they were given up; they confirm
             nothing until others have: the estimate has followed them, whether they were right or not.
     """
 
     turn_s: float = 0.0
-    offset_s: float = 0.0
+    time_offset_s: float = 0.0
     unreliable: set[int] = field(default_factory=set)
 
     @property
     def too_old(self) -> bool:
         """Whether the estimate is unconfirmed."""
-        return self.turn_s > _MAX_TURN_AGE_S or self.offset_s > _MAX_OFFSET_AGE_S
+        return self.turn_s > _MAX_TURN_AGE_S or self.time_offset_s > _MAX_OFFSET_AGE_S
 
     def begin(self) -> None:
         """A start confirms everything."""
-        self.turn_s = self.offset_s = 0.0
+        self.turn_s = self.time_offset_s = 0.0
         self.unreliable.clear()
 
     def wait(self, seconds: float, moving: bool) -> None:
         """Let time pass."""
         self.turn_s += seconds
-        self.offset_s += seconds if moving else 0.0
+        self.time_offset_s += seconds if moving else 0.0
 
     def add(self, detectable: NDArray[np.bool_]) -> None:
         """The latest frames agree with the estimate and would have shown some of :func:`steps`."""
@@ -58,14 +58,14 @@ class Confirmation:
             self.turn_s = 0.0
             self.unreliable.clear()
         if detectable[2]:
-            self.offset_s = 0.0
+            self.time_offset_s = 0.0
 
 
-def steps(cTl: gtsam.Pose3, turn_rad: float, offset_s: float) -> FloatArray:
+def steps(cTl: gtsam.Pose3, turn_rad: float, time_offset_s: float) -> FloatArray:
     """(7, 3) of extrinsic and time offset: turns of the camera about its x and its y axis, a clock's jump."""
     found = np.zeros((7, 3))
     found[:6, :2] = camera_turns(cTl) * turn_rad
-    found[6, 2] = offset_s
+    found[6, 2] = time_offset_s
     return found
 
 

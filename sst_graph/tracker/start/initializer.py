@@ -307,7 +307,7 @@ class Initializer:
         self.attempts += 1
         self.search = self.graph = None
         if self.attempts >= _MAX_ATTEMPTS:
-            self.guess = Guess(self.guess.cTl, self.guess.offset_s)
+            self.guess = Guess(self.guess.cTl, self.guess.time_offset_s)
 
     def succeeded(self) -> None:
         """There is an estimate."""

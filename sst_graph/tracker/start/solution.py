@@ -57,17 +57,17 @@ class Guess:
 
     Attributes:
         cTl: rough extrinsic, or None where nothing is known.
-        offset_s: rough time offset [s].
+        time_offset_s: rough time offset [s].
         search: search around the guess; False trusts it to within a degree or two.
     """
 
     cTl: gtsam.Pose3 | None
-    offset_s: float
+    time_offset_s: float
     search: bool = True
 
     def point(self, classes: tuple[SemanticClass, ...], names: Sequence[str] = ()) -> Point:
         """With mask biases and parameters (``names``) of 0; the identity where nothing is known."""
-        return Point.unbiased(self.cTl or gtsam.Pose3(), self.offset_s, classes, names)
+        return Point.unbiased(self.cTl or gtsam.Pose3(), self.time_offset_s, classes, names)
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def first_estimate_steps(drive: Drive, guess: Guess, config: TrackerConfig) -> S
     # 1. Candidates, with time offsets around the guess's.
     starts = yield from _starts(drive, guess, config, reach)
     # 2. Solutions from their poses with the guess's time offset, and from the candidates as they are.
-    held = [State(start.cTl, (guess.offset_s,)) for start in _one_of_each_basin(starts)]
+    held = [State(start.cTl, (guess.time_offset_s,)) for start in _one_of_each_basin(starts)]
     # After a search the starts are near.
     kernels_px = NARROW_KERNELS_PX if searched else KERNELS_PX
     families = [held, starts] if reach > 0.0 else [starts]
@@ -197,9 +197,9 @@ def _starts(drive: Drive, guess: Guess, config: TrackerConfig, reach_s: float) -
     enabled = guess.search or guess.cTl is None
     search = dataclasses.replace(calibration.search, time_offset_s=reach_s, enabled=enabled)
     joint = _damped(config) if reach_s == 0.0 else calibration.joint
-    problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.offset_s)
+    problem = StartProblem([drive], Tracks([drive]), calibration.classes, guess.cTl, guess.time_offset_s)
     selection = yield from select_start_steps(problem, joint.graph, search)
-    return [State(cTl, (offset_s,)) for cTl, offset_s in selection.starts]
+    return [State(cTl, (time_offset_s,)) for cTl, time_offset_s in selection.starts]
 
 
 def _damped(config: TrackerConfig) -> JointConfig:
@@ -220,8 +220,8 @@ def _solution(
     biases = [state.biases_px.get((0, c), 0.0) for c in calibration.classes]
     names = tuple(name for name, _ in named_sigmas(calibration.noise.estimate))
     parameters = np.array([state.nuisances.get(name, 0.0) for name in names])
-    cTl, offset_s = state.cTl, state.time_offset_s(0)
-    point = Point(cTl, offset_s, np.array(2 * biases), names=names, parameters=parameters)
+    cTl, time_offset_s = state.cTl, state.time_offset_s(0)
+    point = Point(cTl, time_offset_s, np.array(2 * biases), names=names, parameters=parameters)
     if not solution.converged:
         message = f"the first solution still moved after {solution.outer_iterations} iterations"
         raise _NotConverged(message, _Solved(_cost(drive, point, config), point))
@@ -242,7 +242,9 @@ def _cost(drive: Drive, point: Point, config: TrackerConfig) -> float:
     return cost
 
 
-def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, config: TrackerConfig) -> None:
+def _check_pairs(
+    drive: Drive, start_s: float, pairs: int, time_offset_s: float, config: TrackerConfig
+) -> None:
     """Refuse a solution whose time offset has diverged: it loses pairs, or leaves the searched range."""
     seen = [
         pair
@@ -252,8 +254,8 @@ def _check_pairs(drive: Drive, start_s: float, pairs: int, offset_s: float, conf
     if pairs < _LEAST_PAIRS_SHARE * len(seen):
         raise EstimationError(f"the first solution keeps {pairs} of {len(seen)} pairs of scan and image")
     reach = config.calibration.search.time_offset_s
-    if abs(offset_s - start_s) > reach:
-        raise EstimationError(f"the time offset ran from {start_s:.3f} s to {offset_s:.3f} s")
+    if abs(time_offset_s - start_s) > reach:
+        raise EstimationError(f"the time offset ran from {start_s:.3f} s to {time_offset_s:.3f} s")
 
 
 def prior_gaussian(
@@ -271,5 +273,5 @@ def prior_gaussian(
     information = np.diag(1.0 / np.square(sigmas))
     tie, biases = LOWER_EDGE_BIAS_SIGMA_PX**-2.0 * np.eye(k), slice(7, 7 + 2 * k)
     information[biases, biases] += np.block([[tie, -tie], [-tie, tie]])
-    centre = Point.unbiased(guess.cTl or point.cTl, guess.offset_s, classes, point.names)
+    centre = Point.unbiased(guess.cTl or point.cTl, guess.time_offset_s, classes, point.names)
     return Gaussian(point, information, information @ point.local(centre))

@@ -34,13 +34,13 @@ class Setup:
         camera: of its images.
         config: all settings.
         initial: guess of cTl, or None.
-        initial_offset_s: guess of the time offset [s].
+        initial_time_offset_s: guess of the time offset [s].
     """
 
     camera: PinholeCamera
     config: TrackerConfig
     initial: gtsam.Pose3 | None
-    initial_offset_s: float
+    initial_time_offset_s: float
 
     def differences(self, other: Setup) -> list[str]:
         """In what another one differs: "name: found this, expected the other's"."""
@@ -52,7 +52,10 @@ class Setup:
         ]
         if self.camera != other.camera:
             found.append(f"a camera {self.camera}, expected {other.camera}")
-        if not _same(self.initial, other.initial) or self.initial_offset_s != other.initial_offset_s:
+        if (
+            not _same(self.initial, other.initial)
+            or self.initial_time_offset_s != other.initial_time_offset_s
+        ):
             mine_text, other_text = (_start_text(setup) for setup in (self, other))
             found.append(f"a start from {mine_text}, expected {other_text}")
         return found
@@ -197,4 +200,4 @@ def _start_text(setup: Setup) -> str:
         return "no guess (--init none)"
     translation = ", ".join(f"{x:.4g}" for x in setup.initial.translation())
     turn = ", ".join(f"{x:.4g}" for x in gtsam.Rot3.Logmap(setup.initial.rotation()))
-    return f"T_camera_lidar [{turn}] rad, [{translation}] m with {setup.initial_offset_s:.4g} s (--init)"
+    return f"T_camera_lidar [{turn}] rad, [{translation}] m with {setup.initial_time_offset_s:.4g} s (--init)"

@@ -197,7 +197,7 @@ def _rows(
             columns = np.array([below if t == lower_edge_track(c) else known[t] for t in names])[groups]
             values = np.concatenate([point.biases_px, point.parameters, point.object_biases_px])
             biases = values[columns - 7]
-        at = point.cTl, point.offset_s, pair.motion.c_twist
+        at = point.cTl, point.time_offset_s, pair.motion.c_twist
         r, J, _ = weighted_residuals(alignment, *at, biases)
         block = np.zeros((len(r), point.size + len(held)))
         block[:, :7] = J[:, :7]

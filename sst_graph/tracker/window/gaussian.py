@@ -27,7 +27,7 @@ class Point:
 
     Attributes:
         cTl: extrinsic.
-        offset_s: time offset [s].
+        time_offset_s: time offset [s].
         biases_px: (2 c,) mask bias of each class, then that of each class's lower edges [px].
         tracks: objects with a mask bias of their own, by the number of their track.
         object_biases_px: (k,) those biases [px].
@@ -36,7 +36,7 @@ class Point:
     """
 
     cTl: gtsam.Pose3
-    offset_s: float
+    time_offset_s: float
     biases_px: FloatArray
     tracks: tuple[int, ...] = ()
     object_biases_px: FloatArray = field(default_factory=lambda: np.zeros(0))
@@ -47,13 +47,13 @@ class Point:
     def unbiased(
         cls,
         cTl: gtsam.Pose3,
-        offset_s: float,
+        time_offset_s: float,
         classes: Sequence[SemanticClass],
         names: Sequence[str] = (),
     ) -> Point:
         """With mask biases of 0, and parameters of 0 by these names."""
         nothing = np.zeros(len(names))
-        return cls(cTl, offset_s, np.zeros(2 * len(classes)), names=tuple(names), parameters=nothing)
+        return cls(cTl, time_offset_s, np.zeros(2 * len(classes)), names=tuple(names), parameters=nothing)
 
     @property
     def size(self) -> int:
@@ -102,7 +102,7 @@ class Point:
         return np.concatenate(
             [
                 turn,
-                [other.offset_s - self.offset_s],
+                [other.time_offset_s - self.time_offset_s],
                 np.subtract(other.biases_px, self.biases_px),
                 np.subtract(other.parameters, self.parameters),
                 theirs - self.object_biases_px,
@@ -114,7 +114,7 @@ class Point:
         return replace(
             self,
             cTl=self.cTl.compose(gtsam.Pose3.Expmap(step[:6])),
-            offset_s=self.offset_s + float(step[6]),
+            time_offset_s=self.time_offset_s + float(step[6]),
             biases_px=self.biases_px + step[7 : 7 + len(self.biases_px)],
             parameters=self.parameters + step[7 + len(self.biases_px) : self.core_size],
             object_biases_px=self.object_biases_px + step[self.core_size :],
@@ -125,7 +125,7 @@ class Point:
         of_class, below = np.split(self.biases_px, 2)
         biases = {(0, c): float(bias) for c, bias in zip(classes, of_class, strict=True)}
         shared = {(0, lower_edge_track(c)): float(bias) for c, bias in zip(classes, below, strict=True)}
-        return State(self.cTl, (self.offset_s,), biases, shared, self.nuisances)
+        return State(self.cTl, (self.time_offset_s,), biases, shared, self.nuisances)
 
     @property
     def nuisances(self) -> dict[str, float]:
@@ -303,7 +303,7 @@ def with_room(before: int, after: int, held: int) -> FloatArray:
 def core_steps(points: Sequence[Point], to: Point) -> FloatArray:
     """(k, m) steps from each point to another, over [extrinsic, offset, biases, parameters]."""
     turns = np.array([gtsam.Pose3.Logmap(point.cTl.between(to.cTl)) for point in points]).reshape(-1, 6)
-    offsets = np.array([to.offset_s - point.offset_s for point in points])
+    offsets = np.array([to.time_offset_s - point.time_offset_s for point in points])
     biases = np.array([point.biases_px for point in points]).reshape(len(turns), -1)
     parameters = np.array([point.parameters for point in points]).reshape(len(turns), -1)
     return np.column_stack([turns, offsets, to.biases_px - biases, to.parameters - parameters])
@@ -322,7 +322,7 @@ def _picked(point: Point, tracks: Sequence[int]) -> FloatArray:
 def insert_point(values: gtsam.Values, keys: Sequence[int], point: Point) -> None:
     """Put a point into values under [extrinsic, offset, biases, parameters, object biases], where a key is
     not there yet."""
-    scalars = [point.offset_s, *point.biases_px, *point.parameters, *point.object_biases_px]
+    scalars = [point.time_offset_s, *point.biases_px, *point.parameters, *point.object_biases_px]
     if not values.exists(keys[0]):
         values.insert(keys[0], point.cTl)
     for key, scalar in zip(keys[1:], scalars, strict=True):

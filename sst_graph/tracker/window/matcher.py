@@ -88,7 +88,7 @@ class WindowMatcher:
                 by_object = not self.config.drift.enabled
                 linear = self._linearized(pair, number, point, share, by_object, self.held_names)
                 image = self.window.images[pair.pair.image]
-                out = self.left_out(pair, number, point.offset_s)
+                out = self.left_out(pair, number, point.time_offset_s)
                 found[number] = MatchedPair(pair, linear, stamps[number], image.index, left_out=out)
         return found, set(numbers) - set(found)
 
@@ -128,7 +128,7 @@ class WindowMatcher:
         part, numbers = self.window.drive(chosen.__contains__)
         found = {}
         for pair in pair_by_time(
-            part.scan_stamps_ns, part.image_stamps_ns, point.offset_s, part.image_period_s
+            part.scan_stamps_ns, part.image_stamps_ns, point.time_offset_s, part.image_period_s
         ):
             number, contours = numbers[pair.scan], part.images[pair.image].contours
             counts: dict[int, int] = {}
@@ -143,10 +143,10 @@ class WindowMatcher:
         return found
 
     def left_out(
-        self, pair: PairMatches, number: int, offset_s: float
+        self, pair: PairMatches, number: int, time_offset_s: float
     ) -> frozenset[tuple[SemanticClass, int, int]]:
         """The dynamic objects of a scan whose weight is lower with the image of a pair, or 0."""
-        return self.window.left_out(number, offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
+        return self.window.left_out(number, time_offset_s + pair.pair.base_tau_s, DYNAMIC_REACH_M)
 
     def objects_of(self, chosen: Collection[int]) -> set[int]:
         """Tracks of all objects of some scans."""

@@ -68,7 +68,7 @@ def _with_changed_objects(matcher: WindowMatcher, smoother: WindowSmoother) -> l
     window, found = matcher.window, []
     for number in sorted(window.dynamics.changed_scans & set(smoother.entries)):
         entry = smoother.entries[number]
-        if matcher.left_out(entry.pair, number, smoother.point.offset_s) != entry.left_out:
+        if matcher.left_out(entry.pair, number, smoother.point.time_offset_s) != entry.left_out:
             found.append(number)
         else:
             window.dynamics.changed_scans.discard(number)

@@ -179,14 +179,14 @@ class WindowSmoother:
     def twist_factor(self, entry: MatchedPair) -> gtsam.NonlinearFactor:
         """Odometry's measurement of the twist of a pair's image."""
         (E, D), V, at = self.keys(entry.epoch)[:2], twist_key(0, entry.image), entry.linear.information.point
-        return motion_factor(entry.pair, E, D, V, at.cTl, at.offset_s)
+        return motion_factor(entry.pair, E, D, V, at.cTl, at.time_offset_s)
 
     def drift_factors(self, old: Epoch, new: Epoch) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
         """The random walk of extrinsic and offset from one epoch to the next."""
         a, b, drift = self.keys(old.number), self.keys(new.number), self.drift
         seconds, rate = (new.start_ns - old.start_ns) * 1e-9, float(np.radians(drift.rotation_deg))
         turn = extrinsic_drift(a[0], b[0], seconds, rate, drift.translation_m)
-        return turn, time_offset_drift(a[1], b[1], seconds, drift.offset_s)
+        return turn, time_offset_drift(a[1], b[1], seconds, drift.time_offset_s)
 
     def optimize(self, iterations: int = 10) -> None:
         """Levenberg-Marquardt on the whole window, and a fresh iSAM2 linearized where it ends.
@@ -274,7 +274,7 @@ class WindowSmoother:
     def walk(self, seconds: float) -> FloatArray:
         """(m,) variances of the random walk of [extrinsic, offset, biases, parameters] over some seconds."""
         drift = self.drift
-        rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.offset_s]
+        rates = [np.radians(drift.rotation_deg)] * 3 + [drift.translation_m] * 3 + [drift.time_offset_s]
         return np.asarray(seconds * np.square([*rates, *[0.0] * (self.prior.point.core_size - 7)]))
 
     def information(self) -> FloatArray:

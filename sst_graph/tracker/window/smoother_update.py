@@ -207,7 +207,7 @@ class SmootherUpdate:
         self._add(shift, "link", -new.number)
         E, D = smoother.keys(new.number)[:2]
         self._values.insert(E, smoother.point.cTl)
-        self._values.insert(D, np.array([smoother.point.offset_s]))
+        self._values.insert(D, np.array([smoother.point.time_offset_s]))
         self.epochs = (*self.epochs, new)
         return new.number
 

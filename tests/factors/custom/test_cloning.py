@@ -95,7 +95,7 @@ def test_other_keys(bench, name):
 def test_a_recipe_names_the_factor(bench):
     recipe = recipe_of(bench.makers()["pose_alignment_factor"](E, D))
     assert recipe is not None and recipe.name == "pose_alignment_factor"
-    assert recipe.keys == {X[0]: "X_a", X[1]: "X_b", E: "cTl", D: "offset_s"}
+    assert recipe.keys == {X[0]: "X_a", X[1]: "X_b", E: "cTl", D: "time_offset_s"}
     assert recipe_of(time_offset_prior(D, 0.0, 1.0)) is None
 
 

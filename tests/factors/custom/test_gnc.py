@@ -61,7 +61,7 @@ def test_gnc_leaves_out_an_image_of_another_place(bench, make_scene):
         seen = bench.points.take(np.arange(len(bench.points)))
         shift = 0.0 if k < 10 else 40.0
         seen = replace(seen, pixels=seen.pixels + shift)
-        graph.add(point_to_pixel_factor(seen, E, bench.offset_s, bench.twist))
+        graph.add(point_to_pixel_factor(seen, E, bench.time_offset_s, bench.twist))
     n = len(bench.points)
     found = gnc(graph, values, GncParams(inlier_cost=10.0 * n), known_inliers=[0])
     np.testing.assert_array_equal(found.weights > 0.5, np.arange(13) < 11)

@@ -37,7 +37,7 @@ def bench(make_scene):
 @pytest.mark.parametrize("name", NAMES)
 def test_an_offset_may_be_a_vector_or_a_double(bench, name):
     factor = bench.makers()[name](E, D)
-    vector, double = bench.values(), bench.values(float(bench.offset_s))
+    vector, double = bench.values(), bench.values(float(bench.time_offset_s))
     # one factor on both by turns: the type is looked up again where it changes
     for values in (double, vector, double):
         assert factor.error(values) == pytest.approx(factor.error(vector), rel=1e-12)
@@ -102,13 +102,15 @@ def test_what_is_no_extrinsic_is_refused_at_once(bench, name, wrong, found):
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("wrong", ["D0", True, -1, np.zeros(2), gtsam.Pose3(), [0.1, 0.2]])
 def test_what_is_no_offset_is_refused_at_once(bench, name, wrong):
-    with pytest.raises(FactorError, match=r"(offset_s|D|D_key) of .*: found .*, expected .*key"):
+    with pytest.raises(FactorError, match=r"(time_offset_s|D|D_key) of .*: found .*, expected .*key"):
         bench.makers()[name](E, wrong)
 
 
 @pytest.mark.parametrize("name", NAMES[:8])
 def test_an_integer_zero_is_no_offset(bench, name):
-    with pytest.raises(FactorError, match=r"offset_s of .*: found the int 0, expected 0\.0 for the constant"):
+    with pytest.raises(
+        FactorError, match=r"time_offset_s of .*: found the int 0, expected 0\.0 for the constant"
+    ):
         bench.makers()[name](E, 0)
     factor = bench.makers()[name](E, 0.0)
     assert 0 not in factor.keys() and D not in factor.keys()  # noqa: SIM118  (a gtsam factor, no dict)
@@ -127,7 +129,7 @@ def test_a_constant_written_as_an_int_is_told(bench):
 @pytest.mark.parametrize("name", NAMES)
 def test_one_key_for_two_variables_is_refused(bench, name):
     with pytest.raises(
-        FactorError, match=r"keys of \w+: found E0.*(cTl and offset_s|E and D|E_key and D_key)"
+        FactorError, match=r"keys of \w+: found E0.*(cTl and time_offset_s|E and D|E_key and D_key)"
     ):
         bench.makers()[name](E, E)
 
@@ -196,7 +198,7 @@ def test_every_key_is_checked(make):
 
 
 def test_keys_of_poses_are_checked(bench):
-    arguments = dict(cTl=E, offset_s=D, seconds=0.1)
+    arguments = dict(cTl=E, time_offset_s=D, seconds=0.1)
     for wrong in (None, 0.5, "X", POSE):
         for poses in ((wrong, X[1]), (X[0], wrong)):
             with pytest.raises(FactorError, match=r"X_. of pose_alignment_factor: found .*, expected a key"):
@@ -220,7 +222,7 @@ def test_biases_may_share_a_key_but_nothing_else(bench):
     shared = frame_factor([bench.contour] * 2, E, D, V[0], [B, B])
     assert shared.keys() == [E, D, V[0], B]
     assert frame_factor([bench.contour], E, D, V[0], [GroupedBias((B, B), groups)]).keys() == [E, D, V[0], B]
-    with pytest.raises(FactorError, match="D0 for offset_s and bias"):
+    with pytest.raises(FactorError, match="D0 for time_offset_s and bias"):
         frame_factor([bench.contour], E, D, V[0], D)
     with pytest.raises(FactorError, match="X1 for X_b and bias 1"):
         pose_alignment_factor([bench.contour], X[0], X[1], E, D, 0.1, biases_px=X[1])
