@@ -335,7 +335,7 @@ def match_edges(
     seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
-        tips = paired.projected(paired.points.outward, cTl, offset_s)
+        tips = paired.projected(paired.points.outward, cTl, time_offset_s)
         feet, shares = _contours_or_gradients(paired, uvs, tips - (uvs if shift is None else ideal[index]), kernel)
     else:
         feet, shares = nearest_contours(paired.contours, paired.spans, uvs), None
