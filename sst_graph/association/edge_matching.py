@@ -172,6 +172,10 @@ class PairedEdges:
     def projected(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
         """(n, 2) pixels of points (n, 3) of the groups, moved to their images' instant; NaN behind the
         camera."""
+        return self.camera.project(self.moved(lPs, cTl, time_offset_s))
+
+    def moved(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
+        """(n, 3) points (n, 3) of the groups at their images' instant, in the camera [m]."""
         columns, taus = np.ascontiguousarray(lPs.T), time_offset_s + self.base_taus_s
         if self.velocities is not None:
             columns = columns + taus * self.velocities.T
@@ -179,14 +183,14 @@ class PairedEdges:
         starts = [a for a, _, _ in groups]
         if not all((taus[a:b] == taus[a]).all() for a, b, _ in groups):
             twists, accelerations = (self.repeated(each).T for each in self._motion_rows())
-            return self.camera.project(move_points(cTl, columns, taus, twists, accelerations).cPs.T)
+            return np.asarray(move_points(cTl, columns, taus, twists, accelerations).cPs.T)
         # Every group moves as one rigid body.
         cPs = np.empty_like(columns)
         for (a, b, motion), tau_s in zip(groups, taus[starts].tolist(), strict=True):
             moved = moved_pose(cTl, tau_s, motion.c_twist, motion.c_acceleration)
             np.matmul(moved.rotation().matrix(), columns[:, a:b], out=cPs[:, a:b])
             cPs[:, a:b] += np.asarray(moved.translation()).reshape(3, 1)
-        return self.camera.project(cPs.T)
+        return cPs.T
 
     def accelerations(self) -> FloatArray:
         """(6,) where all groups share it, else (n, 6): of each point's image [rad/s^2, m/s^2]."""

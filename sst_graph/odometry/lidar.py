@@ -21,12 +21,7 @@ from sst_graph.types import RelativeMotion, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
-MOVABLE_CLASSES = (
-    SemanticClass.VEHICLE,
-    SemanticClass.PERSON,
-    SemanticClass.TWO_WHEELER,
-    SemanticClass.OBJECT,
-)
+MOVABLE_CLASSES = (SemanticClass.VEHICLE, SemanticClass.PERSON, SemanticClass.TWO_WHEELER)
 """Classes whose members may move by themselves."""
 _MOVABLE = np.isin(np.arange(256), MOVABLE_CLASSES)
 """Whether a label is one of them."""
