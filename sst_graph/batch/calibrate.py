@@ -19,6 +19,7 @@ from sst_graph.batch.joint_report import (
     label_agreement,
     unknown_motion_remarks,
 )
+from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.method_estimate import (
     Guess,
     MethodEstimate,
@@ -34,11 +35,12 @@ from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
+from sst_graph.drive.geometric_labels import GeometricallyLabelled
 from sst_graph.drive.preparation import Drive, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Source
+from sst_graph.types import SemanticClass, Source
 
 
 def calibrate(
@@ -89,9 +91,12 @@ def prepare_drives(
         prepare = replace(prepare, use_visual_odometry=False)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
+    classes = config.classes
+    if config.method == "edges":
+        sources, classes = [GeometricallyLabelled(source) for source in sources], (SemanticClass.OBJECT,)
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(source, config.classes, prepare, progress, depth, with_lower_edges)
+        prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
 
@@ -183,8 +188,9 @@ _METHODS: dict[Method, _Method] = {
     "static": static_method,
     "semalign": semalign_method,
     "motion": motion_method,
+    "edges": edges_method,
 }
-_NEED_IMAGE_TRACKS = ("paper", "static", "motion")
+_NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 """Methods whose camera velocity comes from visual odometry."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

@@ -19,11 +19,11 @@ from sst_graph.graph.matching import DriveEdges
 
 FloatArray = NDArray[np.float64]
 
-_STAGES = ((14.0, 1.0, 300), (8.0, 0.5, 60), (6.0, 0.25, 30))
+_STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))
 """Blur [px] at an image width of 1242, step of the grid in units of the first one's, and how many poses go on."""
 GRID_DEG = 1.2
 """Step of the first grid: with KITTI's camera, as many pixels as the first blur has [deg]."""
-_POINTS = 6000
+_POINTS = 4000
 """Boundary points, in all, that the poses are compared on."""
 _WIDTH_PX = 1242
 """Image width for which the blurs are given."""

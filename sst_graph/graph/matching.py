@@ -171,6 +171,16 @@ class Tracks:
             other._dynamic = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
+    @classmethod
+    def joined(cls, parts: Sequence[Tracks]) -> Tracks:
+        """The tracks of several drives, each given by itself."""
+        other = cls([])
+        other._tracks = [track for part in parts for track in part._tracks]
+        if all(part.objects is not None for part in parts):
+            other.objects = [own for part in parts for own in part.objects or ()]
+            other._dynamic = [own for part in parts for own in part._dynamic]
+        return other
+
     def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
         """The dynamic objects of a scan."""
         return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
