@@ -119,7 +119,8 @@ def calibrate_prepared(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    result = with_causes(result, drives, guess, config)
+    if config.method not in _NO_LABELS:
+        result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -192,5 +193,7 @@ _METHODS: dict[Method, _Method] = {
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 """Methods whose camera velocity comes from visual odometry."""
+_NO_LABELS = ("edges",)
+"""Methods whose data nobody labelled, so that labels do not tell what is wrong."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

@@ -41,8 +41,9 @@ POINTS_A_SCAN = 1000
 """Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 """Scales of the kernel from a start that is a degree off [px]."""
-KERNELS_PX = (4.0, 3.0)
-"""From the best of the starts [px]."""
+KERNELS_PX = (4.0, 3.0, 2.0, 1.5, 1.2)
+"""From the best of the starts [px]. Pictures have edges beside the objects'; the last scale is below most of
+their distances."""
 SCORE_PX = 1.5
 """Blur under which solutions are compared [px]."""
 _ROLLS_DEG = (-1.6, -0.8, 0.8, 1.6)
@@ -54,6 +55,10 @@ _REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
 """The search covers so many sigmas to either side, and this at most [deg]."""
 _KNOWN_OFFSET_S = 0.03
 """Motion tells the time offset where its sigma is smaller than this [s]."""
+_OFFSETS_S = np.arange(-3, 4) * 0.1
+"""Time offsets around the guess that are tried where motion does not tell and the vehicle moves [s]."""
+_MOVING_MPS = 0.2
+"""Mean speed from which it counts as moving [m/s]: 100 ms are then 2 cm."""
 _MOTION_FLOOR = np.array([*np.radians([0.5] * 3), 0.1, 0.1, 0.1, 0.004])
 """(7,) sigmas added to motion's as a factor: odometry errs by this much in ways that its covariance leaves out
 [rad, m, s]."""
@@ -139,10 +144,11 @@ def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> 
         )
     drives = [thinned(drive, POINTS_A_SCAN) for drive in calibration.drives]
     joint = replace(calibration.joint(), drives=drives)
-    region = _region(guess, motion)
+    region = _region(guess, motion, _time_offsets(calibration, motion))
     translation = np.zeros(3) if guess.cTl is None else np.asarray(guess.cTl.translation())
     pose = gtsam.Pose3(region.cTl.rotation(), translation)
-    centre = State(pose, (region.time_offset_s,))
+    known = motion is not None and _tells_offset(motion)
+    centre = State(pose, (region.time_offsets_s[0] if known else guess.time_offset_s,))
     prior = _prior(centre, motion)
     whole = replace(joint, centre=centre, prior=prior)
     scans = [spread_evenly(len(drive.scans), SEARCH_SCANS) for drive in drives]
@@ -164,16 +170,34 @@ def thinned(drive: Drive, most: int) -> Drive:
     return replace(drive, scans=tuple(scans))
 
 
-def _region(guess: Guess, motion: MotionSolution | None) -> SearchRegion:
+def _tells_offset(motion: MotionSolution) -> bool:
+    return bool(np.sqrt(motion.covariance[6, 6]) < _KNOWN_OFFSET_S)
+
+
+def _time_offsets(calibration: CalibrationProblem, motion: MotionSolution | None) -> tuple[float, ...]:
+    """Time offsets at which starts are searched."""
+    guess = calibration.guess.time_offset_s
+    if motion is not None and _tells_offset(motion):
+        return (motion.state.time_offsets_s[0],)
+    speeds = [
+        float(np.linalg.norm(each.mean_twist[3:]))
+        for drive in calibration.drives
+        for each in drive.lidar_motions
+        if each.ok
+    ]
+    moving = bool(speeds) and float(np.mean(speeds)) > _MOVING_MPS
+    return tuple((guess + _OFFSETS_S).tolist()) if moving else (guess,)
+
+
+def _region(
+    guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[float, ...]
+) -> SearchRegion:
     """Guess and motion together; where one says nothing, what the other says."""
     if motion is None:
         assert guess.cTl is not None
         half = (_REACH_SIGMAS * _GUESS_SIGMA_DEG,) * 3
-        return SearchRegion(guess.cTl, guess.time_offset_s, half)
+        return SearchRegion(guess.cTl, time_offsets_s, half)
     known = KnownRotation(motion.state.cTl.rotation(), motion.covariance[:3, :3])
-    offset_s = guess.time_offset_s
-    if np.sqrt(motion.covariance[6, 6]) < _KNOWN_OFFSET_S:
-        offset_s = motion.state.time_offsets_s[0]
     # Both as Gaussians in the tangent space of the guess, or of motion alone.
     information = np.linalg.inv(known.covariance + np.radians(0.7) ** 2 * np.eye(3))
     middle = motion.state.cTl
@@ -188,7 +212,7 @@ def _region(guess: Guess, motion: MotionSolution | None) -> SearchRegion:
     R = middle.rotation().matrix()
     sigmas_deg = np.degrees(np.sqrt(np.diag(R @ covariance @ R.T)))
     half = tuple(np.minimum(_REACH_SIGMAS * sigmas_deg, _MOST_DEG).tolist())
-    return SearchRegion(middle, offset_s, (half[0], half[1], half[2]), known)
+    return SearchRegion(middle, time_offsets_s, (half[0], half[1], half[2]), known)
 
 
 def _prior(centre: State, motion: MotionSolution | None) -> gtsam.NonlinearFactor | None:

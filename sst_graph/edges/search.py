@@ -27,10 +27,10 @@ _POINTS = 4000
 """Boundary points, in all, that the poses are compared on."""
 _WIDTH_PX = 1242
 """Image width for which the blurs are given."""
-MODES = 5
+MODES = 6
 """Most starts that are returned."""
-APART_DEG = 0.8
-"""Starts are at least this far apart: nearer ones lead to one estimate [deg]."""
+APART_DEG, APART_S = 0.8, 0.05
+"""Starts are farther apart than one of these: nearer ones lead to one estimate [deg], [s]."""
 _VETO_CHI2 = 25.0
 """Chi-squared, of 3, of the difference from motion's rotation beyond which a pose is not tried."""
 MOTION_FLOOR_DEG = 0.7
@@ -57,13 +57,13 @@ class SearchRegion:
 
     Attributes:
         cTl: the pose in the middle.
-        time_offset_s: the time offset [s].
+        time_offsets_s: time offsets that are tried [s].
         half_deg: half widths (3,) of the rotations about the camera's axes [deg].
         motion: what motion alone says, where it says something.
     """
 
     cTl: gtsam.Pose3
-    time_offset_s: float
+    time_offsets_s: tuple[float, ...]
     half_deg: tuple[float, float, float]
     motion: KnownRotation | None = None
 
@@ -78,28 +78,47 @@ class EdgeStart:
 
 
 def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
-    """The best poses that are :data:`APART_DEG` apart, best first; none where nothing is in view."""
-    scale = edges.drive.camera.width / _WIDTH_PX
+    """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is in
+    view."""
     edges = edges.thinned(_POINTS)
-    rotations = _grid(region)
-    translation = np.asarray(region.cTl.translation())
-    scores = np.zeros(len(rotations))
-    for number, (blur_px, step, kept) in enumerate(_STAGES):
-        blurred = BlurredScore.of(edges, region.cTl, region.time_offset_s, scale * blur_px)
-        if blurred is None:
-            return []
-        if number:
-            rotations = _around(rotations, step * GRID_DEG)
-        rotations = _not_vetoed(rotations, region)
-        scores = blurred.scores(rotations, np.tile(translation, (len(rotations), 1)))
-        best = np.argsort(-scores)[:kept]
-        rotations, scores = rotations[best], scores[best]
+    first = _not_vetoed(_grid(region), region)
+    candidates = [(number, first) for number in range(len(region.time_offsets_s))]
+    found: list[tuple[float, int, FloatArray]] = []
+    for stage, (blur_px, step, kept) in enumerate(_STAGES):
+        found = []
+        for number, rotations in candidates:
+            if stage:
+                rotations = _not_vetoed(_around(rotations, step * GRID_DEG), region)
+            found += _scored(edges, region, number, rotations, blur_px)[:kept]
+        found = sorted(found, key=lambda one: -one[0])[:kept]
+        candidates = [
+            (number, np.stack([R for _, own, R in found if own == number]))
+            for number in sorted({own for _, own, _ in found})
+        ]
     starts: list[EdgeStart] = []
-    for R, each in zip(rotations, scores.tolist(), strict=True):
-        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), translation)
-        if all(angle_deg(pose, other.cTl) > APART_DEG for other in starts):
-            starts.append(EdgeStart(pose, region.time_offset_s, each))
+    for each, number, R in found:
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), region.cTl.translation())
+        start = EdgeStart(pose, region.time_offsets_s[number], each)
+        if all(_apart(start, other) for other in starts):
+            starts.append(start)
     return starts[:MODES]
+
+
+def _scored(
+    edges: DriveEdges, region: SearchRegion, number: int, rotations: FloatArray, blur_px: float
+) -> list[tuple[float, int, FloatArray]]:
+    """(score, number of the time offset, rotation (3, 3)) of rotations (m, 3, 3), best first."""
+    blur_px *= edges.drive.camera.width / _WIDTH_PX
+    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px)
+    if blurred is None:
+        return []
+    scores = blurred.scores(rotations, np.tile(region.cTl.translation(), (len(rotations), 1)))
+    return [(float(scores[k]), number, rotations[k]) for k in np.argsort(-scores).tolist()]
+
+
+def _apart(a: EdgeStart, b: EdgeStart) -> bool:
+    far = angle_deg(a.cTl, b.cTl) > APART_DEG
+    return far or abs(a.time_offset_s - b.time_offset_s) > APART_S
 
 
 def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
