@@ -18,6 +18,7 @@ from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
+from sst_graph.features.picture_gradients import PictureGradients
 from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
@@ -111,7 +112,8 @@ class ScanFeatures:
 class ImageFeatures:
     """Features of an image: its mask and the signed distance to each class's contour.
 
-    Of the picture, only its edges along the contours are kept.
+    Of the picture, only its edges along the contours are kept; its gradients, too, where objects without a
+    class are aligned.
     """
 
     stored_apart: ClassVar[bool] = True
@@ -119,7 +121,7 @@ class ImageFeatures:
     index: int
     stamp_ns: int
     mask: NDArray[np.uint8]
-    contours: dict[SemanticClass, ContourMap]
+    contours: dict[SemanticClass, ContourMap | PictureGradients]
 
     def stored_in(self, store: ArrayStore) -> ImageFeatures:
         """The same with mask and distances in an array store."""
@@ -128,7 +130,10 @@ class ImageFeatures:
 
     def __getstate__(self) -> dict[str, Any]:
         """The mask, packed, and the picture's edges, not the distances that follow from them."""
-        edges = {c: contour.edges for c, contour in self.contours.items()}
+        edges = {
+            c: contour.edges if isinstance(contour, ContourMap) else contour
+            for c, contour in self.contours.items()
+        }
         return {"index": self.index, "stamp_ns": self.stamp_ns, "mask": self.packed, "contours": edges}
 
     @cached_property
@@ -140,7 +145,10 @@ class ImageFeatures:
         mask = state["mask"]
         if isinstance(mask, PackedArray):
             mask = mask.array()
-        fields = {c: ContourMap.of(mask, c, edges=edges) for c, edges in state["contours"].items()}
+        fields = {
+            c: edges if isinstance(edges, PictureGradients) else ContourMap.of(mask, c, edges=edges)
+            for c, edges in state["contours"].items()
+        }
         contours = {c: field for c, field in fields.items() if field is not None}
         for name, value in {**state, "mask": mask, "contours": contours}.items():
             object.__setattr__(self, name, value)
@@ -398,6 +406,14 @@ def image_features(
 ) -> ImageFeatures:
     """Mask and contours of an image; ``use_picture``: the contours follow its picture."""
     picture = image.pixels if use_picture else None
-    fields = {c: ContourMap.of(image.mask, c, picture, valid=image.valid) for c in classes}
-    contours = {c: field for c, field in fields.items() if field is not None}
+    fields = {
+        c: ContourMap.of(image.mask, c, picture, valid=image.valid)
+        for c in classes
+        if c != SemanticClass.OBJECT
+    }
+    contours: dict[SemanticClass, ContourMap | PictureGradients] = {
+        c: field for c, field in fields.items() if field is not None
+    }
+    if SemanticClass.OBJECT in classes and image.has_picture:
+        contours[SemanticClass.OBJECT] = PictureGradients.of(image.pixels, image.valid)
     return ImageFeatures(index, image.stamp_ns, image.mask, contours)

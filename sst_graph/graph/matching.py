@@ -177,6 +177,16 @@ class Tracks:
             other._dynamic = [{place[scan]: own for scan, own in moving.items() if scan in place}]
         return other
 
+    @classmethod
+    def joined(cls, parts: Sequence[Tracks]) -> Tracks:
+        """The tracks of several drives, each given by itself."""
+        other = cls([])
+        other._tracks = [track for part in parts for track in part._tracks]
+        if all(part.objects is not None for part in parts):
+            other.objects = [own for part in parts for own in part.objects or ()]
+            other._dynamic = [own for part in parts for own in part._dynamic]
+        return other
+
     def dynamic_objects(self, drive: int, scan: int) -> DynamicObjects:
         """The dynamic objects of a scan."""
         return self._dynamic[drive].get(scan, {}) if self._dynamic else {}
@@ -284,6 +294,42 @@ class DriveEdges:
     def match(self, state: State, kernel: RobustKernel) -> DriveMatches | None:
         """Pair scans with images in true time under a state, and match their silhouettes; None without."""
         drive, time_offset_s = self.drive, state.time_offset_s(self.number)
+        # 1. The points, and the images that they are compared with.
+        at = self._at(state)
+        if at is None:
+            return None
+        paired, group_pairs = at.paired, at.group_pairs
+        # 2. Match them.
+        scene = at.motions.scene(drive, paired.repeated(group_pairs))
+        deviation = deviation_of(state.nuisances, scene)
+        found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
+        if len(found.index) == 0:
+            return None
+        if at.shares is not None and not (at.shares == 1.0).all():
+            weights = at.shares[found.index] * found.alignment.weights
+            found = replace(found, alignment=replace(found.alignment, weights=weights))
+        firsts = paired.bounds[:-1]
+        return DriveMatches(
+            self,
+            at.pairs,
+            at.motions,
+            found,
+            np.array(group_pairs),
+            [self.classes[g] for g in at.groups],
+            at.index[found.index],
+            found.index - np.repeat(firsts, np.diff(found.bounds)),
+            state.cTl,
+            time_offset_s,
+        )
+
+    def paired(self, state: State) -> PairedEdges | None:
+        """The points with their images in true time under a state, without those whose objects move in an
+        unknown way; None without any."""
+        at = self._at(state)
+        return None if at is None else at.paired
+
+    def _at(self, state: State) -> _PairedAtState | None:
+        drive, time_offset_s = self.drive, state.time_offset_s(self.number)
         pairs = self.pairs(time_offset_s)
         # 1. The groups that have an image, and in it a contour of their class; once for each image.
         numbers: dict[int, list[int]] = {}
@@ -297,7 +343,6 @@ class DriveEdges:
         ]
         if not groups:
             return None
-        chosen = np.array([g for g, _ in groups])
         # 2. The motion around the images.
         motions = _Motions.of(self, pairs, state)
         # 3. The points, without the objects whose weight is 0.
@@ -309,28 +354,8 @@ class DriveEdges:
             if not shares.all():
                 kept = np.flatnonzero(shares)
                 paired, index, shares = paired.take(kept), index[kept], shares[kept]
-        # 4. Match them.
-        scene = motions.scene(drive, paired.repeated([p for _, p in groups]))
-        deviation = deviation_of(state.nuisances, scene)
-        found = match_edges(paired, state.cTl, time_offset_s, kernel, self.config, deviation)
-        if len(found.index) == 0:
-            return None
-        if shares is not None and not (shares == 1.0).all():
-            weights = shares[found.index] * found.alignment.weights
-            found = replace(found, alignment=replace(found.alignment, weights=weights))
-        firsts = paired.bounds[:-1]
-        return DriveMatches(
-            self,
-            pairs,
-            motions,
-            found,
-            np.array([p for _, p in groups]),
-            [self.classes[g] for g in chosen.tolist()],
-            index[found.index],
-            found.index - np.repeat(firsts, np.diff(found.bounds)),
-            state.cTl,
-            time_offset_s,
-        )
+        chosen, group_pairs = [g for g, _ in groups], [p for _, p in groups]
+        return _PairedAtState(pairs, chosen, group_pairs, motions, paired, index, shares)
 
     def pairs(self, time_offset_s: float) -> list[Pair]:
         """Scans and images that belong together in true time under an offset."""
@@ -416,6 +441,29 @@ class _Motions:
         """What assumptions depend on, of some of the pairs."""
         since_s = self.since_s[of]
         return Scene(drive.camera, self.measured[of], since_s, drive.scan_period_s)
+
+
+@dataclass(frozen=True)
+class _PairedAtState:
+    """A drive's points and the images that they are compared with under a state.
+
+    Attributes:
+        pairs: all pairs of scan and image.
+        groups: the groups that have an image, and
+        group_pairs: the pair of each.
+        motions: around the images.
+        paired: the points of these groups.
+        index: (n,) which of the drive's points each is.
+        shares: (n,) of the weight that its object's motion leaves each point, or None where all are static.
+    """
+
+    pairs: Sequence[Pair]
+    groups: list[int]
+    group_pairs: list[int]
+    motions: _Motions
+    paired: PairedEdges
+    index: IntArray
+    shares: FloatArray | None
 
 
 @dataclass(frozen=True)
