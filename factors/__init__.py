@@ -58,6 +58,7 @@ if TYPE_CHECKING:
     from .between import Between
     from .camera import MIN_DEPTH_M, PinholeCamera
     from .camera_motion import camera_motion_factor
+    from .camera_pose import camera_pose_factor
     from .condensed import condense
     from .custom.cloning import PackedGraph, clone_factor, clone_graph, rekeyed
     from .custom.factor import FactorRecipe, custom_factor, recipe_of
@@ -110,6 +111,7 @@ __all__ = [
     "alignment_cost",
     "beta_regularizer",
     "camera_motion_factor",
+    "camera_pose_factor",
     "check_gradient",
     "check_jacobians",
     "clone_factor",
@@ -149,6 +151,7 @@ _MODULES = {
     "between": "Between",
     "camera": "MIN_DEPTH_M PinholeCamera",
     "camera_motion": "camera_motion_factor",
+    "camera_pose": "camera_pose_factor",
     "condensed": "condense",
     "custom.cloning": "PackedGraph clone_factor clone_graph rekeyed",
     "custom.factor": "FactorRecipe custom_factor recipe_of",

@@ -86,11 +86,12 @@ class NoiseScales:
 
 
 def camera_steps(drives: Sequence[Drive]) -> list[CameraStep]:
-    """The camera's motion between consecutive images of all drives, where at least its rotation is known."""
+    """The camera's motion between tracked images of all drives, where at least its rotation is known."""
+    indices = [{image.stamp_ns: image.index for image in drive.images} for drive in drives]
     return [
-        CameraStep(number, image.index, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
+        CameraStep(number, indices[number][tracks.from_ns], tracks.from_ns, tracks.to_ns, pair.direction)
         for number, drive in enumerate(drives)
-        for image, pair in zip(drive.images, drive.image_pairs, strict=False)
+        for pair, tracks in ((pair, pair.tracks) for pair in drive.image_pairs)
         if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * MAX_ROTATION_SIGMA_RAD**2
     ]
 
