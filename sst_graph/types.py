@@ -58,7 +58,8 @@ def _value(item: Any) -> Hashable:
 class SemanticClass(IntEnum):
     """Canonical classes that both sensors' labels are mapped to.
 
-    ``OTHER`` is known to be none of the named classes (background); ``IGNORE`` may be anything.
+    ``OTHER`` is known to be none of the named classes (background); ``IGNORE`` may be anything. ``OBJECT`` is
+    what stands on the ground, of no known class: found by geometry, in no label of any data set.
     """
 
     OTHER = 0
@@ -73,6 +74,7 @@ class SemanticClass(IntEnum):
     TERRAIN = 9
     FENCE = 10
     SIGN = 11
+    OBJECT = 12
     IGNORE = 255
 
 

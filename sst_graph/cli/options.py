@@ -116,6 +116,9 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument(
         "--rolling", action="store_true", default=None, help="measure each point at its own time"
     )
+    simulate.add_argument(
+        "--stereo", action="store_true", help="write image_3 and semantic_3 as well, 0.53 m to the right"
+    )
     _add_settings(simulate)
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier drive in OUT")
     return simulate
@@ -130,9 +133,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         f"y down, z forward), {SIGN}. Several drives share one extrinsic.",
     )
     calibrate.add_argument(
-        "data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder, or a bag"
+        "data", metavar="DATA", type=Path, nargs="*", help="dataset or sequence folder, or a bag"
     )
-    _add_source_options(calibrate)
+    _add_source_options(calibrate, several_cameras=True)
     _add_label_options(calibrate)
     calibrate.add_argument(
         "--method",
@@ -159,6 +162,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)
+    _add_rig(calibrate)
     calibrate.add_argument(
         "--out",
         type=Path,
@@ -168,6 +172,25 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
+
+
+def _add_rig(command: _Parser) -> None:
+    """What is known of several cameras."""
+    rig = command.add_argument_group("several cameras (docs/rigs.md)")
+    rig.add_argument(
+        "--rig",
+        metavar="dataset|FILE",
+        help="known poses between the cameras: those of the data's nominal calibration, or of Kalibr's "
+        "camchain.yaml (T_cn_cnm1) or KITTI's calib.txt",
+    )
+    rig.add_argument(
+        "--rig-sigma",
+        metavar="DEG,CM",
+        help="how well these are known, one sigma along each axis (default 0.03,0.2)",
+    )
+    rig.add_argument(
+        "--one-trigger", action="store_true", help="all cameras are triggered together: one time offset"
+    )
 
 
 def _add_estimate(command: _Parser) -> None:
@@ -400,7 +423,7 @@ SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
 None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
 
 
-def _add_source_options(command: argparse.ArgumentParser) -> None:
+def _add_source_options(command: argparse.ArgumentParser, several_cameras: bool = False) -> None:
     """How a drive is read."""
     source = command.add_argument_group("data")
     source.add_argument(
@@ -409,7 +432,11 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     )
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
-    source.add_argument("--camera", help=f"camera folder (default {SOURCE_DEFAULTS['camera']})")
+    named = f"camera folder, nuScenes channel or image topic (default {SOURCE_DEFAULTS['camera']})"
+    if several_cameras:
+        source.add_argument("--camera", nargs="+", metavar="NAME", help=f"{named}; several: a rig")
+    else:
+        source.add_argument("--camera", metavar="NAME", help=named)
     source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
     source.add_argument(
         "--image-shift",

@@ -32,6 +32,7 @@ from sst_graph.data.kitti.odometry_layout import (
     LAYOUT,
     FrameCounts,
     KittiFiles,
+    check_camera,
     find_files,
     find_sequence,
     image_times_path,
@@ -232,6 +233,7 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
         ConfigError: no such sequence, camera or range of frames.
     """
     folder = find_sequence(path, options.sequence)
+    check_camera(folder, options.camera)
     calibration = read_calibration(folder / "calib.txt")
     nominal = calibration.cTl(options.camera)
     stamps_ns = read_times(folder / "times.txt")

@@ -8,6 +8,7 @@ unpickled.
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -24,7 +25,17 @@ _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
 _MAX_HEADER = 10_000
 _COLUMNS = ("x", "y", "z", "intensity")
-_BROKEN = (ValueError, EOFError, OSError, KeyError, TypeError, SyntaxError, zipfile.BadZipFile, zlib.error)
+_BROKEN = (
+    ValueError,
+    EOFError,
+    OSError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def read_bin(data: bytes, path: Path) -> Cloud:
