@@ -58,7 +58,8 @@ def _value(item: Any) -> Hashable:
 class SemanticClass(IntEnum):
     """Canonical classes that both sensors' labels are mapped to.
 
-    ``OTHER`` is known to be none of the named classes (background); ``IGNORE`` may be anything.
+    ``OTHER`` is known to be none of the named classes (background); ``IGNORE`` may be anything. ``OBJECT`` is
+    what stands on the ground, of no known class: found by geometry, in no label of any data set.
     """
 
     OTHER = 0
@@ -73,6 +74,7 @@ class SemanticClass(IntEnum):
     TERRAIN = 9
     FENCE = 10
     SIGN = 11
+    OBJECT = 12
     IGNORE = 255
 
 
@@ -89,6 +91,8 @@ class Scan(ByValue):
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
         left_out: number of further points in the data, which were NaN or inf.
+        intensities: (n,) float32 strength of the return, in the data's own unit, or None where the data have
+            none; only networks use it.
     """
 
     stamp_ns: int
@@ -98,6 +102,7 @@ class Scan(ByValue):
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     left_out: int = 0
+    intensities: NDArray[np.float32] | None = None
 
     @property
     def has_labels(self) -> bool:

@@ -23,10 +23,11 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import move_points, moved_pose
+from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
-from sst_graph.features.mask_contour import ContourMap, nearest_contours
+from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours
+from sst_graph.features.picture_gradients import PictureGradients, nearest_edges
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -74,14 +75,6 @@ degrees are other edges."""
 MIN_OBJECT_SHARE = 0.1
 """Least fraction of an object's boundary points in view that must have a match. An object that the image's
 labels miss crosses contours of others in a few places only."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Camera motion around one image: twist at its instant and the twist's rate of change, (6,) each."""
-
-    c_twist: FloatArray
-    c_acceleration: FloatArray
 
 
 class PointDeviation(Protocol):
@@ -132,7 +125,7 @@ class PairedEdges:
         points: of all groups, one group after the other.
         owners: (n,) number of the object of each point, counted over all groups.
         bounds: (g + 1,) where each group begins, and the end.
-        contours: of each group's class in its image.
+        contours: of each group's class in its image; for objects without a class the picture's gradients.
         motions: the camera's around each group's image.
         base_taus_s: (n,) stamp of the image minus the time of the point [s].
         biases_px: (g,) mask bias of each group's class [px].
@@ -144,8 +137,8 @@ class PairedEdges:
     points: Boundaries
     owners: IntArray
     bounds: IntArray
-    contours: Sequence[ContourMap]
-    motions: Sequence[Motion]
+    contours: Sequence[ContourMap | PictureGradients]
+    motions: Sequence[CameraTwist]
     base_taus_s: FloatArray
     biases_px: FloatArray
     velocities: FloatArray | None = None
@@ -171,21 +164,25 @@ class PairedEdges:
     def projected(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
         """(n, 2) pixels of points (n, 3) of the groups, moved to their images' instant; NaN behind the
         camera."""
+        return self.camera.project(self.moved(lPs, cTl, time_offset_s))
+
+    def moved(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
+        """(n, 3) points (n, 3) of the groups at their images' instant, in the camera [m]."""
         columns, taus = np.ascontiguousarray(lPs.T), time_offset_s + self.base_taus_s
         if self.velocities is not None:
             columns = columns + taus * self.velocities.T
         groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
         starts = [a for a, _, _ in groups]
         if not all((taus[a:b] == taus[a]).all() for a, b, _ in groups):
-            twists, accelerations = (self.repeated(each).T for each in self._motion_rows())
-            return self.camera.project(move_points(cTl, columns, taus, twists, accelerations).cPs.T)
+            each = CameraTwist(*(self.repeated(rows).T for rows in self._motion_rows()))
+            return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
         # Every group moves as one rigid body.
         cPs = np.empty_like(columns)
         for (a, b, motion), tau_s in zip(groups, taus[starts].tolist(), strict=True):
-            moved = moved_pose(cTl, tau_s, motion.c_twist, motion.c_acceleration)
+            moved = moved_pose(cTl, tau_s, motion)
             np.matmul(moved.rotation().matrix(), columns[:, a:b], out=cPs[:, a:b])
             cPs[:, a:b] += np.asarray(moved.translation()).reshape(3, 1)
-        return self.camera.project(cPs.T)
+        return cPs.T
 
     def accelerations(self) -> FloatArray:
         """(6,) where all groups share it, else (n, 6): of each point's image [rad/s^2, m/s^2]."""
@@ -240,10 +237,10 @@ class ScanWithImage:
     """
 
     boundaries: Mapping[SemanticClass, Boundaries]
-    contours: Mapping[SemanticClass, ContourMap]
+    contours: Mapping[SemanticClass, ContourMap | PictureGradients]
     camera: PinholeCamera
     base_tau_s: float
-    motion: Motion
+    motion: CameraTwist
     velocities: Mapping[SemanticClass, FloatArray] | None = None
 
 
@@ -333,7 +330,13 @@ def match_edges(
     paired, uvs = paired.take(index), uvs[index]
     seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
     # 2. Find the nearest contours within the gate.
-    feet = nearest_contours(paired.contours, paired.spans, uvs)
+    if any(isinstance(contour, PictureGradients) for contour in paired.contours):
+        tips = paired.projected(paired.points.outward, cTl, time_offset_s)
+        feet, shares = _contours_or_gradients(
+            paired, uvs, tips - (uvs if shift is None else ideal[index]), kernel
+        )
+    else:
+        feet, shares = nearest_contours(paired.contours, paired.spans, uvs), None
     residuals = feet.distances + paired.repeated(paired.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
     paired, uvs, index = paired.take(near), uvs[near], index[near]
@@ -353,6 +356,9 @@ def match_edges(
     paired, index = paired.take(on), index[on]
     sigmas = match_sigmas(length[on], cosine[on], config)
     sides = sides_of(paired.points.edges, outward[on, 0])
+    weights = side_weights(paired.owners, sides, sigmas, config)
+    if shares is not None:
+        weights = weights * shares[near][on]
     alignment = Alignment(
         camera=paired.camera,
         lPs=paired.points.lPs,
@@ -362,10 +368,52 @@ def match_edges(
         normals=normals[on],
         kernel=kernel,
         c_acceleration=paired.accelerations(),
-        weights=side_weights(paired.owners, sides, sigmas, config),
+        weights=weights,
         l_velocities=paired.velocities,
     )
     return EdgeMatches(index, sides, alignment, paired.bounds, seen)
+
+
+def _contours_or_gradients(
+    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel
+) -> tuple[ContourFeet, FloatArray]:
+    """Contours of masks for the groups that have one, edges of the picture for the others.
+
+    Args:
+        ways: (n, 2) outward in the image, of any length [px].
+
+    Returns:
+        The contours, and (n,) the share of its full weight that each has.
+    """
+    n, biases = len(uvs), paired.repeated(paired.biases_px)
+    by_gradient = paired.repeated([isinstance(each, PictureGradients) for each in paired.contours]).astype(
+        bool
+    )
+    distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
+    normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
+    masked, unmasked = np.flatnonzero(~by_gradient), np.flatnonzero(by_gradient)
+    for index in (masked, unmasked):
+        some = paired.take(index)
+        groups = [
+            (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
+        ]
+        if not groups:
+            continue
+        spans, own = [span for _, span in groups], uvs[index]
+        if index is masked:
+            maps = [each for each, _ in groups if isinstance(each, ContourMap)]
+            found = nearest_contours(maps, spans, own)
+            distances[index] = found.distances
+        else:
+            pictures = [each for each, _ in groups if isinstance(each, PictureGradients)]
+            outward = ways[index] / np.maximum(np.linalg.norm(ways[index], axis=1), 1e-9)[:, None]
+            # The window is where the residual is 0.
+            bias = biases[index]
+            edges = nearest_edges(pictures, spans, own + bias[:, None] * outward, outward, kernel.scale)
+            found, shares[index] = edges, np.maximum(edges.shares, 1e-3)
+            distances[index] = edges.distances - bias
+        normals[index], feet[index], valid[index] = found.normals, found.feet, found.valid
+    return ContourFeet(distances, normals, feet, valid), shares
 
 
 def _deviated(paired: PairedEdges, deviation: PointDeviation, uvs: FloatArray) -> PairedEdges:

@@ -13,6 +13,7 @@ from sst_graph.batch.baselines import paper_method, semalign_method, static_meth
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
+from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
     joint_diagnostics,
     joint_reasons,
@@ -34,11 +35,12 @@ from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutc
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
+from sst_graph.drive.geometric_labels import GeometricallyLabelled
 from sst_graph.drive.preparation import Drive, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Source
+from sst_graph.types import SemanticClass, Source
 
 
 def calibrate(
@@ -87,11 +89,16 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
+    if config.method not in _NEED_DEPTH:
+        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
+    classes = config.classes
+    if config.method == "edges":
+        sources, classes = [GeometricallyLabelled(source) for source in sources], (SemanticClass.OBJECT,)
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
-        prepare_drive(source, config.classes, prepare, progress, depth, with_lower_edges)
+        prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
 
@@ -123,7 +130,8 @@ def finished(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    result = with_causes(result, drives, guess, config)
+    if config.method not in _NO_LABELS:
+        result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -198,8 +206,14 @@ _METHODS: dict[Method, _Method] = {
     "static": static_method,
     "semalign": semalign_method,
     "motion": motion_method,
+    "edges": edges_method,
 }
-_NEED_IMAGE_TRACKS = ("paper", "static", "motion")
+_NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 """Methods whose camera velocity comes from visual odometry."""
+_TRACK_INTERVAL_S = 0.07
+"""Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
+known as well after 33 ms as after 100 ms, the rate of turn is not."""
+_NO_LABELS = ("edges",)
+"""Methods whose data nobody labelled, so that labels do not tell what is wrong."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

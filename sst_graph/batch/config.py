@@ -18,7 +18,7 @@ from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.odometry.lidar import LidarOdometryConfig
 from sst_graph.types import SemanticClass
 
-Method = Literal["joint", "paper", "static", "semalign", "motion"]
+Method = Literal["joint", "paper", "static", "semalign", "motion", "edges"]
 UseMotion = Literal["auto", "always", "never"]
 UseLowerEdges = Literal["auto", "always", "never"]
 

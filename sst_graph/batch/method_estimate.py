@@ -158,10 +158,8 @@ def _jumps(drives: Sequence[Drive]) -> list[str]:
 
 def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:
     """The scans of a joint solution's pairs."""
-    return tuple(
-        FrameId(drives[pair.drive].name, drives[pair.drive].scans[pair.pair.scan].index)
-        for pair in solution.pairs
-    )
+    scans = dict.fromkeys((pair.drive, pair.pair.scan) for pair in solution.pairs)
+    return tuple(FrameId(drives[drive].name, drives[drive].scans[scan].index) for drive, scan in scans)
 
 
 def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray) -> tuple[DriveOffset, ...]:

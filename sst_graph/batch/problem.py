@@ -62,6 +62,7 @@ class CalibrationProblem:
     ) -> CalibrationProblem:
         """The problem with objects tracked."""
         config = config.estimating
+        config = replace(config, noise=replace(config.noise, every_image=True))
         objects = [object_tracks(drive) for drive in drives]
         by_object = config.noise.object_bias_sigma_px > 0.0
         tracks = Tracks(drives, objects if by_object else None)

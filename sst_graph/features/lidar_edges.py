@@ -26,6 +26,9 @@ IntArray = NDArray[np.intp]
 
 _BEHIND_M = 0.5
 """The neighbour has to be farther by this much: less is the object's own relief [m]."""
+_JUMP_M = 0.25
+"""The same on objects without a class, of which every near side of a jump counts, on the object's own parts
+too [m]."""
 _MAX_STEPS = 1.6
 """Largest azimuth gap between neighbours, in beam steps: one missing return ends the line."""
 _MAX_ELEVATION_GAP = np.radians(0.9)
@@ -130,15 +133,31 @@ def find_boundaries(
     for c in present:
         mask = members[c]
         objects = split_objects(points, mask, instances, _MIN_POINTS)
+        seen = _Seen(mask, np.zeros_like(mask), _JUMP_M) if c == SemanticClass.OBJECT else _Seen(mask, mask)
         parts = [
-            _side_edges(points, mask, beams, +1),
-            _side_edges(points, mask, beams, -1),
-            _ring_edges(points, mask, beams, roofs=c == SemanticClass.VEHICLE),
+            _side_edges(points, seen, beams, +1),
+            _side_edges(points, seen, beams, -1),
+            _ring_edges(points, seen, beams, roofs=c == SemanticClass.VEHICLE),
         ]
-        if with_lower_edges:
-            parts.append(_ring_edges(points, mask, beams, _ground_heights(points, objects)))
+        if with_lower_edges and c != SemanticClass.OBJECT:
+            parts.append(_ring_edges(points, seen, beams, _ground_heights(points, objects)))
         found[c] = _collect(parts, offsets, objects, max_range_m)
     return {c: b for c, b in found.items() if len(b)}
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Where edges may lie.
+
+    Attributes:
+        mask: (n,) points that may be the last before an edge.
+        inner: (n,) points that are never behind one.
+        behind_m: least step in range across an edge [m].
+    """
+
+    mask: NDArray[np.bool_]
+    inner: NDArray[np.bool_]
+    behind_m: float = _BEHIND_M
 
 
 @dataclass(frozen=True)
@@ -151,14 +170,15 @@ class _Edges:
     edge: Edge
 
 
-def _side_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, side: int) -> _Edges:
+def _side_edges(points: FloatArray, seen: _Seen, beams: Beams, side: int) -> _Edges:
     """Edges towards rising (side = 1) or falling azimuth, half a beam step from the last return.
 
     The half step, not the middle of the two azimuths: a laser mounted off the axis shows a near and a
     far return of neighbouring firings under azimuths that differ by more, or less, than the step.
     """
-    member = mask[beams.order]
-    here, there = (member[:-1], member[1:]) if side > 0 else (member[1:], member[:-1])
+    mask = seen.mask
+    member, inner = mask[beams.order], seen.inner[beams.order]
+    here, there = (member[:-1], inner[1:]) if side > 0 else (member[1:], inner[:-1])
     # Few points are the last of a class: all that follows is computed for these alone.
     place = np.flatnonzero(here & ~there) + (side < 0)
     last, following = beams.order[place], beams.order[place + side]
@@ -166,7 +186,7 @@ def _side_edges(points: FloatArray, mask: NDArray[np.bool_], beams: Beams, side:
     gap = side * (beams.azimuth[following] - beams.azimuth[last])
     parallax = 0.04 * np.abs(1.0 / beams.rho[last] - 1.0 / beams.rho[following])
     ok = (beams.ring[last] == beams.ring[following]) & (gap < _MAX_STEPS * beams.step + parallax)
-    ok &= _is_behind(beams.rho, last, following)
+    ok &= _is_behind(beams.rho, last, following, seen.behind_m)
     last, before = last[ok], before[ok]
     steps = side * (beams.azimuth[last] - beams.azimuth[before])
     known = mask[before] & (beams.ring[before] == beams.ring[last]) & (steps > 0.0)
@@ -201,7 +221,7 @@ def _turn(points: FloatArray, angle: float) -> FloatArray:
 
 def _ring_edges(
     points: FloatArray,
-    mask: NDArray[np.bool_],
+    seen: _Seen,
     beams: Beams,
     ground: FloatArray | None = None,
     roofs: bool = False,
@@ -217,13 +237,14 @@ def _ring_edges(
     Args:
         roofs: whether objects of the class have one: seen from above, they end at its far end.
     """
+    mask = seen.mask
     up = 1 if ground is None else -1
     ring = beams.ring + up
     i = np.flatnonzero(mask & (ring >= 0) & (ring < len(beams.height)))
     following, near = _nearest_in_ring(beams, i, ring[i])
-    ok = near & ~mask[following]
+    ok = near & ~seen.inner[following]
     if ground is None:
-        ok &= _is_behind(beams.rho, i, following)
+        ok &= _is_behind(beams.rho, i, following, seen.behind_m)
     else:
         ok &= points[following, 2] < ground[i] + _GROUND_MARGIN_M
     i, following = i[ok], following[ok]
@@ -300,8 +321,8 @@ def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[Int
     return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < beams.step)
 
 
-def _is_behind(rho: FloatArray, last: IntArray, following: IntArray) -> NDArray[np.bool_]:
-    return np.asarray(rho[following] > rho[last] + _BEHIND_M)
+def _is_behind(rho: FloatArray, last: IntArray, following: IntArray, behind_m: float) -> NDArray[np.bool_]:
+    return np.asarray(rho[following] > rho[last] + behind_m)
 
 
 def _collect(

@@ -269,7 +269,9 @@ class PoseBatch:
         ends = [*starts[1:].tolist(), len(order)]
         spans = list(zip(starts.tolist(), ends, strict=True))
         known = [
-            (contour, a, b) for contour, (a, b) in zip(contours, spans, strict=True) if contour is not None
+            (contour, a, b)
+            for contour, (a, b) in zip(contours, spans, strict=True)
+            if isinstance(contour, ContourMap)
         ]
         some = np.concatenate([order[:0], *(order[a:b] for _, a, b in known)])
         if len(some):

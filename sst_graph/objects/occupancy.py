@@ -42,6 +42,8 @@ _SPEED_MPS = 0.6
 """Assumed speed of an object half way between the two shares [m/s]."""
 _MAX_SPEED_MPS = 30.0
 """Assumed speed of an object below the smaller share [m/s]."""
+TESTED_CLASSES = (*MOVABLE_CLASSES, SemanticClass.OBJECT)
+"""Classes of objects that may move. Odometry registers OBJECT, which is most of what stands still, too."""
 _RAISED = ~np.isin(np.arange(256), (SemanticClass.GROUND, SemanticClass.TERRAIN))
 """Whether a label is anything but ground."""
 
@@ -140,7 +142,7 @@ class _Places:
     def of(cls, scan: ScanFeatures, wTl: gtsam.Pose3) -> _Places:
         names: list[ObjectName] = []
         outlines, trees = {}, {}
-        for c in [c for c in MOVABLE_CLASSES if c in scan.boundaries]:
+        for c in [c for c in TESTED_CLASSES if c in scan.boundaries]:
             edges = [scan.boundaries[c], *([scan.lower_edges[c]] if c in scan.lower_edges else [])]
             lPs = np.concatenate([part.lPs for part in edges])
             objects = np.concatenate([part.objects for part in edges])

@@ -18,8 +18,7 @@ from scipy.spatial.distance import cdist
 
 from sst_graph.drive.preparation import ScanFeatures
 from sst_graph.features.lidar_edges import Boundaries, Edge
-from sst_graph.objects.occupancy import ObjectName
-from sst_graph.odometry.lidar import MOVABLE_CLASSES
+from sst_graph.objects.occupancy import TESTED_CLASSES, ObjectName
 from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -213,7 +212,7 @@ class _ScanOutlines:
     @classmethod
     def of(cls, scan: ScanFeatures, tracks: Mapping[ObjectName, int], wTl: gtsam.Pose3) -> _ScanOutlines:
         outlines = {}
-        for c in MOVABLE_CLASSES:
+        for c in TESTED_CLASSES:
             if (points := scan.boundaries.get(c)) is None:
                 continue
             points = points.take(np.flatnonzero(points.edges == Edge.SIDE))

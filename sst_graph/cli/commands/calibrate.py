@@ -11,6 +11,7 @@ import gtsam
 
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, exit_code, write_calibration
 from sst_graph.cli.progress import ProgressBar
@@ -38,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
     with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
         read_as = options_of(args)
         sources = open_drives(args)
+        if config.method != "motion":
+            check_classes(sources, config.classes, args.classes)
         warn_of_other_pairs(args.init, read_as)
         initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
         result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)

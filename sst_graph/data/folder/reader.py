@@ -81,7 +81,7 @@ class CloudFiles:
             offsets_s = self.timing.offsets_s(points[used])
         elif self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
             offsets_s = times[used]
-        rings = cloud.rings()
+        rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
         return Scan(
             stamp_ns=stamp_ns,
@@ -91,6 +91,7 @@ class CloudFiles:
             offsets_s=offsets_s,
             rings=rings_from_order(points) if rings is None else rings[used],
             left_out=len(used) - len(points),
+            intensities=None if intensities is None else intensities[used],
         )
 
     def _labels(
@@ -135,7 +136,8 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         return pictures.image(k, int(images.stamps_ns[k]))
 
     properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
-    of_scans, of_images = Sensor(clouds.stamps_ns, scans.scan), Sensor(images.stamps_ns, image)
+    of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
+    of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 

@@ -182,7 +182,7 @@ class KittiSource:
     def scan(self, index: int) -> Scan:
         """Scan of an index that has one; errors as of the frame."""
         path = self.files.scans[index]
-        points = read_points(path)
+        points, intensities = read_points(path)
         # Beams without a return come as NaN from many drivers.
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = point_labels(self.files.labels.get(index), used)
@@ -196,6 +196,7 @@ class KittiSource:
             offsets_s=None if offsets_s is None else offsets_s[used],
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
+            intensities=intensities[used],
         )
 
     def _offsets(

@@ -1,0 +1,308 @@
+"""``--method edges``: LiDAR edges against gradients of the pictures, in the joint method's graph; no labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.edges_covariance import edges_covariance
+from sst_graph.batch.edges_reasons import EdgeContrast, edge_contrast, edges_reasons
+from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
+from sst_graph.batch.motion_factor import gaussian_factor
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.edges.agreement import score
+from sst_graph.edges.search import (
+    KnownRotation,
+    SearchRegion,
+    angle_deg,
+    edge_starts,
+    spread_evenly,
+    turned,
+)
+from sst_graph.errors import EstimationError
+from sst_graph.graph.building import Tracks
+from sst_graph.graph.matching import DriveEdges, edges_of
+from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
+
+FloatArray = NDArray[np.float64]
+
+SEARCH_SCANS = 12
+"""Scans of each drive that starts are compared on."""
+POINTS_A_SCAN = 1000
+"""Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
+START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
+"""Scales of the kernel from a start that is a degree off [px]."""
+KERNELS_PX = (4.0, 3.0, 2.0, 1.5, 1.2)
+"""From the best of the starts [px]. Pictures have edges beside the objects'; the last scale is below most of
+their distances."""
+SCORE_PX = 1.5
+"""Blur under which solutions are compared [px]."""
+_ROLLS_DEG = (-1.6, -0.8, 0.8, 1.6)
+"""Turns about the camera's axis from which the estimate is tried again: the weakest direction of a street, in
+which false optima lie close by [deg]."""
+_GUESS_SIGMA_DEG = 3.5
+"""Sigma, by axis, of the rotation of a guess that starts are searched around [deg]."""
+_REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
+"""The search covers so many sigmas to either side, and this at most [deg]."""
+_KNOWN_OFFSET_S = 0.03
+"""Motion tells the time offset where its sigma is smaller than this [s]."""
+_OFFSETS_S = np.arange(-3, 4) * 0.1
+"""Time offsets around the guess that are tried where motion does not tell and the vehicle moves [s]."""
+_MOVING_MPS = 0.2
+"""Mean speed from which it counts as moving [m/s]: 100 ms are then 2 cm."""
+_MOTION_FLOOR = np.array([*np.radians([0.5] * 3), 0.1, 0.1, 0.1, 0.004])
+"""(7,) sigmas added to motion's as a factor: odometry errs by this much in ways that its covariance leaves out
+[rad, m, s]."""
+_TRANSLATION_SIGMA_M = 0.1
+"""Prior sigma of the translation around the guess: unbounded, weak scenes run away along the road [m]."""
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Drives to be calibrated by edges.
+
+    Attributes:
+        whole: all scans, with no more points than are needed.
+        some: a few scans of each drive.
+        region: where starts are searched.
+        centre: what the weak priors are centred on.
+        motion: what motion alone says, or None.
+    """
+
+    whole: JointProblem
+    some: JointProblem
+    region: SearchRegion
+    centre: State
+    motion: MotionSolution | None
+
+
+def edges_method(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> MethodEstimate:
+    """Extrinsic and time offset from edges; drives are prepared with geometric labels.
+
+    Raises:
+        EstimationError: no start: neither a guess nor motion, or nothing in view.
+    """
+    # 1. What motion says, before any edge is compared.
+    motion = _motion_alone(drives, guess, config, progress)
+    calibration = CalibrationProblem.of(drives, guess, config, progress)
+    problem = _problem(calibration, motion)
+    # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
+    candidates = _refined(problem, _starts(problem))
+    # 3. All frames, from the best, and from turns about the camera's axis.
+    solution = _solved(problem, candidates, progress)
+    # 4. Covariance, with what parts of the data disagree by.
+    estimate = JointEstimate.of(solution, calibration.objects)
+    covariance, spread = edges_covariance(problem.whole, estimate)
+    # 5. Has it worked?
+    contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
+    reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
+    return MethodEstimate(
+        solution.state.cTl,
+        solution.state.time_offsets_s[0],
+        covariance,
+        frames_used(drives, solution),
+        reasons,
+        by_static_objects=covariance,
+        diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
+    )
+
+
+def _motion_alone(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> MotionSolution | None:
+    """What motion says; None where it says nothing or two things."""
+    try:
+        reach_s = config.search.time_offset_s
+        solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, reach_s, progress)
+    except EstimationError:
+        return None
+    return solutions[0] if solutions[0].converged and alternative(solutions) is None else None
+
+
+def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> _Problem:
+    """The problem, with the search around what guess and motion say together.
+
+    Raises:
+        EstimationError: neither says anything.
+    """
+    guess = calibration.guess
+    if guess.cTl is None and motion is None:
+        raise EstimationError(
+            "without labels, a start is needed: a guess within 5 deg (--init), or a drive whose motion "
+            "tells the rotation (turns and changes of speed)"
+        )
+    drives = [thinned(drive, POINTS_A_SCAN) for drive in calibration.drives]
+    joint = replace(calibration.joint(), drives=drives)
+    region = _region(guess, motion, _time_offsets(calibration, motion))
+    translation = np.zeros(3) if guess.cTl is None else np.asarray(guess.cTl.translation())
+    pose = gtsam.Pose3(region.cTl.rotation(), translation)
+    known = motion is not None and _tells_offset(motion)
+    centre = State(pose, (region.time_offsets_s[0] if known else guess.time_offset_s,))
+    prior = _prior(centre, motion)
+    whole = replace(joint, centre=centre, prior=prior)
+    scans = [spread_evenly(len(drive.scans), SEARCH_SCANS) for drive in drives]
+    parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
+    tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
+    some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
+    return _Problem(whole, some, replace(region, cTl=pose), centre, motion)
+
+
+def thinned(drive: Drive, most: int) -> Drive:
+    """The drive with at most so many boundary points, evenly spread, of each class in each scan."""
+    scans = []
+    for scan in drive.scans:
+        boundaries = {
+            c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most))))
+            for c, points in scan.boundaries.items()
+        }
+        scans.append(replace(scan, boundaries=boundaries))
+    return replace(drive, scans=tuple(scans))
+
+
+def _tells_offset(motion: MotionSolution) -> bool:
+    return bool(np.sqrt(motion.covariance[6, 6]) < _KNOWN_OFFSET_S)
+
+
+def _time_offsets(calibration: CalibrationProblem, motion: MotionSolution | None) -> tuple[float, ...]:
+    """Time offsets at which starts are searched."""
+    guess = calibration.guess.time_offset_s
+    if motion is not None and _tells_offset(motion):
+        return (motion.state.time_offsets_s[0],)
+    speeds = [
+        float(np.linalg.norm(each.mean_twist[3:]))
+        for drive in calibration.drives
+        for each in drive.lidar_motions
+        if each.ok
+    ]
+    moving = bool(speeds) and float(np.mean(speeds)) > _MOVING_MPS
+    return tuple((guess + _OFFSETS_S).tolist()) if moving else (guess,)
+
+
+def _region(guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[float, ...]) -> SearchRegion:
+    """Guess and motion together; where one says nothing, what the other says."""
+    if motion is None:
+        assert guess.cTl is not None
+        half = (_REACH_SIGMAS * _GUESS_SIGMA_DEG,) * 3
+        return SearchRegion(guess.cTl, time_offsets_s, half)
+    known = KnownRotation(motion.state.cTl.rotation(), motion.covariance[:3, :3])
+    # Both as Gaussians in the tangent space of the guess, or of motion alone.
+    information = np.linalg.inv(known.covariance + np.radians(0.7) ** 2 * np.eye(3))
+    middle = motion.state.cTl
+    covariance = np.linalg.inv(information)
+    if guess.cTl is not None:
+        step = gtsam.Rot3.Logmap(guess.cTl.rotation().between(known.cRl))
+        total = information + np.eye(3) / np.radians(_GUESS_SIGMA_DEG) ** 2
+        covariance = np.linalg.inv(total)
+        middle = gtsam.Pose3(
+            guess.cTl.rotation().retract(covariance @ information @ step), guess.cTl.translation()
+        )
+    R = middle.rotation().matrix()
+    sigmas_deg = np.degrees(np.sqrt(np.diag(R @ covariance @ R.T)))
+    half = tuple(np.minimum(_REACH_SIGMAS * sigmas_deg, _MOST_DEG).tolist())
+    return SearchRegion(middle, time_offsets_s, (half[0], half[1], half[2]), known)
+
+
+def _prior(centre: State, motion: MotionSolution | None) -> gtsam.NonlinearFactor | None:
+    """Motion as a factor, and the translation's prior."""
+    sigmas = np.array([10.0] * 3 + [_TRANSLATION_SIGMA_M] * 3 + [1.0])
+    information, state = np.diag(sigmas**-2.0), centre
+    if motion is not None:
+        own = np.linalg.inv(motion.covariance + np.diag(_MOTION_FLOOR**2))
+        step = np.append(
+            gtsam.Pose3.Logmap(motion.state.cTl.between(centre.cTl)),
+            centre.time_offsets_s[0] - motion.state.time_offsets_s[0],
+        )
+        total = information + own
+        # Both Gaussians in the tangent space of motion's estimate.
+        mean = np.linalg.solve(total, information @ step)
+        state = State(motion.state.cTl.retract(mean[:6]), (motion.state.time_offsets_s[0] + float(mean[6]),))
+        information = total
+    return gaussian_factor(state, np.linalg.inv(information))
+
+
+def _starts(problem: _Problem) -> list[State]:
+    """Starts by the search, on the drive with most edges in view.
+
+    Raises:
+        EstimationError: none.
+    """
+    edges = edges_of(problem.some.drives, problem.some.tracks, problem.some.config.graph)
+    if not edges:
+        raise EstimationError("no LiDAR edge in any scan")
+    richest: DriveEdges = max(edges, key=len)
+    found = edge_starts(richest, problem.region)
+    if not found:
+        raise EstimationError("no LiDAR edge in any picture")
+    return [State(start.cTl, (start.time_offset_s,)) for start in found]
+
+
+def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, JointSolution]]:
+    """Solutions on a few scans, by their score, best first.
+
+    Raises:
+        EstimationError: none leads anywhere.
+    """
+    edges = edges_of(problem.some.drives, problem.some.tracks, problem.some.config.graph)
+    found, failures = [], []
+    for start in starts:
+        try:
+            solution = solve_joint(problem.some, start, START_KERNELS_PX)
+        except EstimationError as error:
+            failures.append(error)
+            continue
+        found.append((score(edges, solution.state, SCORE_PX), solution))
+    if not found:
+        raise failures[0]
+    return sorted(found, key=lambda pair: -pair[0])
+
+
+def _solved(
+    problem: _Problem, candidates: list[tuple[float, JointSolution]], progress: Progress | None
+) -> JointSolution:
+    """The best candidate on all frames; one that begins at another roll, where that agrees better."""
+    best = candidates[0]
+    rolled = [replace(best[1].state, cTl=_rolled(best[1].state.cTl, np.radians(roll))) for roll in _ROLLS_DEG]
+    again = _refined(problem, rolled)
+    candidates += [one for one in again if angle_deg(one[1].state.cTl, best[1].state.cTl) > _SAME_DEG]
+    candidates.sort(key=lambda pair: -pair[0])
+    return solve_joint(problem.whole, candidates[0][1].state, KERNELS_PX, progress)
+
+
+_SAME_DEG = 0.3
+"""Solutions nearer than this are one [deg]."""
+
+
+def _rolled(cTl: gtsam.Pose3, roll_rad: float) -> gtsam.Pose3:
+    """Turned about the camera's optical axis."""
+    R = turned(cTl, np.array([[0.0, 0.0, roll_rad]]))[0]
+    return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), cTl.translation())
+
+
+def _diagnostics(
+    solution: JointSolution, contrast: EdgeContrast, motion: MotionSolution | None
+) -> dict[str, Any]:
+    """JSON-able numbers about the run."""
+    facts: dict[str, Any] = {
+        "outer_iterations": solution.outer_iterations,
+        "matches": sum(len(pair) for pair in solution.pairs),
+        "pairs": len(solution.pairs),
+        "contrast": contrast.to_dict(),
+    }
+    if motion is not None:
+        sigmas = np.sqrt(np.diag(motion.covariance))
+        facts["motion"] = {
+            "time_offset_s": motion.state.time_offsets_s[0],
+            "sigmas": sigmas.tolist(),
+        }
+    return facts

@@ -1,0 +1,117 @@
+"""Whether calibration by edges has worked: how far its score stands out, and whether motion agrees."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.edges.agreement import score
+from sst_graph.edges.search import angle_deg, turned
+from sst_graph.graph.matching import edges_of
+from sst_graph.graph.outer_loop import JointProblem, JointSolution
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import MotionSolution, difference
+
+FloatArray = NDArray[np.float64]
+
+BLUR_PX = 2.0
+"""Blur of the scores that are compared [px]."""
+_TURNS = 24
+"""Random rotations that the estimate is compared with."""
+_TURN_DEG = (2.0, 4.0)
+"""Their angles [deg]."""
+_APART_DEG = 1.0
+"""Other solutions farther than this are other optima [deg]."""
+MIN_CONTRAST = 5.0
+"""Least height of the estimate's score above those of the random rotations, in their standard deviations."""
+MIN_OVER_OTHER = 1.08
+"""Least ratio of the estimate's score to that of the best other optimum."""
+MAX_MOTION_CHI2 = 33.0
+"""Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two contradict."""
+_FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
+"""Added to the sigmas of that difference [rad, s]."""
+MAX_AWAY_M = 0.35
+"""Farthest that an estimate may lie from the guess: it is bound to it [m]."""
+
+
+@dataclass(frozen=True)
+class EdgeContrast:
+    """How far an estimate's score stands out.
+
+    Attributes:
+        score: of the estimate.
+        sigmas: its height above the mean at random rotations, in their standard deviations.
+        ratio: to the highest of them.
+        other: score of the best other optimum; 0 without one.
+    """
+
+    score: float
+    sigmas: float
+    ratio: float
+    other: float
+
+    def to_dict(self) -> dict[str, float]:
+        """JSON-able."""
+        return asdict(self)
+
+
+def edge_contrast(problem: JointProblem, state: State, others: Sequence[State], seed: int) -> EdgeContrast:
+    """Scores at the estimate, at random rotations around it, and at other solutions."""
+    edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
+    rng = np.random.default_rng(seed)
+    axes = rng.normal(size=(_TURNS, 3))
+    axes /= np.linalg.norm(axes, axis=1)[:, None]
+    turns = np.radians(rng.uniform(*_TURN_DEG, _TURNS))[:, None] * axes
+    around = []
+    for R in turned(state.cTl, turns):
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), state.cTl.translation())
+        around.append(score(edges, State(pose, state.time_offsets_s, state.biases_px), BLUR_PX))
+    own = score(edges, state, BLUR_PX)
+    apart = [each for each in others if angle_deg(each.cTl, state.cTl) > _APART_DEG]
+    other = max((score(edges, each, BLUR_PX) for each in apart), default=0.0)
+    spread = float(np.std(around)) + 1e-9
+    return EdgeContrast(own, (own - float(np.mean(around))) / spread, own / max(max(around), 1e-9), other)
+
+
+def edges_reasons(
+    solution: JointSolution,
+    contrast: EdgeContrast,
+    motion: MotionSolution | None,
+    covariance: FloatArray,
+    centre: State,
+) -> tuple[str, ...]:
+    """Why the estimate may be wrong altogether; none where nothing says so."""
+    reasons = []
+    if not solution.converged:
+        reasons.append(f"the outer loop still moved after {solution.outer_iterations} iterations")
+    if contrast.sigmas < MIN_CONTRAST:
+        reasons.append(
+            f"edges of LiDAR and pictures agree hardly better than at rotations 2 to 4 deg away "
+            f"({contrast.sigmas:.1f} standard deviations, expected {MIN_CONTRAST:g} or more): "
+            "the pose may be wrong altogether"
+        )
+    if contrast.other > 0.0 and contrast.score < MIN_OVER_OTHER * contrast.other:
+        reasons.append(
+            "another pose agrees with the pictures almost as well "
+            f"(score {contrast.score:.0f} against {contrast.other:.0f}): give a closer guess or a richer drive"
+        )
+    if motion is not None:
+        step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
+        total = (motion.covariance + covariance)[np.ix_([0, 1, 2, 6], [0, 1, 2, 6])] + np.diag(_FLOOR**2)
+        chi2 = float(step @ np.linalg.solve(total, step))
+        if chi2 > MAX_MOTION_CHI2:
+            reasons.append(
+                f"motion alone gives another calibration, {np.degrees(np.linalg.norm(step[:3])):.2f} deg and "
+                f"{1e3 * step[3]:+.1f} ms away (chi-squared {chi2:.0f} of 4)"
+            )
+    away = float(np.linalg.norm(solution.state.cTl.translation() - centre.cTl.translation()))
+    if away > MAX_AWAY_M:
+        reasons.append(
+            f"the estimate lies {away:.2f} m from the guess, farther than edges can tell (at most "
+            f"{MAX_AWAY_M:g} m)"
+        )
+    return tuple(reasons)

@@ -1,0 +1,1 @@
+"""Calibration without labels: where LiDAR edges and gradients of the picture agree best."""

@@ -1,0 +1,161 @@
+"""Starts for calibration without labels: rotations on a grid, scored by blurred edges, the best refined.
+
+A grid around what is known beforehand is scored under a wide blur; the best of it again on finer grids, under a
+narrower one. What motion alone says of rotation rules out poses that contradict it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sst_graph.edges.agreement import BlurredScore
+from sst_graph.graph.matching import DriveEdges
+
+FloatArray = NDArray[np.float64]
+
+_STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))
+"""Blur [px] at an image width of 1242, step of the grid in units of the first one's, and how many poses go on."""
+GRID_DEG = 1.2
+"""Step of the first grid: with KITTI's camera, as many pixels as the first blur has [deg]."""
+_POINTS = 4000
+"""Boundary points, in all, that the poses are compared on."""
+_WIDTH_PX = 1242
+"""Image width for which the blurs are given."""
+MODES = 6
+"""Most starts that are returned."""
+APART_DEG, APART_S = 0.8, 0.05
+"""Starts are farther apart than one of these: nearer ones lead to one estimate [deg], [s]."""
+_VETO_CHI2 = 25.0
+"""Chi-squared, of 3, of the difference from motion's rotation beyond which a pose is not tried."""
+MOTION_FLOOR_DEG = 0.7
+"""Added to the sigmas of motion's rotation: its covariance leaves out what biases odometry [deg]."""
+
+
+@dataclass(frozen=True)
+class KnownRotation:
+    """A rotation cRl known beforehand, with the (3, 3) covariance of its right perturbation [rad^2]."""
+
+    cRl: gtsam.Rot3
+    covariance: FloatArray
+
+    def chi2(self, rotations: FloatArray) -> FloatArray:
+        """(m,) of 3, of rotations (m, 3, 3)."""
+        floor = np.radians(MOTION_FLOOR_DEG) ** 2 * np.eye(3)
+        steps = Rotation.from_matrix(self.cRl.matrix().T @ rotations).as_rotvec()
+        return np.asarray((steps @ np.linalg.inv(self.covariance + floor) * steps).sum(axis=1))
+
+
+@dataclass(frozen=True)
+class SearchRegion:
+    """Where starts are searched.
+
+    Attributes:
+        cTl: the pose in the middle.
+        time_offsets_s: time offsets that are tried [s].
+        half_deg: half widths (3,) of the rotations about the camera's axes [deg].
+        motion: what motion alone says, where it says something.
+    """
+
+    cTl: gtsam.Pose3
+    time_offsets_s: tuple[float, ...]
+    half_deg: tuple[float, float, float]
+    motion: KnownRotation | None = None
+
+
+@dataclass(frozen=True)
+class EdgeStart:
+    """A pose cTl and a time offset [s] with its score."""
+
+    cTl: gtsam.Pose3
+    time_offset_s: float
+    score: float
+
+
+def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
+    """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is in
+    view."""
+    edges = edges.thinned(_POINTS)
+    first = _not_vetoed(_grid(region), region)
+    candidates = [(number, first) for number in range(len(region.time_offsets_s))]
+    found: list[tuple[float, int, FloatArray]] = []
+    for stage, (blur_px, step, kept) in enumerate(_STAGES):
+        found = []
+        for number, rotations in candidates:
+            if stage:
+                rotations = _not_vetoed(_around(rotations, step * GRID_DEG), region)
+            found += _scored(edges, region, number, rotations, blur_px)[:kept]
+        found = sorted(found, key=lambda one: -one[0])[:kept]
+        candidates = [
+            (number, np.stack([R for _, own, R in found if own == number]))
+            for number in sorted({own for _, own, _ in found})
+        ]
+    starts: list[EdgeStart] = []
+    for each, number, R in found:
+        pose = gtsam.Pose3(gtsam.Rot3.ClosestTo(R), region.cTl.translation())
+        start = EdgeStart(pose, region.time_offsets_s[number], each)
+        if all(_apart(start, other) for other in starts):
+            starts.append(start)
+    return starts[:MODES]
+
+
+def _scored(
+    edges: DriveEdges, region: SearchRegion, number: int, rotations: FloatArray, blur_px: float
+) -> list[tuple[float, int, FloatArray]]:
+    """(score, number of the time offset, rotation (3, 3)) of rotations (m, 3, 3), best first."""
+    blur_px *= edges.drive.camera.width / _WIDTH_PX
+    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px)
+    if blurred is None:
+        return []
+    scores = blurred.scores(rotations, np.tile(region.cTl.translation(), (len(rotations), 1)))
+    return [(float(scores[k]), number, rotations[k]) for k in np.argsort(-scores).tolist()]
+
+
+def _apart(a: EdgeStart, b: EdgeStart) -> bool:
+    far = angle_deg(a.cTl, b.cTl) > APART_DEG
+    return far or abs(a.time_offset_s - b.time_offset_s) > APART_S
+
+
+def angle_deg(a: gtsam.Pose3, b: gtsam.Pose3) -> float:
+    """Angle between two rotations [deg]."""
+    return float(np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation())))))
+
+
+def turned(cTl: gtsam.Pose3, turns_rad: FloatArray) -> FloatArray:
+    """(m, 3, 3) rotations Exp(turn) cRl, about the camera's axes, of turns (m, 3) [rad]."""
+    return np.asarray(Rotation.from_rotvec(turns_rad).as_matrix() @ cTl.rotation().matrix())
+
+
+def _grid(region: SearchRegion) -> FloatArray:
+    """(m, 3, 3) rotations around the middle of a region."""
+    axes = [
+        np.arange(-np.ceil(half / GRID_DEG), np.ceil(half / GRID_DEG) + 1.0) * GRID_DEG
+        for half in region.half_deg
+    ]
+    turns = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return turned(region.cTl, np.radians(turns))
+
+
+def _around(rotations: FloatArray, step_deg: float) -> FloatArray:
+    """(27 m, 3, 3) each rotation (m, 3, 3) and its neighbours on a grid of that step."""
+    axis = np.radians(step_deg) * np.array([-1.0, 0.0, 1.0])
+    turns = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    steps = Rotation.from_rotvec(turns).as_matrix()
+    return np.asarray((steps[None] @ rotations[:, None]).reshape(-1, 3, 3))
+
+
+def _not_vetoed(rotations: FloatArray, region: SearchRegion) -> FloatArray:
+    if region.motion is None:
+        return rotations
+    allowed = region.motion.chi2(rotations) < _VETO_CHI2
+    return rotations[allowed] if allowed.any() else rotations
+
+
+def spread_evenly(count: int, most: int) -> Sequence[int]:
+    """At most ``most`` positions of ``count``, evenly spread."""
+    return list(np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist())

@@ -1,0 +1,182 @@
+"""Edges of a picture in any direction, for boundary points of objects that nobody labelled.
+
+The change of colour across a direction, relative to what is usual nearby: a weak edge on a plain road tells as
+much as a strong one in foliage. It is bounded, so that no single edge decides, and its local mean is taken
+off, so that texture as such is worth nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.features.image_edges import Picture
+from sst_graph.features.mask_contour import ContourFeet, well_inside
+from sst_graph.features.sampling import sampled
+from sst_graph.files.array_store import ArrayStore, shape_of, storable
+
+FloatArray = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
+
+DIRECTIONS = 8
+"""Directions of which strengths are kept, evenly over half a turn: a ninth of a right angle off, an edge has
+98 % of its strength."""
+_BLUR_PX = 1.0
+"""Gaussian blur of the picture before differences are taken [px]."""
+_AROUND_PX = 40
+"""Width of the surroundings in which a change of colour is judged [px]."""
+_FLOOR = 1.5
+"""Change of colour [grey levels a pixel] below which surroundings count as plain: noise and compression."""
+_MOST = 4.0
+"""Largest strength, in units of the mean of the surroundings."""
+UNIT = 255.0 / _MOST
+"""Stored value of a strength of 1."""
+STEP_PX = 0.5
+"""Between the places across an edge at which strengths are read [px]."""
+_LEAST_MASS = 0.5
+"""Least sum of strengths above the usual, times pixels, that makes an edge."""
+
+
+@storable("strengths", "usual")
+@dataclass(frozen=True)
+class PictureGradients:
+    """Strength of the edges across :data:`DIRECTIONS` directions in one picture.
+
+    Attributes:
+        strengths: (DIRECTIONS * h, w) uint8, one direction's below the other's; see :data:`UNIT`.
+        usual: (DIRECTIONS * ceil(h / 4), ceil(w / 4)) uint8, mean of the surroundings of every fourth pixel.
+        width, height: of the picture.
+    """
+
+    strengths: NDArray[np.uint8]
+    usual: NDArray[np.uint8]
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, picture: Picture, valid: NDArray[np.bool_] | None = None) -> PictureGradients:
+        """Of a picture (h, w, 3).
+
+        Args:
+            valid: (h, w) where the lens shows anything; there is no edge beside pixels where it does not.
+        """
+        smooth = cv2.GaussianBlur(picture, (0, 0), _BLUR_PX).astype(np.float32)
+        gx, gy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32.0, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32.0
+        angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+        changes = [
+            np.sqrt(((np.cos(a) * gx + np.sin(a) * gy) ** 2).sum(axis=2)).astype(np.float32) for a in angles
+        ]
+        if valid is not None:
+            beside = cv2.dilate((~valid).view(np.uint8), np.ones((7, 7), np.uint8)) > 0
+            changes = [np.where(beside, np.float32(0.0), change) for change in changes]
+        around = (2 * (_AROUND_PX // 2) + 1,) * 2
+        mean = cv2.blur(np.mean(changes, axis=0), around) + np.float32(_FLOOR)
+        height, width = picture.shape[:2]
+        strengths, usual = [], []
+        for change in changes:
+            strength = np.minimum(change / mean, np.float32(_MOST))
+            strengths.append(np.rint(UNIT * strength).astype(np.uint8))
+            usual.append(np.rint(UNIT * cv2.blur(strength, around)).astype(np.uint8)[::4, ::4])
+        return cls(np.concatenate(strengths), np.concatenate(usual), width, height)
+
+    def stored_in(self, store: ArrayStore) -> PictureGradients:
+        """The same with its fields in an array store."""
+        return replace(self, strengths=store.put(self.strengths), usual=store.put(self.usual))
+
+    def blurred(self, sigma_px: float, every: int) -> FloatMap:
+        """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels."""
+        size = -(-self.width // every), -(-self.height // every)
+        parts = np.split(self.strengths, DIRECTIONS)
+        usual = np.split(self.usual, DIRECTIONS)
+        fields = []
+        for strength, mean in zip(parts, usual, strict=True):
+            small = cv2.resize(strength, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+            small -= cv2.resize(mean, size, interpolation=cv2.INTER_LINEAR)
+            fields.append(cv2.GaussianBlur(small, (0, 0), sigma_px / every) / np.float32(UNIT))
+        return np.stack(fields)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the strengths, which are not read for it."""
+        return shape_of(self, "strengths")
+
+
+def direction_numbers(directions: FloatArray) -> NDArray[np.intp]:
+    """(n,) number of the kept direction nearest to unit vectors (n, 2)."""
+    angles = np.arctan2(directions[:, 1], directions[:, 0])
+    return np.asarray(np.rint(angles * DIRECTIONS / np.pi).astype(np.intp) % DIRECTIONS)
+
+
+def profiles(
+    gradients: Sequence[PictureGradients],
+    spans: Sequence[tuple[int, int]],
+    uvs: FloatArray,
+    outward: FloatArray,
+    ts: FloatArray,
+) -> FloatMap:
+    """(m, n) strengths above the usual at m distances ``ts`` outward from pixels uvs (n, 2) of several pictures.
+
+    Args:
+        spans: where the pixels of each picture begin and end, one after the other.
+        outward: (n, 2) unit vectors.
+    """
+    found = np.zeros((len(ts), len(uvs)), np.float32)
+    number = direction_numbers(outward)
+    for each, (a, b) in zip(gradients, spans, strict=True):
+        if b <= a:
+            continue
+        u = uvs[a:b, 0] + ts[:, None] * outward[a:b, 0]
+        v = uvs[a:b, 1] + ts[:, None] * outward[a:b, 1]
+        u, v = np.clip(u, 0.0, each.width - 1.0), np.clip(v, 0.0, each.height - 1.0)
+        strength = sampled(each.strengths, u, v + number[a:b] * each.height)
+        quarter = -(-each.height // 4)
+        column, row = (uvs[a:b, 0] / 4.0).astype(np.intp), (uvs[a:b, 1] / 4.0).astype(np.intp)
+        column, row = np.clip(column, 0, -(-each.width // 4) - 1), np.clip(row, 0, quarter - 1)
+        usual = each.usual[row + number[a:b] * quarter, column]
+        found[:, a:b] = (strength.astype(np.float32) - usual) / np.float32(UNIT)
+    return found
+
+
+@dataclass(frozen=True)
+class GradientFeet(ContourFeet):
+    """Edges of pictures near pixels, as :class:`ContourFeet`; and (n,) how strong each is, 0 to 1."""
+
+    shares: FloatArray
+
+
+def nearest_edges(
+    gradients: Sequence[PictureGradients],
+    spans: Sequence[tuple[int, int]],
+    uvs: FloatArray,
+    outward: FloatArray,
+    scale_px: float,
+) -> GradientFeet:
+    """Edges across the outward directions near pixels uvs (n, 2): their centres of mass under a Gaussian.
+
+    To match these again and again, and to minimise squared distances in between, climbs the sum of the strengths
+    under that Gaussian (mean shift; Comaniciu and Meer, PAMI 2002).
+
+    Args:
+        outward: (n, 2) unit vectors.
+        scale_px: sigma of the Gaussian [px].
+    """
+    n = len(uvs)
+    if n == 0:
+        return GradientFeet(np.zeros(0), uvs, uvs, np.zeros(0, np.bool_), np.zeros(0))
+    step = max(STEP_PX, scale_px / 6.0)
+    ts = np.arange(-3.0 * scale_px, 3.0 * scale_px + 1e-9, step)
+    sizes = [(each.width, each.height) for each in gradients]
+    width, height = np.repeat(np.array(sizes).reshape(-1, 2), [b - a for a, b in spans], axis=0).T
+    valid = well_inside(uvs[:, 0], uvs[:, 1], width, height)
+    safe = np.where(valid[:, None], uvs, 5.0)
+    strength = profiles(gradients, spans, safe, outward, ts).astype(np.float64)
+    mass = np.maximum(strength, 0.0) * np.exp(-0.5 * (ts / scale_px) ** 2)[:, None]
+    total = mass.sum(axis=0)
+    centre = (ts @ mass) / np.maximum(total, 1e-9)
+    valid &= total * step > _LEAST_MASS
+    shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
+    return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, shares)
