@@ -365,6 +365,12 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
     return angle * result.camera.fx
 
 
+_FROM_OTHERS = (
+    "its own images give no estimate: pose and time offset follow from the other cameras and what is known of "
+    "the rig"
+)
+
+
 def _camera_result(
     camera: _Camera,
     name: str,
@@ -381,6 +387,8 @@ def _camera_result(
     status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
     gone = {f"{direction.sentence}: {direction.advice}" for direction in own.weak_directions}
     kept = tuple(reason for reason in own.reasons if reason not in gone)
+    if not own.frames_used and status == "ok":
+        kept = (_FROM_OTHERS, *kept)
     sentences = tuple(f"{direction.sentence}: {direction.advice}" for direction in weak)
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),

@@ -16,8 +16,8 @@ from sst_graph.rig import read_rig
 def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A stereo street on disk, in small pictures."""
     folder = tmp_path_factory.mktemp("rig") / "street"
-    options = ["--seed", "2", "--frames", "20", "--time-offset", "0.05", "--stereo"]
-    small = ["width=621", "height=188", "azimuth_limit_deg=50", "azimuth_step_deg=0.3", "vehicle_density=0.3"]
+    options = ["--seed", "2", "--frames", "24", "--time-offset", "0.05", "--stereo"]
+    small = ["width=621", "height=188", "azimuth_limit_deg=50", "vehicle_density=0.3"]
     assert main(["simulate", str(folder), *options, *(f"--set={value}" for value in small)]) == 0
     return folder
 

@@ -144,5 +144,5 @@ def test_cameras_that_a_bag_has_not(bag: Path) -> None:
 
 
 def test_cameras_that_kitti_has_not(stereo: Path) -> None:
-    with pytest.raises(ConfigError, match="camera 'image_0': .* has image_2, image_3"):
+    with pytest.raises(ConfigError, match=r"camera 'image_0': .* has image_2, image_3"):
         open_source(stereo, camera="image_0")
