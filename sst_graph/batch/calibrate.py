@@ -36,7 +36,7 @@ from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import Drive, Progress, prepare_drive
+from sst_graph.drive.preparation import Drive, PrepareConfig, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -86,11 +86,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
-    prepare = config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
-        prepare = replace(prepare, use_visual_odometry=False)
-    if config.method not in _NEED_DEPTH:
-        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    prepare = preparation_of(config)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     classes = config.classes
@@ -101,6 +97,16 @@ def prepare_drives(
         prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
+
+
+def preparation_of(config: CalibrationConfig) -> PrepareConfig:
+    """What the method needs of every frame."""
+    prepare = config.prepare
+    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
+        prepare = replace(prepare, use_visual_odometry=False)
+    if config.method not in _NEED_DEPTH:
+        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    return prepare
 
 
 def calibrate_prepared(
