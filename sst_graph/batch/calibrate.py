@@ -15,6 +15,7 @@ from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
 from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
+    fit_of,
     joint_diagnostics,
     joint_reasons,
     label_agreement,
@@ -36,7 +37,7 @@ from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import Drive, Progress, prepare_drive
+from sst_graph.drive.preparation import Drive, PrepareConfig, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -86,11 +87,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
-    prepare = config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
-        prepare = replace(prepare, use_visual_odometry=False)
-    if config.method not in _NEED_DEPTH:
-        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    prepare = preparation_of(config)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     classes = config.classes
@@ -101,6 +98,16 @@ def prepare_drives(
         prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
+
+
+def preparation_of(config: CalibrationConfig) -> PrepareConfig:
+    """What the method needs of every frame."""
+    prepare = config.prepare
+    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
+        prepare = replace(prepare, use_visual_odometry=False)
+    if config.method not in _NEED_DEPTH:
+        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    return prepare
 
 
 def calibrate_prepared(
@@ -165,7 +172,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     start = problem.start()
     # 2. Outlines over all frames, from the best start and from others that are nearly as good.
     solutions = problem.solve_from(start)
-    agreement = label_agreement(problem, solutions[0])
+    start_solution, agreement = solutions[0], label_agreement(problem, solutions[0])
     # 3. Lower edges of the objects, where both sensors' labels agree about them.
     lower = problem.with_lower_edges(solutions)
     problem, solutions = problem.with_noise(lower.joint.graph), lower.solutions
@@ -178,7 +185,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     assumptions = examine_assumptions(problem, motion.estimate)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, assumptions.considered)
-    # 8. The estimate, and why it may be wrong.
+    # 8. How it fits the labels, point by point.
+    fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
+    # 9. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
     return MethodEstimate(
@@ -196,6 +205,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
         | joint_diagnostics(problem, motion.estimate, lower),
         JointOutcome(problem, motion.estimate, assumptions.considered),
+        fit,
     )
 
 

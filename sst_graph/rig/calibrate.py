@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.calibrate import finished, prepare_drives, solve_problem
+from sst_graph.batch.calibrate import finished, preparation_of, prepare_drives, solve_problem
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
@@ -82,10 +82,9 @@ def prepare_rig(
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
-    images = replace(config.prepare, use_visual_odometry=any(drive.image_pairs for drive in drives[first]))
     for name, theirs in others:
         drives[name] = [
-            with_camera(drive, source, config.classes, images, progress)
+            with_camera(drive, source, config.classes, preparation_of(config), progress)
             for drive, source in zip(drives[first], theirs, strict=True)
         ]
     return drives
@@ -366,6 +365,12 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
     return angle * result.camera.fx
 
 
+_FROM_OTHERS = (
+    "its own images give no estimate: pose and time offset follow from the other cameras and what is known of "
+    "the rig"
+)
+
+
 def _camera_result(
     camera: _Camera,
     name: str,
@@ -382,6 +387,8 @@ def _camera_result(
     status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
     gone = {f"{direction.sentence}: {direction.advice}" for direction in own.weak_directions}
     kept = tuple(reason for reason in own.reasons if reason not in gone)
+    if not own.frames_used and status == "ok":
+        kept = (_FROM_OTHERS, *kept)
     sentences = tuple(f"{direction.sentence}: {direction.advice}" for direction in weak)
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
