@@ -15,6 +15,7 @@ from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
 from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
+    fit_of,
     joint_diagnostics,
     joint_reasons,
     label_agreement,
@@ -171,7 +172,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     start = problem.start()
     # 2. Outlines over all frames, from the best start and from others that are nearly as good.
     solutions = problem.solve_from(start)
-    agreement = label_agreement(problem, solutions[0])
+    start_solution, agreement = solutions[0], label_agreement(problem, solutions[0])
     # 3. Lower edges of the objects, where both sensors' labels agree about them.
     lower = problem.with_lower_edges(solutions)
     problem, solutions = problem.with_noise(lower.joint.graph), lower.solutions
@@ -184,7 +185,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     assumptions = examine_assumptions(problem, motion.estimate)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, assumptions.considered)
-    # 8. The estimate, and why it may be wrong.
+    # 8. How it fits the labels, point by point.
+    fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
+    # 9. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
     return MethodEstimate(
@@ -202,6 +205,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
         | joint_diagnostics(problem, motion.estimate, lower),
         JointOutcome(problem, motion.estimate, assumptions.considered),
+        fit,
     )
 
 

@@ -41,7 +41,7 @@ POINTS_A_SCAN = 1000
 """Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 """Scales of the kernel from a start that is a degree off [px]."""
-KERNELS_PX = (4.0, 3.0, 2.0, 1.5, 1.2)
+KERNELS_PX = (*[5.0] * 4, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
 """From the best of the starts [px]. Pictures have edges beside the objects'; the last scale is below most of
 their distances."""
 SCORE_PX = 1.5
@@ -62,8 +62,9 @@ _MOVING_MPS = 0.2
 _MOTION_FLOOR = np.array([*np.radians([0.5] * 3), 0.1, 0.1, 0.1, 0.004])
 """(7,) sigmas added to motion's as a factor: odometry errs by this much in ways that its covariance leaves out
 [rad, m, s]."""
-_TRANSLATION_SIGMA_M = 0.1
-"""Prior sigma of the translation around the guess: unbounded, weak scenes run away along the road [m]."""
+_TRANSLATION_SIGMA_M, _FREE_TRANSLATION_SIGMA_M = 0.1, 0.3
+"""Prior sigma of the translation around the guess, or around 0 without one: unbounded, weak scenes run away
+along the road [m]."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> 
     pose = gtsam.Pose3(region.cTl.rotation(), translation)
     known = motion is not None and _tells_offset(motion)
     centre = State(pose, (region.time_offsets_s[0] if known else guess.time_offset_s,))
-    prior = _prior(centre, motion)
+    prior = _prior(centre, motion, guess.cTl is not None)
     whole = replace(joint, centre=centre, prior=prior)
     scans = [spread_evenly(len(drive.scans), SEARCH_SCANS) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
@@ -213,9 +214,10 @@ def _region(guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[f
     return SearchRegion(middle, time_offsets_s, (half[0], half[1], half[2]), known)
 
 
-def _prior(centre: State, motion: MotionSolution | None) -> gtsam.NonlinearFactor | None:
+def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> gtsam.NonlinearFactor:
     """Motion as a factor, and the translation's prior."""
-    sigmas = np.array([10.0] * 3 + [_TRANSLATION_SIGMA_M] * 3 + [1.0])
+    sigma_m = _TRANSLATION_SIGMA_M if guessed else _FREE_TRANSLATION_SIGMA_M
+    sigmas = np.array([10.0] * 3 + [sigma_m] * 3 + [1.0])
     information, state = np.diag(sigmas**-2.0), centre
     if motion is not None:
         own = np.linalg.inv(motion.covariance + np.diag(_MOTION_FLOOR**2))

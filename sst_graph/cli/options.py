@@ -170,6 +170,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         metavar="DIR",
         help="folder to write (default %(default)s)",
     )
+    calibrate.add_argument(
+        "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
+    )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
 

@@ -94,9 +94,18 @@ class BlurredScore:
 
     @classmethod
     def of(
-        cls, edges: DriveEdges, cTl: gtsam.Pose3, time_offset_s: float, blur_px: float
+        cls,
+        edges: DriveEdges,
+        cTl: gtsam.Pose3,
+        time_offset_s: float,
+        blur_px: float,
+        known_fields: dict[int, FloatMap],
     ) -> BlurredScore | None:
-        """At a time offset; the pose only takes the points to the camera and back. None without pairs."""
+        """At a time offset; the pose only takes the points to the camera and back. None without pairs.
+
+        Args:
+            known_fields: fields under this blur by the identity of their gradients; new ones are put there.
+        """
         paired = edges.paired(State(cTl, (time_offset_s,)))
         if paired is None:
             return None
@@ -106,7 +115,11 @@ class BlurredScore:
         paired, group = paired.take(paired_index), group[paired_index]
         every = max(1, int(blur_px / 3.0))
         names = {k: number for number, k in enumerate(known)}
-        fields = np.stack([_gradients(paired, k).blurred(blur_px, every) for k in known])
+        for k in known:
+            gradients = _gradients(paired, k)
+            if id(gradients) not in known_fields:
+                known_fields[id(gradients)] = gradients.blurred(blur_px, every)
+        fields = np.stack([known_fields[id(paired.contours[k])] for k in known])
         to_lidar = cTl.inverse()
         lPs, tips = (
             _moved(to_lidar, paired.moved(each, cTl, time_offset_s))

@@ -18,6 +18,7 @@ from sst_graph.edges.agreement import BlurredScore
 from sst_graph.graph.matching import DriveEdges
 
 FloatArray = NDArray[np.float64]
+FloatMap = NDArray[np.float32]
 
 _STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))
 """Blur [px] at an image width of 1242, step of the grid in units of the first one's, and how many poses go on."""
@@ -85,11 +86,11 @@ def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
     candidates = [(number, first) for number in range(len(region.time_offsets_s))]
     found: list[tuple[float, int, FloatArray]] = []
     for stage, (blur_px, step, kept) in enumerate(_STAGES):
-        found = []
+        found, fields = [], dict[int, FloatMap]()
         for number, rotations in candidates:
             if stage:
                 rotations = _not_vetoed(_around(rotations, step * GRID_DEG), region)
-            found += _scored(edges, region, number, rotations, blur_px)[:kept]
+            found += _scored(edges, region, number, rotations, (blur_px, fields))[:kept]
         found = sorted(found, key=lambda one: -one[0])[:kept]
         candidates = [
             (number, np.stack([R for _, own, R in found if own == number]))
@@ -105,11 +106,19 @@ def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
 
 
 def _scored(
-    edges: DriveEdges, region: SearchRegion, number: int, rotations: FloatArray, blur_px: float
+    edges: DriveEdges,
+    region: SearchRegion,
+    number: int,
+    rotations: FloatArray,
+    blur: tuple[float, dict[int, FloatMap]],
 ) -> list[tuple[float, int, FloatArray]]:
-    """(score, number of the time offset, rotation (3, 3)) of rotations (m, 3, 3), best first."""
-    blur_px *= edges.drive.camera.width / _WIDTH_PX
-    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px)
+    """(score, number of the time offset, rotation (3, 3)) of rotations (m, 3, 3), best first.
+
+    Args:
+        blur: its sigma [px], and the fields that are known under it.
+    """
+    blur_px, fields = blur[0] * edges.drive.camera.width / _WIDTH_PX, blur[1]
+    blurred = BlurredScore.of(edges, region.cTl, region.time_offsets_s[number], blur_px, fields)
     if blurred is None:
         return []
     scores = blurred.scores(rotations, np.tile(region.cTl.translation(), (len(rotations), 1)))

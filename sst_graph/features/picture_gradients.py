@@ -64,23 +64,27 @@ class PictureGradients:
         Args:
             valid: (h, w) where the lens shows anything; there is no edge beside pixels where it does not.
         """
-        smooth = cv2.GaussianBlur(picture, (0, 0), _BLUR_PX).astype(np.float32)
-        gx, gy = cv2.Scharr(smooth, cv2.CV_32F, 1, 0) / 32.0, cv2.Scharr(smooth, cv2.CV_32F, 0, 1) / 32.0
-        angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
-        changes = [
-            np.sqrt(((np.cos(a) * gx + np.sin(a) * gy) ** 2).sum(axis=2)).astype(np.float32) for a in angles
-        ]
+        smooth = cv2.GaussianBlur(picture, (0, 0), _BLUR_PX)
+        gx, gy = (cv2.Scharr(smooth, cv2.CV_32F, *axis, scale=1.0 / 32.0) for axis in ((1, 0), (0, 1)))
+        # The structure tensor, summed over the colours, holds the change across every direction.
+        xx, xy, yy = (cv2.transform(a * b, np.ones((1, 3))) for a, b in ((gx, gx), (gx, gy), (gy, gy)))
         if valid is not None:
-            beside = cv2.dilate((~valid).view(np.uint8), np.ones((7, 7), np.uint8)) > 0
-            changes = [np.where(beside, np.float32(0.0), change) for change in changes]
+            seen = 1 - cv2.dilate((~valid).view(np.uint8), np.ones((7, 7), np.uint8))
+            xx, xy, yy = (each * seen for each in (xx, xy, yy))
+        changes = [
+            np.sqrt(np.maximum(c * c * xx + 2.0 * c * s * xy + s * s * yy, 0.0, dtype=np.float32))
+            for c, s in zip(*_axes(), strict=True)
+        ]
         around = (2 * (_AROUND_PX // 2) + 1,) * 2
-        mean = cv2.blur(np.mean(changes, axis=0), around) + np.float32(_FLOOR)
+        mean = cv2.blur(sum(changes[1:], changes[0]), around) / np.float32(DIRECTIONS) + np.float32(_FLOOR)
+        per_mean = np.float32(UNIT) / mean
         height, width = picture.shape[:2]
-        strengths, usual = [], []
-        for change in changes:
-            strength = np.minimum(change / mean, np.float32(_MOST))
-            strengths.append(np.rint(UNIT * strength).astype(np.uint8))
-            usual.append(np.rint(UNIT * cv2.blur(strength, around)).astype(np.uint8)[::4, ::4])
+        quarter, nearby = (-(-width // 4), -(-height // 4)), (2 * (_AROUND_PX // 8) + 1,) * 2
+        strengths = [cv2.convertScaleAbs(np.minimum(change * per_mean, 255.0)) for change in changes]
+        usual = [
+            cv2.blur(cv2.resize(strength, quarter, interpolation=cv2.INTER_AREA), nearby)
+            for strength in strengths
+        ]
         return cls(np.concatenate(strengths), np.concatenate(usual), width, height)
 
     def stored_in(self, store: ArrayStore) -> PictureGradients:
@@ -88,7 +92,8 @@ class PictureGradients:
         return replace(self, strengths=store.put(self.strengths), usual=store.put(self.usual))
 
     def blurred(self, sigma_px: float, every: int) -> FloatMap:
-        """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels."""
+        """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels; both
+        sizes rounded up."""
         size = -(-self.width // every), -(-self.height // every)
         parts = np.split(self.strengths, DIRECTIONS)
         usual = np.split(self.usual, DIRECTIONS)
@@ -103,6 +108,12 @@ class PictureGradients:
     def shape(self) -> tuple[int, ...]:
         """Of the strengths, which are not read for it."""
         return shape_of(self, "strengths")
+
+
+def _axes() -> tuple[list[np.float32], list[np.float32]]:
+    """Cosines and sines of the directions."""
+    angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
+    return [np.float32(c) for c in np.cos(angles)], [np.float32(s) for s in np.sin(angles)]
 
 
 def direction_numbers(directions: FloatArray) -> NDArray[np.intp]:

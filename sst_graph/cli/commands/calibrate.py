@@ -47,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         result = dataclasses.replace(result, read_as=read_as)
         # The numbers first: what follows may find the disk full.
         mention(summary(result, against))
-        names = write_calibration(folder, result, sources, against)
+        names = write_calibration(folder, result, sources, against, not args.no_report)
     mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
     return exit_code(result)
 
