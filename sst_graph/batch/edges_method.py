@@ -104,7 +104,7 @@ def edges_method(
     solution = _solved(problem, candidates, progress)
     # 4. Covariance, with what parts of the data disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
-    covariance, spread = edges_covariance(problem.whole, estimate)
+    covariance, spread = edges_covariance(estimate)
     # 5. Has it worked?
     contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
