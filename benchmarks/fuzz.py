@@ -36,6 +36,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from benchmarks import fuzz_layouts
 from benchmarks import fuzz_mutations as m
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig, calibrate, open_source
 from sst_graph.cli import main as command
@@ -132,6 +133,7 @@ def prepare(folder: Path, started: bool = False) -> None:
         started: the tracker of the checkpoint has started, which takes half a minute to make.
     """
     _write_tiny_drive(folder / "tiny" / "sequences" / "00")
+    fuzz_layouts.write_layouts(folder / "tiny" / "sequences" / "00", folder / "layouts")
     street = simulate(STREET)
     write_drive(street, folder / "street")
     result = calibrate(street, street.nominal, CalibrationConfig())
@@ -352,6 +354,23 @@ def _calibrate(ground: Ground, rng: Rng) -> None:
     _command(ground, rng, words)
 
 
+def _other_layout(kind: str) -> Callable[[Ground, Rng], None]:
+    """A mutated file of a drive in another layout than KITTI odometry."""
+
+    def attempt(ground: Ground, rng: Rng) -> None:
+        path, mutation, drive = fuzz_layouts.target(ground.folder / "layouts", kind, rng)
+        with ground.mutated(rng, path, mutation):
+            if rng.random() < 0.1:
+                _command(ground, rng, ["info", str(drive)])
+            fuzz_layouts.read_all(drive, rng)
+
+    return attempt
+
+
+def _messages(ground: Ground, rng: Rng) -> None:
+    fuzz_layouts.messages(ground.folder / "layouts", rng)
+
+
 DRIVE_FILES: tuple[tuple[str, m.Mutation], ...] = (
     ("calib.txt", m.text),
     ("times.txt", m.text),
@@ -382,6 +401,12 @@ KINDS: Kinds = {
     "settings": (_settings, 1.0),
     "overrides": (_overrides, 1.0),
     "checkpoint": (_checkpoint, 0.5),
+    "kitti-raw": (_other_layout("kitti-raw"), 0.8),
+    "folder": (_other_layout("folder"), 0.8),
+    "clouds": (_other_layout("clouds"), 0.8),
+    "nuscenes": (_other_layout("nuscenes"), 0.8),
+    "bags": (_other_layout("bags"), 0.8),
+    "messages": (_messages, 0.8),
     "calibrate": (_calibrate, 0.0),
 }
 """What is tried, and how often; a weight of 0: only where it is asked for."""

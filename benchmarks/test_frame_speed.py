@@ -74,7 +74,7 @@ def one_by_one(view: ClassView, values: gtsam.Values) -> gtsam.GaussianFactorGra
                 motion_model=a.motion_model,
                 weights=np.asarray(a.weights)[i : i + 1],
             )
-            graph.add(frame_factor([match], E, D, C_TWIST, condensed=False))
+            graph.add(frame_factor([match], E, D, C_TWIST))
     return graph.linearize(values)
 
 

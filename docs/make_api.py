@@ -39,6 +39,9 @@ SECTIONS: dict[str, list[str]] = {
         "sst_graph.IncrementalTerms",
         "sst_graph.calibration_covariance",
         "sst_graph.align_frame",
+        "sst_graph.CameraCalibration",
+        "sst_graph.ScanMotion",
+        "sst_graph.FrameMatching",
     ],
     "Marginals and formats": ["sst_graph.CalibrationMarginal"],
 }

@@ -52,10 +52,13 @@ if TYPE_CHECKING:
         point_to_pixel_factor,
         residuals,
         silhouette_factor,
+        stacked,
         weighted_residuals,
     )
+    from .between import Between
     from .camera import MIN_DEPTH_M, PinholeCamera
-    from .camera_motion import Between, camera_motion_factor
+    from .camera_motion import camera_motion_factor
+    from .camera_pose import camera_pose_factor
     from .condensed import condense
     from .custom.cloning import PackedGraph, clone_factor, clone_graph, rekeyed
     from .custom.factor import FactorRecipe, custom_factor, recipe_of
@@ -63,12 +66,14 @@ if TYPE_CHECKING:
     from .custom.jacobian_check import JacobianBlock, JacobianReport, check_gradient, check_jacobians
     from .custom.variables import Kind, Vector
     from .errors import FactorError
-    from .hand_eye import hand_eye_factor, rotation_hand_eye
-    from .motion import MotionModel, PointwiseMoved, RigidlyMoved, move_points
+    from .hand_eye import CameraMotion, LidarMotion, hand_eye_factor, rotation_hand_eye
+    from .motion import CameraTwist, MotionModel, PointwiseMoved, RigidlyMoved, move_points
     from .pose_alignment import pose_alignment_factor
     from .priors import beta_regularizer, extrinsic_drift, time_offset_drift, time_offset_prior
     from .robust import KernelKind, RobustKernel
     from .velocity import (
+        DirectionSigmas,
+        LidarTwist,
         mean_velocity_factor,
         twist_jerk_factor,
         twist_smoothness_factor,
@@ -81,6 +86,9 @@ __all__ = [
     "MIN_DEPTH_M",
     "Alignment",
     "Between",
+    "CameraMotion",
+    "CameraTwist",
+    "DirectionSigmas",
     "FactorError",
     "FactorRecipe",
     "GncParams",
@@ -90,6 +98,8 @@ __all__ = [
     "JacobianReport",
     "KernelKind",
     "Kind",
+    "LidarMotion",
+    "LidarTwist",
     "LinearTerm",
     "MotionModel",
     "PackedGraph",
@@ -101,6 +111,7 @@ __all__ = [
     "alignment_cost",
     "beta_regularizer",
     "camera_motion_factor",
+    "camera_pose_factor",
     "check_gradient",
     "check_jacobians",
     "clone_factor",
@@ -121,6 +132,7 @@ __all__ = [
     "residuals",
     "rotation_hand_eye",
     "silhouette_factor",
+    "stacked",
     "time_offset_drift",
     "time_offset_prior",
     "twist_jerk_factor",
@@ -134,10 +146,12 @@ __all__ = [
 _MODULES = {
     "alignment": (
         "Alignment GroupedBias LinearTerm alignment_cost frame_factor pixel_to_point_factor "
-        "point_to_pixel_factor residuals silhouette_factor weighted_residuals"
+        "point_to_pixel_factor residuals silhouette_factor stacked weighted_residuals"
     ),
+    "between": "Between",
     "camera": "MIN_DEPTH_M PinholeCamera",
-    "camera_motion": "Between camera_motion_factor",
+    "camera_motion": "camera_motion_factor",
+    "camera_pose": "camera_pose_factor",
     "condensed": "condense",
     "custom.cloning": "PackedGraph clone_factor clone_graph rekeyed",
     "custom.factor": "FactorRecipe custom_factor recipe_of",
@@ -145,14 +159,14 @@ _MODULES = {
     "custom.jacobian_check": "JacobianBlock JacobianReport check_gradient check_jacobians",
     "custom.variables": "Kind Vector",
     "errors": "FactorError",
-    "hand_eye": "hand_eye_factor rotation_hand_eye",
-    "motion": "MotionModel PointwiseMoved RigidlyMoved move_points",
+    "hand_eye": "CameraMotion LidarMotion hand_eye_factor rotation_hand_eye",
+    "motion": "CameraTwist MotionModel PointwiseMoved RigidlyMoved move_points",
     "pose_alignment": "pose_alignment_factor",
     "priors": "beta_regularizer extrinsic_drift time_offset_drift time_offset_prior",
     "robust": "KernelKind RobustKernel",
     "velocity": (
-        "mean_velocity_factor twist_jerk_factor twist_smoothness_factor twist_transfer_factor "
-        "velocity_direction_factor velocity_factor"
+        "DirectionSigmas LidarTwist mean_velocity_factor twist_jerk_factor twist_smoothness_factor "
+        "twist_transfer_factor velocity_direction_factor velocity_factor"
     ),
 }
 """The public names of each module."""

@@ -1,8 +1,8 @@
 """Alignment factors: a frame's matches as ONE vectorised factor (see :mod:`sst_graph.factors.reprojection`).
 
 The cost of a factor is the robust cost sum rho(|r_i| / sigma_i); its linearization carries the weights
-w_i of each match. Condensed (the default) it has cols + 2 rows however many matches there are, with the
-cost, gradient and Gauss-Newton Hessian of the stacked factor.
+w_i of each match. It is condensed: it has cols + 2 rows however many matches there are, with the cost,
+gradient and Gauss-Newton Hessian of the :func:`stacked` factor.
 
 Variables are given by their key; a constant in place of a key fixes the quantity: ``time_offset_s=0.1`` or
 ``c_twist=np.zeros(6)``. Extrinsic Pose3, offset and bias ``Vector(1)`` or ``double``, twist ``Vector(6)``.
@@ -11,16 +11,16 @@ Variables are given by their key; a constant in place of a key fixes the quantit
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import checked_array, described
+from .arguments import checked_array, checked_positive, described
 from .condensed import condense, condense_root, cost_rows
-from .custom.factor import custom_factor
+from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
 from .errors import FactorError
 from .matches import Alignment
@@ -36,6 +36,7 @@ __all__ = [
     "point_to_pixel_factor",
     "residuals",
     "silhouette_factor",
+    "stacked",
     "weighted_residuals",
 ]
 
@@ -80,15 +81,13 @@ def point_to_pixel_factor(
     cTl: int | gtsam.Pose3,
     time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
-    *,
-    condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """r_i = uv(cP_i) - q_i, q_i the nearest pixel of the point's class; two rows a point [px].
 
     SST-Calib, eq. 2. See :func:`frame_factor` for the arguments.
     """
     _require_points(alignment)
-    return frame_factor([alignment], cTl, time_offset_s, c_twist, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist)
 
 
 def pixel_to_point_factor(
@@ -96,8 +95,6 @@ def pixel_to_point_factor(
     cTl: int | gtsam.Pose3,
     time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
-    *,
-    condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """r_j = uv(cP_j) - q_j, P_j the point that projects nearest to the mask pixel q_j; two rows a pixel [px].
 
@@ -105,7 +102,7 @@ def pixel_to_point_factor(
     way round (a point may occur many times); its weight w_l n_p / n_i is the alignment's ``weights``.
     """
     _require_points(alignment)
-    return frame_factor([alignment], cTl, time_offset_s, c_twist, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist)
 
 
 def silhouette_factor(
@@ -114,8 +111,6 @@ def silhouette_factor(
     time_offset_s: int | float = 0.0,
     c_twist: int | FloatArray | None = None,
     bias_px: int | float | None = None,
-    *,
-    condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """r_i = n_i . (uv(cP_i) - q_i) + bias: signed distance to the true outline [px].
 
@@ -129,7 +124,7 @@ def silhouette_factor(
     """
     if alignment.normals is None:
         raise FactorError("alignment of a silhouette", "no normals", "unit normals (n, 2)")
-    return frame_factor([alignment], cTl, time_offset_s, c_twist, bias_px, condensed=condensed)
+    return frame_factor([alignment], cTl, time_offset_s, c_twist, bias_px)
 
 
 def _require_points(alignment: Alignment) -> None:
@@ -145,7 +140,6 @@ def frame_factor(
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | None = None,
     *,
     terms: Sequence[Sequence[LinearTerm]] | None = None,
-    condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """1/2 |error|^2 = sum_i weight_i rho(|r_i| / sigma_i), r_i of all alignments of one image [px].
 
@@ -158,7 +152,6 @@ def frame_factor(
             with one entry for each alignment (None for those that are point-to-pixel; a
             :class:`GroupedBias` where the objects of one alignment have a bias each).
         terms: of each alignment, scalars that its silhouettes depend on besides; None for none.
-        condensed: False gives two rows a match and one more; for tests and for looking at residuals.
 
     Returns:
         A factor with unit noise on the distinct keys, in the order of the arguments.
@@ -166,34 +159,98 @@ def frame_factor(
     Raises:
         FactorError: no alignment, no key, or a bias for an alignment without normals.
     """
-    frame = frame_residual(alignments, cTl, time_offset_s, c_twist, biases_px, terms)
-    rows = row_count(frame.variables, alignments, condensed)
-    function = _FrameError(frame, condensed, rows)
-    noise = gtsam.noiseModel.Unit.Create(rows)
-    return custom_factor(noise, frame.variables.named, function, frame.variables.kinds, rows, _NAME)
+    quantities = Quantities(cTl, time_offset_s, c_twist)
+    return image_factor(frame_residual(alignments, quantities, biases_px, terms), None, _NAME)
 
 
-def row_count(variables: Variables, alignments: Sequence[Alignment], condensed: bool) -> int:
-    """Rows of a factor: one more than [J r] has columns, or one more than its matches have rows."""
-    return variables.cols + 2 if condensed else sum(len(a) * a.rows_per_match for a in alignments) + 1
+class ImageResidual(Protocol):
+    """All matches of an image as a function of a factor's variables; ``values`` are in their order."""
+
+    @property
+    def variables(self) -> Variables: ...
+
+    @property
+    def match_rows(self) -> int:
+        """Rows of all matches."""
+        ...
+
+    def cost(self, values: Sequence[Any]) -> float: ...
+
+    def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        """(cols + 2,) error and its Jacobian."""
+        ...
+
+    def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
+        """(match_rows + 1,) error, the constant last, and its Jacobian."""
+        ...
+
+    def stacked_error(self, values: Sequence[Any]) -> FloatArray:
+        """The error of :meth:`stacked`, without the work for its Jacobian."""
+        ...
+
+
+def image_factor(
+    residual: ImageResidual, noise: gtsam.noiseModel.Base | None, name: str
+) -> gtsam.CustomFactor:
+    """A condensed factor.
+
+    Args:
+        noise: of one dimension, for the whole image; None for the unit's.
+        name: of the factor, for errors.
+    """
+    rows = residual.variables.cols + 2
+    function = _ImageError(residual, True, rows)
+    variables = residual.variables
+    return custom_factor(_over_rows(noise, rows), variables.named, function, variables.kinds, rows, name)
+
+
+def stacked(factor: gtsam.CustomFactor) -> gtsam.CustomFactor:
+    """The same alignment factor with its matches' own rows, one or two each, and a last one that completes
+    the cost: for tests, and for looking at residuals.
+
+    Args:
+        factor: a :func:`frame_factor`, :func:`silhouette_factor`, :func:`point_to_pixel_factor`,
+            :func:`pixel_to_point_factor` or :func:`sst_graph.factors.pose_alignment_factor`.
+
+    Raises:
+        FactorError: another factor.
+    """
+    recipe = recipe_of(factor)
+    if recipe is None or not isinstance(recipe.function, _ImageError):
+        found = described(factor) if recipe is None else recipe.name
+        raise FactorError("factor to be stacked", found, "an alignment factor of sst_graph.factors")
+    residual = recipe.function.residual
+    rows = residual.match_rows + 1
+    function = _ImageError(residual, False, rows)
+    return replace(recipe, noise=_over_rows(recipe.noise, rows), function=function, rows=rows).build()
+
+
+def _over_rows(noise: gtsam.noiseModel.Base | None, rows: int) -> gtsam.noiseModel.Base:
+    """A model of a whole image, which is the same in every row, in so many rows."""
+    if noise is None:
+        return gtsam.noiseModel.Unit.Create(rows)
+    if isinstance(noise, gtsam.noiseModel.Robust):
+        return gtsam.noiseModel.Robust.Create(noise.robust(), _over_rows(noise.noise(), rows))
+    sigma = checked_positive("sigma of the noise of an image", float(noise.sigmas()[0]))
+    return gtsam.noiseModel.Isotropic.Sigma(rows, sigma)
 
 
 @dataclass(frozen=True)
-class _FrameError:
-    """The error of a frame's factor; a plain object, so that it copies and pickles."""
+class _ImageError:
+    """The error of an image's factor; a plain object, so that it copies and pickles."""
 
-    frame: FrameResidual
+    residual: ImageResidual
     condensed: bool
     rows: int
 
     def __call__(self, *values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        frame = self.frame
-        if not jacobians:
-            return cost_rows(frame.cost(values), self.rows) if self.condensed else frame.stacked_error(
-                values
-            ), None
-        error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
-        return error, frame.variables.blocks(J)
+        residual = self.residual
+        if jacobians:
+            error, J = residual.condensed(values) if self.condensed else residual.stacked(values)
+            return error, residual.variables.blocks(J)
+        if self.condensed:
+            return cost_rows(residual.cost(values), self.rows), None
+        return residual.stacked_error(values), None
 
 
 @dataclass(frozen=True)
@@ -265,6 +322,11 @@ class FrameResidual:
     def cols(self) -> int:
         return self.variables.cols
 
+    @property
+    def match_rows(self) -> int:
+        """Rows of all matches."""
+        return sum(len(part.alignment) * part.alignment.rows_per_match for part in self.parts)
+
     def _state(self, values: Sequence[Any]) -> tuple[gtsam.Pose3, float, FloatArray]:
         return self.cTl.value(values), _scalar(self.time_offset_s.value(values)), self.c_twist.value(values)
 
@@ -323,11 +385,19 @@ class FrameResidual:
         return np.concatenate([*blocks, [np.sqrt(constant)]])
 
 
+@dataclass(frozen=True)
+class Quantities:
+    """What the matches of an image depend on besides biases and terms: keys or constants, as
+    :func:`frame_factor` takes them."""
+
+    cTl: Any
+    time_offset_s: Any
+    c_twist: Any
+
+
 def frame_residual(
     alignments: Sequence[Alignment],
-    cTl: Any,
-    time_offset_s: Any,
-    c_twist: Any,
+    quantities: Quantities,
     biases_px: Any,
     terms: Sequence[Sequence[LinearTerm]] | None = None,
     name: str = _NAME,
@@ -341,8 +411,9 @@ def frame_residual(
         if alignment.c_acceleration.ndim > 1:
             found = f"shape {alignment.c_acceleration.shape}"
             raise FactorError(f"c_acceleration of {name}", found, "shape (6,): the matches of one image")
-    pose, offset = pose_or_key(name, "cTl", cTl), number_or_key(name, "time_offset_s", time_offset_s)
-    twist = _twist_or_key(name, c_twist)
+    pose = pose_or_key(name, "cTl", quantities.cTl)
+    offset = number_or_key(name, "time_offset_s", quantities.time_offset_s)
+    twist = _twist_or_key(name, quantities.c_twist)
     biases = [_biases_and_groups(name, bias) for bias in _bias_of_each(alignments, biases_px)]
     terms_of_each = _terms_of_each(alignments, terms)
     arguments = [

@@ -45,6 +45,11 @@ def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:
     return covariance
 
 
+def checked_number(what: str, value: float) -> float:
+    """A finite number."""
+    return float(checked_array(what, [value], (1,))[0])
+
+
 def checked_positive(what: str, value: float) -> float:
     """A finite number above zero."""
     number = isinstance(value, int | float | np.number) and not isinstance(value, bool)

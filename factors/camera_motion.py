@@ -16,49 +16,16 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from .arguments import checked_positive
+from .between import Between
 from .custom.factor import custom_factor
-from .custom.variables import (
-    Argument,
-    Variables,
-    Vector,
-    body_in_lidar,
-    checked_key,
-    key_name,
-    number_or_key,
-    pose_or_key,
-)
+from .custom.variables import Argument, Variables, Vector, number_or_key, pose_or_key
 from .errors import FactorError
-from .hand_eye import MotionError, camera_motion_error
+from .hand_eye import CameraMotion, MotionError, camera_motion_error
 
 FloatArray = NDArray[np.float64]
 _NAME = "camera_motion_factor"
-
-
-@dataclass(frozen=True)
-class Between:
-    """Where an image falls in a trajectory.
-
-    Attributes:
-        X_a, X_b: keys of the poses wTb before and after (Pose3), distinct.
-        seconds: from X_a to X_b, in the LiDAR's clock [s].
-        image_after_a_s: image stamp minus stamp of X_a [s]; the offset is added to it. The image may fall
-            beyond X_a or X_b: the twist then goes on.
-    """
-
-    X_a: int
-    X_b: int
-    seconds: float
-    image_after_a_s: float
-
-    def __post_init__(self) -> None:
-        for name in ("X_a", "X_b"):
-            object.__setattr__(self, name, checked_key("Between", name, getattr(self, name)))
-        if self.X_a == self.X_b:
-            raise FactorError("keys of Between", f"{key_name(self.X_a)} for X_a and X_b", "distinct keys")
-        checked_positive("seconds between the poses", self.seconds)
 
 
 def camera_motion_factor(
@@ -66,32 +33,27 @@ def camera_motion_factor(
     second: Between,
     cTl: int | gtsam.Pose3,
     time_offset_s: int | float,
-    c1Tc2: gtsam.Pose3,
-    covariance: ArrayLike,
-    *,
-    bTl: gtsam.Pose3 | None = None,
-    scale_known: bool = True,
+    camera_motion: CameraMotion,
 ) -> gtsam.CustomFactor:
     """Log(c1Tc2^-1 . cTl . l1Tl2(X, D) . cTl^-1), predicted - measured [rad, m]; l1Tl2 as in the module.
 
+    See :func:`sst_graph.factors.hand_eye_factor` for a motion of unknown scale.
+
     Args:
-        first, second: where the two images fall; they may share poses.
+        first, second: where the two images fall, of one body; they may share poses.
         cTl: key of the extrinsic, or a fixed pose.
         time_offset_s: key of the time offset, or a fixed offset [s].
-        c1Tc2: measured pose of the camera at image 2 in the camera at image 1; any length where the scale
-            is unknown.
-        covariance: (6, 6) of it [rot, trans], right perturbation; see
-            :func:`sst_graph.factors.hand_eye.hand_eye_factor` for an unknown scale.
-        bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
-        scale_known: False where the translation's direction alone was measured.
+        camera_motion: measured from the first image to the second.
 
     Returns:
         A factor of 6 rows on the distinct keys: poses of the first, of the second, cTl, time_offset_s.
 
     Raises:
-        FactorError: one key for two variables, or a covariance that is none.
+        FactorError: one key for two variables, or another place of the LiDAR in the body at each image.
     """
-    error_of, noise = camera_motion_error(c1Tc2, covariance, scale_known)
+    if not first.lTb.equals(second.lTb, 1e-9):
+        raise FactorError(f"bTl of {_NAME}", "one at the first image, another at the second", "one for both")
+    error_of, noise = camera_motion_error(camera_motion)
     E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
     arguments = [
         Argument(f"{end} of the {name}", getattr(where, end), gtsam.Pose3, shared_with="X_")
@@ -100,8 +62,7 @@ def camera_motion_factor(
     ]
     arguments += [Argument("cTl", E, gtsam.Pose3), Argument("time_offset_s", D, Vector(1))]
     variables = Variables.of(_NAME, arguments)
-    chain = _Chain(first, second, E, D, body_in_lidar(_NAME, bTl))
-    function = partial(_error, variables.keys, chain, error_of)
+    function = partial(_error, variables.keys, _Chain(first, second, E, D), error_of)
     return custom_factor(noise, variables.named, function, variables.kinds, 6, _NAME)
 
 
@@ -121,15 +82,14 @@ class _Chain:
     second: Between
     cTl: int | gtsam.Pose3
     time_offset_s: int | float
-    lTb: gtsam.Pose3
 
     def motion(self, named: dict[int, Any], jacobians: bool) -> tuple[gtsam.Pose3, dict[int, FloatArray]]:
         """c1Tc2, and its right derivatives (6, dim) by the variables, where they are asked for."""
         cTl, time_offset_s = self.cTl, self.time_offset_s
         extrinsic = cTl if isinstance(cTl, gtsam.Pose3) else named[cTl]
         offset = named[time_offset_s][0] if isinstance(time_offset_s, int | np.integer) else time_offset_s
-        wTl_1, H_1 = _lidar_at(self.first, named, offset, self.lTb)
-        wTl_2, H_2 = _lidar_at(self.second, named, offset, self.lTb)
+        wTl_1, H_1 = _lidar_at(self.first, named, offset)
+        wTl_2, H_2 = _lidar_at(self.second, named, offset)
         l1Tl2 = wTl_1.between(wTl_2)
         predicted = extrinsic * l1Tl2 * extrinsic.inverse()
         if not jacobians:
@@ -150,7 +110,7 @@ class _Chain:
 
 
 def _lidar_at(
-    where: Between, named: dict[int, Any], time_offset_s: float, lTb: gtsam.Pose3
+    where: Between, named: dict[int, Any], time_offset_s: float
 ) -> tuple[gtsam.Pose3, tuple[FloatArray, FloatArray, FloatArray]]:
     """wTl at an image's instant, and its right derivatives by X_a (6, 6), X_b (6, 6) and the offset (6,)."""
     X_a, X_b = named[where.X_a], named[where.X_b]
@@ -161,6 +121,6 @@ def _lidar_at(
     stretch = s * np.asarray(gtsam.Pose3.ExpmapDerivative(s * xi))
     by_b = stretch @ gtsam.Pose3.LogmapDerivative(xi)
     by_a = part.inverse().AdjointMap() - stretch @ gtsam.Pose3.LogmapDerivative(-xi)
-    lAd = lTb.AdjointMap()
-    wTl = X_a * part * lTb.inverse()
+    lAd = where.lTb.AdjointMap()
+    wTl = X_a * part * where.lTb.inverse()
     return wTl, (lAd @ by_a, lAd @ by_b, lAd @ xi / where.seconds)

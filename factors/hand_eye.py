@@ -13,6 +13,7 @@ camera-LiDAR calibration, 2020.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -20,7 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_array, checked_covariance
+from .arguments import checked_array, checked_covariance, checked_number, described
 from .custom.factor import ResidualFunction, custom_factor
 from .custom.variables import Kind, Vector
 from .errors import FactorError
@@ -34,41 +35,120 @@ LOW_TRANSLATION_M = 0.02
 """Below this length [m] of the predicted translation its direction is known less and less well."""
 
 
+@dataclass(frozen=True, eq=False)
+class CameraMotion:
+    """What visual odometry measured between two images.
+
+    Attributes:
+        c1Tc2: pose of the camera at 2 in the camera at 1; any length where the scale is unknown.
+        covariance: (6, 6) of the error [rot, trans], right perturbation of c1Tc2. With an unknown scale its
+            part across the translation, divided by the length that c1Tc2 has, is the direction's [rad^2];
+            that along it is not used.
+        scale_known: False where the translation's direction alone was measured.
+
+    Raises:
+        FactorError: no pose, no covariance, or no direction where it is all that was measured.
+    """
+
+    c1Tc2: gtsam.Pose3
+    covariance: FloatArray
+    scale_known: bool = True
+
+    def __post_init__(self) -> None:
+        _require("c1Tc2 of CameraMotion", self.c1Tc2, gtsam.Pose3)
+        covariance = checked_covariance("covariance of CameraMotion", self.covariance, 6)
+        object.__setattr__(self, "covariance", covariance)
+        if not self.scale_known and not np.any(self.c1Tc2.translation()):
+            raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
+
+
+@dataclass(frozen=True, eq=False)
+class LidarMotion:
+    """What LiDAR odometry measured between the same two images.
+
+    Attributes:
+        l1Tl2: pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``time_offset_0_s``.
+        l_twist_1, l_twist_2: (6,) twist of the LiDAR in its own frame at both ends [rad/s, m/s].
+        time_offset_0_s: the time offset at which l1Tl2 was measured [s].
+
+    Raises:
+        FactorError: no pose, or numbers of a wrong shape.
+    """
+
+    l1Tl2: gtsam.Pose3
+    l_twist_1: FloatArray
+    l_twist_2: FloatArray
+    time_offset_0_s: float
+
+    def __post_init__(self) -> None:
+        _require("l1Tl2 of LidarMotion", self.l1Tl2, gtsam.Pose3)
+        for name in ("l_twist_1", "l_twist_2"):
+            object.__setattr__(self, name, checked_array(f"{name} of LidarMotion", getattr(self, name), (6,)))
+        time_offset_0_s = checked_number("time_offset_0_s of LidarMotion", self.time_offset_0_s)
+        object.__setattr__(self, "time_offset_0_s", time_offset_0_s)
+
+    @classmethod
+    def of_turn(
+        cls, l1Rl2: gtsam.Rot3, l_omega_1: ArrayLike, l_omega_2: ArrayLike, time_offset_0_s: float
+    ) -> LidarMotion:
+        """A motion of which only the rotation is known, for :func:`rotation_hand_eye`.
+
+        Args:
+            l1Rl2: rotation of the LiDAR at 2 in the LiDAR at 1.
+            l_omega_1, l_omega_2: (3,) its rate at both ends, in the LiDAR's frame [rad/s].
+            time_offset_0_s: as of the class [s].
+        """
+        _require("l1Rl2 of LidarMotion", l1Rl2, gtsam.Rot3)
+        twists = [
+            np.concatenate([checked_array("l_omega of LidarMotion", w, (3,)), np.zeros(3)])
+            for w in (l_omega_1, l_omega_2)
+        ]
+        return cls(gtsam.Pose3(l1Rl2, np.zeros(3)), twists[0], twists[1], time_offset_0_s)
+
+    def in_camera(
+        self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...], jacobians: bool
+    ) -> tuple[gtsam.Pose3, list[FloatArray]]:
+        """cTl . l1Tl2(d) . cTl^-1, and where they are asked for its Jacobians (6, dim) by cTl [and the
+        offset], right perturbations.
+
+        Args:
+            offset: the time offset as a (1,) array, or none for d = 0 [s].
+        """
+        d = float(offset[0][0]) - self.time_offset_0_s if offset else 0.0
+        before, after = gtsam.Pose3.Expmap(-d * self.l_twist_1), gtsam.Pose3.Expmap(d * self.l_twist_2)
+        moved = before * self.l1Tl2 * after
+        predicted = cTl * moved * cTl.inverse()
+        if not jacobians:
+            return predicted, []
+        back, cAd = moved.inverse().AdjointMap(), cTl.AdjointMap()
+        H = [cAd @ (back - np.eye(6))]
+        if offset:
+            H.append((cAd @ (self.l_twist_2 - back @ self.l_twist_1)).reshape(6, 1))
+        return predicted, H
+
+
 def hand_eye_factor(
-    E: int,
-    D: int | None,
-    c1Tc2: gtsam.Pose3,
-    l1Tl2: gtsam.Pose3,
-    l_twist_1: ArrayLike,
-    l_twist_2: ArrayLike,
-    time_offset_0_s: float,
-    covariance: ArrayLike,
-    scale_known: bool = True,
+    E: int, D: int | None, camera_motion: CameraMotion, lidar_motion: LidarMotion
 ) -> gtsam.CustomFactor:
     """Log(c1Tc2^-1 . cTl . l1Tl2(d) . cTl^-1), predicted - measured [rad, m].
 
-    With ``scale_known=False`` the translation enters by its direction only: [Log of the rotation (rad);
-    t / sqrt(|t|^2 + s^2) - t_m / |t_m|], s = :data:`LOW_TRANSLATION_M`, t predicted, t_m measured.
+    Of a camera's motion whose scale is unknown, the translation enters by its direction only: [Log of the
+    rotation (rad); t / sqrt(|t|^2 + s^2) - t_m / |t_m|], s = :data:`LOW_TRANSLATION_M`, t predicted, t_m
+    measured.
 
     Args:
         E: extrinsic.
         D: time offset, or None where the motions are known to be synchronous (d = 0).
-        c1Tc2: measured pose of the camera at 2 in the camera at 1; any length where the scale is unknown.
-        l1Tl2: measured pose of the LiDAR at 2 in the LiDAR at 1, over the interval at ``time_offset_0_s``.
-        l_twist_1, l_twist_2: (6,) twist of the LiDAR in its own frame at both ends [rad/s, m/s].
-        time_offset_0_s: the time offset at which l1Tl2 was measured [s].
-        covariance: (6, 6) of the error [rot, trans], right perturbation of c1Tc2: both motions' together,
-            that of the LiDAR carried to the camera. With an unknown scale its part across the translation,
-            divided by the length that c1Tc2 has, is the direction's [rad^2]; that along it is not used.
-        scale_known: see above.
+        camera_motion: its covariance is that of the error: both motions' together, that of the LiDAR carried
+            to the camera.
+        lidar_motion: over the same interval.
     """
-    motion = _LidarMotion(l1Tl2, l_twist_1, l_twist_2, time_offset_0_s)
-    motion_error, noise = camera_motion_error(c1Tc2, covariance, scale_known)
-    return _factor("hand_eye_factor", E, D, partial(_hand_eye, motion, motion_error), noise, 6)
+    motion_error, noise = camera_motion_error(camera_motion)
+    return _factor("hand_eye_factor", E, D, partial(_hand_eye, lidar_motion, motion_error), noise, 6)
 
 
 def _hand_eye(
-    motion: _LidarMotion, error_of: MotionError, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
+    motion: LidarMotion, error_of: MotionError, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
     predicted, P_H = motion.in_camera(cTl, offset, jacobians)
     error, error_H_P = error_of(predicted, jacobians)
@@ -76,32 +156,28 @@ def _hand_eye(
 
 
 def rotation_hand_eye(
-    E: int,
-    D: int | None,
-    c1Rc2: gtsam.Rot3,
-    l1Rl2: gtsam.Rot3,
-    l_omega_1: ArrayLike,
-    l_omega_2: ArrayLike,
-    time_offset_0_s: float,
-    covariance: ArrayLike,
+    E: int, D: int | None, c1Rc2: gtsam.Rot3, lidar_motion: LidarMotion, covariance: ArrayLike
 ) -> gtsam.CustomFactor:
-    """Log(c1Rc2^-1 . cRl . l1Rl2(d) . cRl^-1) [rad]; arguments as in :func:`hand_eye_factor`, rotation only.
+    """Log(c1Rc2^-1 . cRl . l1Rl2(d) . cRl^-1) [rad], the rotation of :func:`hand_eye_factor` alone.
 
     The Jacobian by the extrinsic's translation is zero: something else must hold it.
+
+    Args:
+        E: extrinsic.
+        D: time offset, or None where the motions are known to be synchronous (d = 0).
+        c1Rc2: measured rotation of the camera at 2 in the camera at 1.
+        lidar_motion: only its rotation counts; see :meth:`LidarMotion.of_turn`.
+        covariance: (3, 3) of the error, both motions' together [rad^2].
     """
-    twists = [
-        np.concatenate([checked_array("l_omega", w, (3,)), np.zeros(3)]) for w in (l_omega_1, l_omega_2)
-    ]
-    motion = _LidarMotion(gtsam.Pose3(l1Rl2, np.zeros(3)), twists[0], twists[1], time_offset_0_s)
     noise = gtsam.noiseModel.Gaussian.Covariance(
         checked_covariance("covariance of the rotation", covariance, 3)
     )
-    function = partial(_rotation_hand_eye, motion, c1Rc2)
+    function = partial(_rotation_hand_eye, lidar_motion, c1Rc2)
     return _factor("rotation_hand_eye", E, D, function, noise, 3)
 
 
 def _rotation_hand_eye(
-    motion: _LidarMotion, c1Rc2: gtsam.Rot3, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
+    motion: LidarMotion, c1Rc2: gtsam.Rot3, cTl: gtsam.Pose3, *offset: FloatArray, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
     predicted, P_H = motion.in_camera(cTl, offset, jacobians)
     error = gtsam.Rot3.Logmap(c1Rc2.between(predicted.rotation()))
@@ -119,49 +195,22 @@ def _factor(
     return custom_factor(noise, keys, function, kinds[: len(keys)], rows, name)
 
 
-class _LidarMotion:
-    """l1Tl2(d), and the camera's motion that it predicts."""
-
-    def __init__(
-        self, l1Tl2: gtsam.Pose3, twist_1: ArrayLike, twist_2: ArrayLike, time_offset_0_s: float
-    ) -> None:
-        self.l1Tl2 = l1Tl2
-        self.twist_1 = checked_array("l_twist_1", twist_1, (6,))
-        self.twist_2 = checked_array("l_twist_2", twist_2, (6,))
-        self.time_offset_0_s = float(checked_array("time_offset_0_s", [time_offset_0_s], (1,))[0])
-
-    def in_camera(
-        self, cTl: gtsam.Pose3, offset: tuple[FloatArray, ...], jacobians: bool
-    ) -> tuple[gtsam.Pose3, list[FloatArray]]:
-        """cTl . l1Tl2(d) . cTl^-1, and where they are asked for its Jacobians (6, dim) by cTl [and the
-        offset], right perturbations."""
-        d = float(offset[0][0]) - self.time_offset_0_s if offset else 0.0
-        moved = gtsam.Pose3.Expmap(-d * self.twist_1) * self.l1Tl2 * gtsam.Pose3.Expmap(d * self.twist_2)
-        predicted = cTl * moved * cTl.inverse()
-        if not jacobians:
-            return predicted, []
-        back, cAd = moved.inverse().AdjointMap(), cTl.AdjointMap()
-        H = [cAd @ (back - np.eye(6))]
-        if offset:
-            H.append((cAd @ (self.twist_2 - back @ self.twist_1)).reshape(6, 1))
-        return predicted, H
+def _require(what: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise FactorError(what, described(value), f"a gtsam.{kind.__name__}")
 
 
-def camera_motion_error(
-    c1Tc2: gtsam.Pose3, covariance: ArrayLike, scale_known: bool
-) -> tuple[MotionError, gtsam.noiseModel.Base]:
+def camera_motion_error(measured: CameraMotion) -> tuple[MotionError, gtsam.noiseModel.Base]:
     """Error of a predicted c1Tc2 against the measured one, with its derivative, and the noise of it.
 
-    The equation and the arguments are those of :func:`hand_eye_factor`.
+    The equation is that of :func:`hand_eye_factor`.
     """
-    measured_covariance = checked_covariance("covariance of the hand-eye error", covariance, 6)
-    if scale_known:
-        return partial(_pose_error, c1Tc2), gtsam.noiseModel.Gaussian.Covariance(measured_covariance)
+    c1Tc2, covariance = measured.c1Tc2, measured.covariance
+    if measured.scale_known:
+        return partial(_pose_error, c1Tc2), gtsam.noiseModel.Gaussian.Covariance(covariance)
     t = np.asarray(c1Tc2.translation())
     length = float(np.linalg.norm(t))
-    if length == 0.0:
-        raise FactorError("translation of c1Tc2", "zero", "a direction, where the scale is unknown")
-    noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, measured_covariance))
+    noise = gtsam.noiseModel.Gaussian.Covariance(_direction_covariance(c1Tc2, covariance))
     return partial(_direction_error, c1Tc2.rotation(), t / length), noise
 
 

@@ -127,6 +127,19 @@ _SKEW = np.zeros((3, 9))
 _SKEW[[2, 1, 2, 0, 1, 0], [1, 2, 3, 5, 6, 7]] = [-1.0, 1.0, 1.0, -1.0, -1.0, 1.0]
 
 
+@dataclass(frozen=True, eq=False)
+class CameraTwist:
+    """The camera's twist at the instant of an image.
+
+    Attributes:
+        c_twist: (6,), or (6, n) where the points belong to several images [rad/s, m/s].
+        c_acceleration: (6,) or (6, n) its rate of change [rad/s^2, m/s^2].
+    """
+
+    c_twist: FloatArray
+    c_acceleration: FloatArray
+
+
 @dataclass(frozen=True)
 class RigidlyMoved:
     """Points that share one tau.
@@ -234,8 +247,7 @@ def move_points(
     cTl: gtsam.Pose3,
     lPs: FloatArray,
     taus_s: FloatArray | float,
-    c_twist: FloatArray,
-    c_acceleration: FloatArray,
+    motion: CameraTwist,
     model: MotionModel = "se3",
     l_velocities: FloatArray | None = None,
 ) -> RigidlyMoved | PointwiseMoved:
@@ -245,20 +257,19 @@ def move_points(
         cTl: pose of the LiDAR in the camera.
         lPs: (3, n) points in the LiDAR [m].
         taus_s: (n,) interval of each point, or one float for all [s].
-        c_twist: (6,) camera twist at the image's instant, or (6, n) where the points belong to several images
-            [rad/s, m/s].
-        c_acceleration: (6,) or (6, n) its rate of change [rad/s^2, m/s^2].
+        motion: of the camera at the image's instant.
         model: see :data:`MotionModel`.
         l_velocities: (3, n) velocity u over ground of the object that each point lies on, in the LiDAR frame
             [m/s]; None where all are static.
     """
+    c_twist, c_acceleration = motion.c_twist, motion.c_acceleration
     one_motion = c_twist.ndim == 1 and c_acceleration.ndim == 1
     if l_velocities is not None or not one_motion:
         taus_s = np.broadcast_to(np.asarray(taus_s, np.float64), lPs.shape[1:])
     if l_velocities is not None:
         lPs = lPs + taus_s * l_velocities
     if isinstance(taus_s, float):
-        return _move_rigidly(cTl, lPs, taus_s, c_twist, c_acceleration, model)
+        return _move_rigidly(cTl, lPs, taus_s, motion, model)
     R = np.asarray(cTl.rotation().matrix())
     cPs = R @ lPs + np.asarray(cTl.translation()).reshape(3, 1)
     twists, changes = c_twist.reshape(6, -1), c_acceleration.reshape(6, -1) * taus_s
@@ -269,13 +280,9 @@ def move_points(
 
 
 def _move_rigidly(
-    cTl: gtsam.Pose3,
-    lPs: FloatArray,
-    tau_s: float,
-    c_twist: FloatArray,
-    c_acceleration: FloatArray,
-    model: MotionModel,
+    cTl: gtsam.Pose3, lPs: FloatArray, tau_s: float, motion: CameraTwist, model: MotionModel
 ) -> RigidlyMoved:
+    c_twist, c_acceleration = motion.c_twist, motion.c_acceleration
     xi = -tau_s * (c_twist - 0.5 * tau_s * c_acceleration)
     rate = c_twist - tau_s * c_acceleration
     moved = _moved_pose(cTl, xi, model)
@@ -284,14 +291,10 @@ def _move_rigidly(
 
 
 def moved_pose(
-    cTl: gtsam.Pose3,
-    tau_s: float,
-    c_twist: FloatArray,
-    c_acceleration: FloatArray,
-    model: MotionModel = "se3",
+    cTl: gtsam.Pose3, tau_s: float, motion: CameraTwist, model: MotionModel = "se3"
 ) -> gtsam.Pose3:
     """cTl' of all points that share one tau, cP = cTl' . lP; arguments as in :func:`move_points`."""
-    return _moved_pose(cTl, -tau_s * (c_twist - 0.5 * tau_s * c_acceleration), model)
+    return _moved_pose(cTl, -tau_s * (motion.c_twist - 0.5 * tau_s * motion.c_acceleration), model)
 
 
 def _moved_pose(cTl: gtsam.Pose3, xi: FloatArray, model: MotionModel) -> gtsam.Pose3:

@@ -20,19 +20,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .alignment import FrameResidual, GroupedBias, frame_residual, row_count
-from .arguments import checked_positive, described
-from .condensed import condense, cost_rows
-from .custom.factor import custom_factor
-from .custom.variables import (
-    Argument,
-    Variables,
-    Vector,
-    body_in_lidar,
-    checked_key,
-    number_or_key,
-    pose_or_key,
-)
+from .alignment import FrameResidual, GroupedBias, Quantities, frame_residual, image_factor
+from .arguments import described
+from .between import Between
+from .condensed import condense
+from .custom.variables import Argument, Variables, Vector, number_or_key, pose_or_key
 from .errors import FactorError
 from .matches import Alignment
 from .motion import se3_left_jacobian, twist_ad
@@ -42,18 +34,11 @@ FloatArray = NDArray[np.float64]
 
 def pose_alignment_factor(
     alignments: Sequence[Alignment],
-    X_a: int,
-    X_b: int,
+    between: Between,
     cTl: int | gtsam.Pose3,
     time_offset_s: int | float,
-    seconds: float,
-    *,
-    X_scan: int | None = None,
-    bTl: gtsam.Pose3 | None = None,
     biases_px: Sequence[int | float | GroupedBias | None] | int | float | GroupedBias | None = None,
-    image_after_middle_s: float | None = None,
     noise: gtsam.noiseModel.Base | None = None,
-    condensed: bool = True,
 ) -> gtsam.CustomFactor:
     """1/2 |error|^2 = sum_i weight_i rho(|r_i| / sigma_i), r_i as in the module, of one image [px].
 
@@ -64,67 +49,46 @@ def pose_alignment_factor(
 
     Args:
         alignments: one or more, over the same image. With ``X_scan`` their points count as taken at the
-            instant of X_a: ``base_taus_s`` is t_image_stamp - t_a.
-        X_a, X_b: keys of wTb before and after (Pose3), distinct.
+            instant of X_a: ``base_taus_s`` is t_image_stamp - t_a. Where they have a ``c_acceleration``, one
+            for all, the twist at the image's instant is the mean one plus (offset +
+            ``between.image_after_middle_s``) times it.
+        between: where the image falls in the trajectory, and the scan's pose.
         cTl: key of the extrinsic, or a fixed pose.
         time_offset_s: key of the time offset, or a fixed offset [s].
-        seconds: from X_a to X_b, in the LiDAR's clock [s].
-        X_scan: key of wTb at the scan's stamp, where that is another pose than X_a.
-        bTl: pose of the LiDAR in the body, known; None where the poses are the LiDAR's own.
         biases_px: as in :func:`sst_graph.factors.frame_factor`.
-        image_after_middle_s: t_image_stamp minus the middle between X_a and X_b [s]. Given, the twist at
-            the image's instant is the mean one plus (offset + image_after_middle_s) times the
-            alignments' common ``c_acceleration``; None: the mean twist holds throughout.
         noise: of one dimension, over the whole image: ``Isotropic.Sigma(1, s)`` multiplies every match's
             sigma by s; a ``Robust`` around it gives the image one weight, by its distance
             sqrt(2 cost) / s, which is near sqrt(number of matches) where they fit. None: each match counts
             by its own sigma and kernel.
-        condensed: False gives one or two rows a match and one more.
 
     Returns:
         A factor on the distinct keys: X_a, X_b, X_scan, cTl, time_offset_s, biases; its noise is the unit's
         or, in all its rows, the given one.
 
     Raises:
-        FactorError: keys or intervals that make no factor; see also :func:`sst_graph.factors.frame_factor`.
+        FactorError: keys that make no factor, or several accelerations; see also
+            :func:`sst_graph.factors.frame_factor`.
     """
-    frame = _on_poses(
-        alignments, X_a, X_b, cTl, time_offset_s, seconds, X_scan, bTl, biases_px, image_after_middle_s
-    )
-    variables = frame.variables
-    rows = row_count(variables, alignments, condensed)
-    function = _PoseFrameError(frame, condensed, rows)
-    return custom_factor(_over_rows(noise, rows), variables.named, function, variables.kinds, rows, _NAME)
-
-
-def _over_rows(noise: gtsam.noiseModel.Base | None, rows: int) -> gtsam.noiseModel.Base:
-    """The model of one dimension in every row."""
-    if noise is None:
-        return gtsam.noiseModel.Unit.Create(rows)
-    if not isinstance(noise, gtsam.noiseModel.Base):
+    if noise is not None and not isinstance(noise, gtsam.noiseModel.Base):
         raise FactorError(f"noise of {_NAME}", described(noise), "a gtsam.noiseModel of dimension 1, or None")
-    if noise.dim() != 1:
+    if noise is not None and noise.dim() != 1:
         raise FactorError(f"noise of {_NAME}", f"dimension {noise.dim()}", "dimension 1, for the whole image")
-    if isinstance(noise, gtsam.noiseModel.Robust):
-        return gtsam.noiseModel.Robust.Create(noise.robust(), _over_rows(noise.noise(), rows))
-    sigma = float(noise.sigmas()[0])
-    return gtsam.noiseModel.Isotropic.Sigma(rows, checked_positive(f"sigma of the noise of {_NAME}", sigma))
-
-
-@dataclass(frozen=True)
-class _PoseFrameError:
-    """The error of a frame's factor on poses; a plain object, so that it copies and pickles."""
-
-    frame: _PoseFrame
-    condensed: bool
-    rows: int
-
-    def __call__(self, *values: Any, jacobians: bool) -> tuple[FloatArray, list[FloatArray] | None]:
-        frame = self.frame
-        if not jacobians:
-            return frame.error(values, self.condensed, self.rows), None
-        error, J = frame.condensed(values) if self.condensed else frame.stacked(values)
-        return error, frame.variables.blocks(J)
+    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
+    inner = frame_residual(alignments, Quantities(_EXTRINSIC, D, between.X_a), biases_px, name=_NAME)
+    arguments = [
+        Argument("X_a", between.X_a, gtsam.Pose3),
+        Argument("X_b", between.X_b, gtsam.Pose3),
+        Argument("X_scan", between.X_s, gtsam.Pose3, shared_with="X_"),
+        Argument("cTl", E, gtsam.Pose3),
+        Argument("time_offset_s", D, Vector(1)),
+    ]
+    arguments += [
+        Argument(name, key, Vector(1))
+        for name, key in inner.variables.named.items()
+        if name.startswith("bias")
+    ]
+    variables, acceleration = Variables.of(_NAME, arguments), _common_acceleration(alignments)
+    return image_factor(_PoseFrame(inner, variables, between, E, D, acceleration), noise, _NAME)
 
 
 @dataclass(frozen=True)
@@ -135,30 +99,25 @@ class _PoseFrame:
         inner: residuals over extrinsic (in effect, with the scan's motion), offset, twist and biases. The
             twist goes under the key X_a there; the extrinsic is always a variable.
         variables: of the factor.
-        X_a, X_b, X_s: keys of the poses.
+        between: the poses.
         cTl, time_offset_s: key or constant.
-        lTb: pose of the body in the LiDAR.
-        seconds: from X_a to X_b [s].
-        c_acceleration: (6,) [rad/s^2, m/s^2], zero where the mean twist is used as it is.
-        image_after_middle_s: see :func:`pose_alignment_factor`.
+        c_acceleration: (6,) [rad/s^2, m/s^2].
     """
 
     inner: FrameResidual
     variables: Variables
-    X_a: int
-    X_b: int
-    X_s: int
+    between: Between
     cTl: int | gtsam.Pose3
     time_offset_s: int | float
-    lTb: gtsam.Pose3
-    seconds: float
     c_acceleration: FloatArray
-    image_after_middle_s: float
 
-    def error(self, values: Sequence[Any], condensed: bool, rows: int) -> FloatArray:
-        """(rows,) error, without the work for its Jacobian."""
-        inner = self.inner_values(values)
-        return cost_rows(self.inner.cost(inner), rows) if condensed else self.inner.stacked_error(inner)
+    @property
+    def match_rows(self) -> int:
+        """Rows of all matches."""
+        return self.inner.match_rows
+
+    def cost(self, values: Sequence[Any]) -> float:
+        return self.inner.cost(self.inner_values(values))
 
     def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         G, constant = self.inner.gram(self.inner_values(values))
@@ -169,6 +128,9 @@ class _PoseFrame:
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         error, J = self.inner.stacked(self.inner_values(values))
         return error, J @ self.lift(values)
+
+    def stacked_error(self, values: Sequence[Any]) -> FloatArray:
+        return self.inner.stacked_error(self.inner_values(values))
 
     def _by_key(self, values: Sequence[Any]) -> dict[int, Any]:
         return dict(zip(self.variables.keys, values, strict=True))
@@ -181,25 +143,25 @@ class _PoseFrame:
         time_offset_s = (
             named[self.time_offset_s][0] if isinstance(self.time_offset_s, int) else self.time_offset_s
         )
-        return float(time_offset_s) + self.image_after_middle_s
+        return float(time_offset_s) + self.between.image_after_middle_s
 
     def _step(self, named: dict[int, Any]) -> FloatArray:
         """Log(wTb_a^-1 wTb_b)."""
-        return np.asarray(gtsam.Pose3.Logmap(named[self.X_a].between(named[self.X_b])))
+        return np.asarray(gtsam.Pose3.Logmap(named[self.between.X_a].between(named[self.between.X_b])))
 
     def _lTs(self, named: dict[int, Any]) -> gtsam.Pose3:
-        aTs = cast(gtsam.Pose3, named[self.X_a].between(named[self.X_s]))
-        return self.lTb * aTs * self.lTb.inverse()
+        aTs = cast(gtsam.Pose3, named[self.between.X_a].between(named[self.between.X_s]))
+        return self.between.lTb * aTs * self.between.lTb.inverse()
 
     def inner_values(self, values: Sequence[Any]) -> list[Any]:
         """Values of the inner residual's keys."""
         named = self._by_key(values)
         cTl = self._extrinsic(named)
-        l_twist = np.asarray(self.lTb.AdjointMap()) @ self._step(named) / self.seconds
+        l_twist = np.asarray(self.between.lTb.AdjointMap()) @ self._step(named) / self.between.seconds
         c_twist = np.asarray(cTl.AdjointMap()) @ l_twist
         special = {
-            _EXTRINSIC: cTl if self.X_s == self.X_a else cTl * self._lTs(named),
-            self.X_a: c_twist + self._after_middle_s(named) * self.c_acceleration,
+            _EXTRINSIC: cTl if self.between.X_s == self.between.X_a else cTl * self._lTs(named),
+            self.between.X_a: c_twist + self._after_middle_s(named) * self.c_acceleration,
         }
         return [special[key] if key in special else named[key] for key in self.inner.variables.keys]
 
@@ -209,10 +171,10 @@ class _PoseFrame:
         outer, inner = self.variables.columns, self.inner.variables.columns
         L = np.zeros((self.inner.cols, self.variables.cols))
         for key, place in inner.items():
-            if key not in (_EXTRINSIC, self.X_a):
+            if key not in (_EXTRINSIC, self.between.X_a):
                 L[place, outer[key]] += np.eye(place.stop - place.start)
         cTl = self._extrinsic(named)
-        self._lift_twist(L[inner[self.X_a]], outer, named, np.asarray(cTl.AdjointMap()))
+        self._lift_twist(L[inner[self.between.X_a]], outer, named, np.asarray(cTl.AdjointMap()))
         self._lift_extrinsic(L[inner[_EXTRINSIC]], outer, named)
         return L
 
@@ -220,75 +182,32 @@ class _PoseFrame:
         self, rows: FloatArray, outer: dict[int, slice], named: dict[int, Any], Ad_cTl: FloatArray
     ) -> None:
         step = self._step(named)
-        Ad_lTb = np.asarray(self.lTb.AdjointMap())
-        scaled = Ad_cTl @ Ad_lTb / self.seconds
+        Ad_lTb = np.asarray(self.between.lTb.AdjointMap())
+        scaled = Ad_cTl @ Ad_lTb / self.between.seconds
         # Log(Exp(-d_a) Exp(step) Exp(d_b)): J_l(step)^-1 on the left, J_r^-1 = J_l(-step)^-1 on the right
-        rows[:, outer[self.X_a]] -= scaled @ np.linalg.inv(se3_left_jacobian(step))
-        rows[:, outer[self.X_b]] += scaled @ np.linalg.inv(se3_left_jacobian(-step))
+        rows[:, outer[self.between.X_a]] -= scaled @ np.linalg.inv(se3_left_jacobian(step))
+        rows[:, outer[self.between.X_b]] += scaled @ np.linalg.inv(se3_left_jacobian(-step))
         if isinstance(self.cTl, int):
-            rows[:, outer[self.cTl]] -= Ad_cTl @ twist_ad(Ad_lTb @ step / self.seconds)
+            rows[:, outer[self.cTl]] -= Ad_cTl @ twist_ad(Ad_lTb @ step / self.between.seconds)
         if isinstance(self.time_offset_s, int):
             rows[:, outer[self.time_offset_s]] += self.c_acceleration[:, None]
 
     def _lift_extrinsic(self, rows: FloatArray, outer: dict[int, slice], named: dict[int, Any]) -> None:
         """By cTl, and where the scan has a pose of its own by X_s and X_a."""
-        if self.X_s == self.X_a:
+        if self.between.X_s == self.between.X_a:
             if isinstance(self.cTl, int):
                 rows[:, outer[self.cTl]] += np.eye(6)
             return
         sTl = self._lTs(named).inverse()
         if isinstance(self.cTl, int):
             rows[:, outer[self.cTl]] += np.asarray(sTl.AdjointMap())
-        rows[:, outer[self.X_s]] += np.asarray(self.lTb.AdjointMap())
-        rows[:, outer[self.X_a]] -= np.asarray((sTl * self.lTb).AdjointMap())
+        rows[:, outer[self.between.X_s]] += np.asarray(self.between.lTb.AdjointMap())
+        rows[:, outer[self.between.X_a]] -= np.asarray((sTl * self.between.lTb).AdjointMap())
 
 
 _EXTRINSIC = 2**64 - 1
 """Stands for the extrinsic in effect among the inner residual's keys; gtsam.symbol makes no such key."""
 _NAME = "pose_alignment_factor"
-
-
-def _on_poses(
-    alignments: Sequence[Alignment],
-    X_a: int,
-    X_b: int,
-    cTl: int | gtsam.Pose3,
-    time_offset_s: int | float,
-    seconds: float,
-    X_scan: int | None,
-    bTl: gtsam.Pose3 | None,
-    biases_px: Any,
-    image_after_middle_s: float | None,
-) -> _PoseFrame:
-    X_a, X_b = checked_key(_NAME, "X_a", X_a), checked_key(_NAME, "X_b", X_b)
-    X_s = X_a if X_scan is None else checked_key(_NAME, "X_scan", X_scan)
-    E, D = pose_or_key(_NAME, "cTl", cTl), number_or_key(_NAME, "time_offset_s", time_offset_s)
-    inner = frame_residual(alignments, _EXTRINSIC, D, X_a, biases_px, name=_NAME)
-    arguments = [
-        Argument("X_a", X_a, gtsam.Pose3),
-        Argument("X_b", X_b, gtsam.Pose3),
-        Argument("X_scan", X_s, gtsam.Pose3, shared_with="X_"),
-        Argument("cTl", E, gtsam.Pose3),
-        Argument("time_offset_s", D, Vector(1)),
-    ]
-    arguments += [
-        Argument(name, key, Vector(1))
-        for name, key in inner.variables.named.items()
-        if name.startswith("bias")
-    ]
-    return _PoseFrame(
-        inner,
-        Variables.of(_NAME, arguments),
-        X_a,
-        X_b,
-        X_s,
-        E,
-        D,
-        body_in_lidar(_NAME, bTl),
-        checked_positive("seconds between the poses", seconds),
-        np.zeros(6) if image_after_middle_s is None else _common_acceleration(alignments),
-        image_after_middle_s or 0.0,
-    )
 
 
 def _common_acceleration(alignments: Sequence[Alignment]) -> FloatArray:

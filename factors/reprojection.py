@@ -25,7 +25,7 @@ from .camera import MIN_DEPTH_M, PinholeCamera
 from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
-from .motion import move_points
+from .motion import CameraTwist, move_points
 
 FloatArray = NDArray[np.float64]
 
@@ -191,8 +191,8 @@ def evaluate(
         )
     twist = np.asarray(c_twist, dtype=np.float64)
     taus_s = alignment.taus_s(float(time_offset_s))
-    acceleration, model = alignment.c_acceleration.T, alignment.motion_model
-    moved = move_points(cTl, lPs, taus_s, twist, acceleration, model, alignment.velocity_columns)
+    motion = CameraTwist(twist, alignment.c_acceleration.T)
+    moved = move_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
     X, Y, Z = moved.cPs
     behind = Z <= MIN_DEPTH_M
     any_behind = bool(behind.any())

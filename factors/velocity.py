@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .arguments import checked_array, checked_covariance, checked_positive
+from .arguments import checked_array, checked_covariance, checked_number, checked_positive
 from .custom.factor import custom_factor
 from .custom.variables import Kind, Vector, checked_key, checked_keys
 from .errors import FactorError
@@ -31,14 +31,35 @@ def velocity_factor(V_key: int, c_twist: ArrayLike, covariance: ArrayLike) -> gt
     return gtsam.PriorFactorVector(checked_key("velocity_factor", "V_key", V_key), measured, noise)
 
 
+@dataclass(frozen=True)
+class DirectionSigmas:
+    """Standard deviations of a measured motion whose scale is apart.
+
+    Attributes:
+        omega: of the rotation rate, each axis [rad/s].
+        direction_rad: of the direction, each of the two axes across it [rad].
+        speed_mps: of the speed along it [m/s].
+
+    Raises:
+        FactorError: one that is not above 0.
+    """
+
+    omega: float
+    direction_rad: float
+    speed_mps: float
+
+    def __post_init__(self) -> None:
+        for name in ("omega", "direction_rad", "speed_mps"):
+            checked = checked_positive(f"{name} of DirectionSigmas", getattr(self, name))
+            object.__setattr__(self, name, checked)
+
+
 def velocity_direction_factor(
     V_key: int,
     omega: ArrayLike,
     direction: ArrayLike,
     speed_mps: float,
-    sigma_omega: float,
-    sigma_direction_rad: float,
-    sigma_speed_mps: float,
+    sigmas: DirectionSigmas,
     low_speed_mps: float = LOW_SPEED_MPS,
 ) -> gtsam.CustomFactor:
     """[omega_V - omega; B^T v / sqrt(|v|^2 + s^2); d . v - speed], for odometry whose scale is apart.
@@ -46,7 +67,7 @@ def velocity_direction_factor(
     The five-point method gives a rotation and a direction d; the metric speed comes from elsewhere with
     another sigma. B (3, 2) spans the plane normal to d, so that at speed rows 3 and 4 are the angle from
     d to v [rad]; at a speed below s they turn into B^T v / s, which bounds what a direction may claim:
-    a sigma of sigma_direction_rad * max(|v|, s) [m/s] across d, without a singularity at rest. The sign
+    a sigma of sigmas.direction_rad * max(|v|, s) [m/s] across d, without a singularity at rest. The sign
     of d is decided by the last row.
 
     Args:
@@ -54,9 +75,7 @@ def velocity_direction_factor(
         omega: (3,) rotation rate in the camera frame [rad/s].
         direction: (3,) direction of the camera's motion in its own frame, any length but zero.
         speed_mps: metric speed along the direction [m/s].
-        sigma_omega: rad/s, each axis.
-        sigma_direction_rad: rad, each of the two axes.
-        sigma_speed_mps: m/s.
+        sigmas: of the three.
         low_speed_mps: s [m/s].
     """
     measured_omega = checked_array("omega", omega, (3,))
@@ -65,14 +84,12 @@ def velocity_direction_factor(
     if length == 0.0:
         raise FactorError("direction", "the zero vector", "a direction")
     d = d / length
-    speed = float(checked_array("speed_mps", [speed_mps], (1,))[0])
+    speed = checked_number("speed_mps", speed_mps)
     s = checked_positive("low_speed_mps", low_speed_mps)
     across = np.asarray(gtsam.Unit3(d).basis()).T  # (2, 3)
-    sigmas = [checked_positive("sigma_omega", sigma_omega)] * 3
-    sigmas += [checked_positive("sigma_direction_rad", sigma_direction_rad)] * 2
-    sigmas += [checked_positive("sigma_speed_mps", sigma_speed_mps)]
     function = _DirectionError(measured_omega, d, across, speed, s)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array(sigmas))
+    rows = np.repeat([sigmas.omega, sigmas.direction_rad, sigmas.speed_mps], [3, 2, 1])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(rows)
     return custom_factor(noise, {"V_key": V_key}, function, [Vector(6)], 6, "velocity_direction_factor")
 
 
@@ -145,8 +162,7 @@ def twist_jerk_factor(
     V_a: int,
     V_b: int,
     V_c: int,
-    seconds_ab: float,
-    seconds_bc: float,
+    seconds: tuple[float, float],
     sigma_rot_jerk: float,
     sigma_lin_jerk: float,
 ) -> gtsam.CustomFactor:
@@ -156,11 +172,12 @@ def twist_jerk_factor(
 
     Args:
         V_a, V_b, V_c: twists in the order of time.
-        seconds_ab, seconds_bc: intervals [s].
+        seconds: from a to b, and from b to c [s].
         sigma_rot_jerk: rad/s^3, each axis.
         sigma_lin_jerk: m/s^3, each axis.
     """
-    ab, bc = checked_positive("seconds_ab", seconds_ab), checked_positive("seconds_bc", seconds_bc)
+    ab, bc = checked_array("seconds of twist_jerk_factor", seconds, (2,)).tolist()
+    ab, bc = checked_positive("seconds from a to b", ab), checked_positive("seconds from b to c", bc)
     middle = 0.5 * (ab + bc)
     scales = (1.0 / ab / middle, (-1.0 / ab - 1.0 / bc) / middle, 1.0 / bc / middle)
     noise = gtsam.noiseModel.Diagonal.Sigmas(_sigmas_by_kind("jerk", sigma_rot_jerk, sigma_lin_jerk))
@@ -176,14 +193,32 @@ def _sigmas_by_kind(name: str, rotation: float, translation: float) -> FloatArra
     )
 
 
+@dataclass(frozen=True, eq=False)
+class LidarTwist:
+    """The LiDAR's twist at the instant of an image, by odometry.
+
+    Attributes:
+        l_twist: (6,) in its own frame, at LiDAR time t_image_stamp + time_offset_0_s [rad/s, m/s].
+        l_acceleration: (6,) its rate of change [rad/s^2, m/s^2].
+        time_offset_0_s: the time offset under which it was looked up [s].
+
+    Raises:
+        FactorError: numbers of a wrong shape.
+    """
+
+    l_twist: FloatArray
+    l_acceleration: FloatArray
+    time_offset_0_s: float
+
+    def __post_init__(self) -> None:
+        for name in ("l_twist", "l_acceleration"):
+            object.__setattr__(self, name, checked_array(f"{name} of LidarTwist", getattr(self, name), (6,)))
+        time_offset_0_s = checked_number("time_offset_0_s of LidarTwist", self.time_offset_0_s)
+        object.__setattr__(self, "time_offset_0_s", time_offset_0_s)
+
+
 def twist_transfer_factor(
-    V_key: int,
-    E_key: int,
-    D_key: int,
-    l_twist: ArrayLike,
-    l_acceleration: ArrayLike,
-    time_offset_0_s: float,
-    covariance: ArrayLike,
+    V_key: int, E_key: int, D_key: int, lidar_twist: LidarTwist, covariance: ArrayLike
 ) -> gtsam.CustomFactor:
     """V - Ad(E) (l_twist + (D - time_offset_0_s) l_acceleration) [rad/s, m/s].
 
@@ -195,33 +230,22 @@ def twist_transfer_factor(
         V_key: camera twist at the image's instant.
         E_key: extrinsic cTl.
         D_key: time offset.
-        l_twist: (6,) LiDAR twist at LiDAR time t_image_stamp + time_offset_0_s [rad/s, m/s].
-        l_acceleration: (6,) its rate of change [rad/s^2, m/s^2].
-        time_offset_0_s: the time offset under which ``l_twist`` was looked up [s].
-        covariance: (6, 6) of ``l_twist``, expressed in the camera frame.
+        lidar_twist: of the LiDAR at the image's instant.
+        covariance: (6, 6) of its twist, expressed in the camera frame.
     """
-    measured = checked_array("l_twist", l_twist, (6,))
-    rate = checked_array("l_acceleration", l_acceleration, (6,))
     noise = gtsam.noiseModel.Gaussian.Covariance(checked_covariance("covariance of the twist", covariance, 6))
-    reference = float(checked_array("time_offset_0_s", [time_offset_0_s], (1,))[0])
     keys = {"V_key": V_key, "E_key": E_key, "D_key": D_key}
     kinds: list[Kind] = [Vector(6), gtsam.Pose3, Vector(1)]
-    function = partial(_twist_error, measured, rate, reference)
+    function = partial(_twist_error, lidar_twist)
     return custom_factor(noise, keys, function, kinds, 6, "twist_transfer_factor")
 
 
 def _twist_error(
-    measured: FloatArray,
-    rate: FloatArray,
-    time_offset_0_s: float,
-    twist: FloatArray,
-    cTl: gtsam.Pose3,
-    time_offset_s: FloatArray,
-    *,
-    jacobians: bool,
+    lidar: LidarTwist, twist: FloatArray, cTl: gtsam.Pose3, time_offset_s: FloatArray, *, jacobians: bool
 ) -> tuple[FloatArray, list[FloatArray] | None]:
+    since_s = float(time_offset_s[0]) - lidar.time_offset_0_s
     error, by_cTl, by_offset = transferred(
-        measured, rate, float(time_offset_s[0]) - time_offset_0_s, twist, cTl, jacobians
+        lidar.l_twist, lidar.l_acceleration, since_s, twist, cTl, jacobians
     )
     if by_cTl is None or by_offset is None:
         return error, None

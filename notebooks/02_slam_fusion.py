@@ -34,6 +34,7 @@ from sst_graph.batch import calibrate_prepared
 from sst_graph.drive.preparation import PrepareConfig, prepare_drive
 from sst_graph.factors import (
     Between,
+    CameraMotion,
     GroupedBias,
     RobustKernel,
     camera_motion_factor,
@@ -144,7 +145,7 @@ print(alone.status, alone.sigmas())
 
 
 def places(values):
-    """For every image: the poses around its true time, the LiDAR's twist there and its rate of change."""
+    """For every image: the scan before its true time, the poses around it and the LiDAR's motion there."""
     time_offset_s = float(values.atVector(D)[0])
     poses = [values.atPose3(X(k)) for k in range(N)]
     middles = 0.5 * (stamps_s[1:] + stamps_s[:-1])
@@ -156,44 +157,30 @@ def places(values):
         a = int(np.clip(np.searchsorted(stamps_s, stamp_s + time_offset_s, "right") - 1, 0, N - 2))
         between = Between(X(a), X(a + 1), stamps_s[a + 1] - stamps_s[a], stamp_s - stamps_s[a])
         twist = twists[a] + (stamp_s + time_offset_s - middles[a]) * rates[a]
-        found.append((a, between, twist, rates[a], stamp_s - middles[a]))
+        found.append((a, between, sst_graph.ScanMotion(twist, rates[a])))
     return found
 
 
 def add_silhouettes(graph, values, where, kernel_px):
     """Silhouettes of every image, and a bias for each vehicle in view."""
     seen = set()
-    for image, (a, between, twist, rate, after_middle_s) in zip(prepared.images, where, strict=True):
-        found = sst_graph.align_frame(
-            prepared.scans[a],
-            image,
-            drive.camera,
-            values.atPose3(E),
-            float(values.atVector(D)[0]),
-            twist,
-            l_acceleration=rate,
-            biases_px={VEHICLE: float(values.atVector(B)[0])},
-            kernel=RobustKernel("geman_mcclure", kernel_px),
-            config=MatchConfig(),
-        )
+    calibration = sst_graph.CameraCalibration(
+        drive.camera,
+        values.atPose3(E),
+        float(values.atVector(D)[0]),
+        {VEHICLE: float(values.atVector(B)[0])},
+    )
+    matching = sst_graph.FrameMatching(kernel=RobustKernel("geman_mcclure", kernel_px), config=MatchConfig())
+    for image, (a, between, motion) in zip(prepared.images, where, strict=True):
+        found = sst_graph.align_frame(prepared.scans[a], image, calibration, motion, matching)
         if not len(found):
             continue
         keys = [gtsam.symbol("o", tracks[a, VEHICLE, int(number)]) for number in found.objects[0]]
         biases, groups = np.unique(np.array(keys, dtype=np.uint64), return_inverse=True)
         biases = tuple(int(key) for key in biases)
         seen |= set(biases)
-        graph.add(
-            pose_alignment_factor(
-                found.alignments,
-                between.X_a,
-                between.X_b,
-                E,
-                D,
-                between.seconds,
-                biases_px=GroupedBias(biases, groups),
-                image_after_middle_s=after_middle_s,
-            )
-        )
+        bias = GroupedBias(biases, groups)
+        graph.add(pose_alignment_factor(found.alignments, between, E, D, bias))
     for key in seen:
         graph.add(gtsam.BetweenFactorVector(B, key, np.zeros(1), gtsam.noiseModel.Isotropic.Sigma(1, 0.5)))
     return seen
@@ -204,8 +191,8 @@ def add_visual_odometry(graph, values, where):
     cTl, time_offset_s = values.atPose3(E), float(values.atVector(D)[0])
 
     def depth(k):
-        a, between, twist, *_ = where[k]
-        moved = cTl * gtsam.Pose3.Expmap(-(between.image_after_a_s + time_offset_s) * twist)
+        a, between, motion = where[k]
+        moved = cTl * gtsam.Pose3.Expmap(-(between.image_after_a_s + time_offset_s) * motion.l_twist)
         return moved.transformFrom(prepared.scans[a].depth_lPs.T.astype(float)).T
 
     # between two poses the body does not quite move with one twist
@@ -213,8 +200,8 @@ def add_visual_odometry(graph, values, where):
     motions = metric_motions(prepared.image_pairs, drive.camera, depth)
     for (first, second), motion in zip(itertools.pairwise(where), motions, strict=True):
         if motion.ok:
-            covariance = motion.covariance + rough
-            graph.add(camera_motion_factor(first[1], second[1], E, D, motion.aTb, covariance))
+            measured = CameraMotion(motion.aTb, motion.covariance + rough)
+            graph.add(camera_motion_factor(first[1], second[1], E, D, measured))
 
 
 values = gtsam.Values(slam)

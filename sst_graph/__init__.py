@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sst_graph.factors import PinholeCamera
     from sst_graph.inspect.inspection import inspect_result
     from sst_graph.result import CalibrationResult
-    from sst_graph.slam.align import align_frame
+    from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
     from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
     from sst_graph.slam.alignment_term import AlignmentTerm
     from sst_graph.slam.covariance import calibration_covariance
@@ -29,11 +29,14 @@ __all__ = [
     "CalibrationConfig",
     "CalibrationMarginal",
     "CalibrationResult",
+    "CameraCalibration",
     "CameraImage",
     "Frame",
+    "FrameMatching",
     "IncrementalTerms",
     "PinholeCamera",
     "Scan",
+    "ScanMotion",
     "SemanticClass",
     "Source",
     "TrackUpdate",
@@ -54,11 +57,14 @@ _HOMES = {
     "CalibrationConfig": "sst_graph.batch",
     "CalibrationMarginal": "sst_graph.export",
     "CalibrationResult": "sst_graph.result",
+    "CameraCalibration": "sst_graph.slam.align",
     "CameraImage": "sst_graph.types",
     "Frame": "sst_graph.types",
+    "FrameMatching": "sst_graph.slam.align",
     "IncrementalTerms": "sst_graph.slam.incremental_terms",
     "PinholeCamera": "sst_graph.factors",
     "Scan": "sst_graph.types",
+    "ScanMotion": "sst_graph.slam.align",
     "SemanticClass": "sst_graph.types",
     "Source": "sst_graph.types",
     "TrackUpdate": "sst_graph.tracker",

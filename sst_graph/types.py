@@ -91,6 +91,8 @@ class Scan(ByValue):
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
         left_out: number of further points in the data, which were NaN or inf.
+        intensities: (n,) float32 strength of the return, in the data's own unit, or None where the data have
+            none; only networks use it.
     """
 
     stamp_ns: int
@@ -100,6 +102,7 @@ class Scan(ByValue):
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     left_out: int = 0
+    intensities: NDArray[np.float32] | None = None
 
     @property
     def has_labels(self) -> bool:

@@ -7,6 +7,9 @@ import numpy as np
 
 from sst_graph.factors import (
     Between,
+    CameraMotion,
+    LidarMotion,
+    LidarTwist,
     camera_motion_factor,
     frame_factor,
     hand_eye_factor,
@@ -15,6 +18,7 @@ from sst_graph.factors import (
     pose_alignment_factor,
     rotation_hand_eye,
     silhouette_factor,
+    stacked,
     twist_transfer_factor,
 )
 
@@ -46,27 +50,25 @@ class Bench:
 
     def makers(self):
         """By name, of (extrinsic, offset) to the factor on them."""
-        between = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
+        first, second = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
+        later = Between(X[0], X[1], 0.1, 0.02, X_scan=X[2])
+        seen, turned = CameraMotion(NEAR, COVARIANCE), NEAR.rotation()
+        driven = LidarMotion(NEAR, TWIST, 1.1 * TWIST, 0.0)
+        turn = LidarMotion.of_turn(turned, TWIST[:3], TWIST[:3], 0.0)
         points, contour = self.points, self.contour
         return {
             "frame_factor": lambda E, D: frame_factor([points, contour], E, D, V[0], [None, B]),
-            "stacked frame_factor": lambda E, D: frame_factor([points], E, D, V[0], condensed=False),
+            "stacked frame_factor": lambda E, D: stacked(frame_factor([points], E, D, V[0])),
             "point_to_pixel_factor": lambda E, D: point_to_pixel_factor(points, E, D, V[0]),
             "pixel_to_point_factor": lambda E, D: pixel_to_point_factor(points, E, D, V[0]),
             "silhouette_factor": lambda E, D: silhouette_factor(contour, E, D, V[0], B),
-            "pose_alignment_factor": lambda E, D: pose_alignment_factor([points], X[0], X[1], E, D, 0.1),
-            "with acceleration": lambda E, D: pose_alignment_factor(
-                [points], X[0], X[1], E, D, 0.1, X_scan=X[2], image_after_middle_s=0.02
-            ),
-            "camera_motion_factor": lambda E, D: camera_motion_factor(*between, E, D, NEAR, COVARIANCE),
-            "hand_eye_factor": lambda E, D: hand_eye_factor(
-                E, D, NEAR, NEAR, TWIST, 1.1 * TWIST, 0.0, COVARIANCE
-            ),
-            "rotation_hand_eye": lambda E, D: rotation_hand_eye(
-                E, D, NEAR.rotation(), NEAR.rotation(), TWIST[:3], TWIST[:3], 0.0, COVARIANCE[:3, :3]
-            ),
+            "pose_alignment_factor": lambda E, D: pose_alignment_factor([points], first, E, D),
+            "with a scan of another time": lambda E, D: pose_alignment_factor([points], later, E, D),
+            "camera_motion_factor": lambda E, D: camera_motion_factor(first, second, E, D, seen),
+            "hand_eye_factor": lambda E, D: hand_eye_factor(E, D, seen, driven),
+            "rotation_hand_eye": lambda E, D: rotation_hand_eye(E, D, turned, turn, COVARIANCE[:3, :3]),
             "twist_transfer_factor": lambda E, D: twist_transfer_factor(
-                V[0], E, D, TWIST, 0.1 * TWIST, 0.0, COVARIANCE
+                V[0], E, D, LidarTwist(TWIST, 0.1 * TWIST, 0.0), COVARIANCE
             ),
         }
 
@@ -78,7 +80,7 @@ NAMES = [
     "pixel_to_point_factor",
     "silhouette_factor",
     "pose_alignment_factor",
-    "with acceleration",
+    "with a scan of another time",
     "camera_motion_factor",
     "hand_eye_factor",
     "rotation_hand_eye",

@@ -14,6 +14,7 @@ import numpy as np
 
 from sst_graph.data import open_source
 from sst_graph.data.kitti.calib import read_calibration
+from sst_graph.data.scan_order import rings_from_order
 from sst_graph.timestamps import read_times
 
 EPOCH_NS = 1_317_042_145_000_000_000
@@ -123,10 +124,13 @@ def pose_record(pose: gtsam.Pose3) -> dict[str, list[float]]:
     return {"translation": t, "rotation": [q.w(), q.x(), q.y(), q.z()]}
 
 
-def as_nuscenes(odometry: Path, root: Path) -> Path:
+def as_nuscenes(odometry: Path, root: Path, labels: bool = True, rings_by_order: bool = False) -> Path:
     """The drive as scene-0061 of nuScenes, every second frame a key frame with lidarseg labels: 17 a car.
 
     A second scene and a second camera stand in the tables, without files. Stamps are later by EPOCH_NS.
+
+    Args:
+        rings_by_order: rings as KITTI's readers find them; else they count up from 0.
     """
     source, stamps = open_source(odometry), read_times(odometry / "times.txt")
     camera = source.camera
@@ -160,7 +164,8 @@ def as_nuscenes(odometry: Path, root: Path) -> Path:
         if kind == "samples":
             samples.append({"token": f"sample-{k}", "scene_token": "t-1", "timestamp": stamp_us})
         values = np.fromfile(odometry / f"velodyne/{k:06d}.bin", "<f4").reshape(-1, 4)
-        rings = np.arange(len(values)) % 32
+        found = rings_from_order(values[:, :3]) if rings_by_order else None
+        rings = np.arange(len(values)) % 32 if found is None else found
         cloud = f"{kind}/LIDAR_TOP/n015__LIDAR_TOP__{stamp_us}.pcd.bin"
         np.column_stack([values, rings]).astype("<f4").tofile(root / cloud)
         picture = f"{kind}/CAM_FRONT/n015__CAM_FRONT__{stamp_us}.png"
@@ -182,10 +187,10 @@ def as_nuscenes(odometry: Path, root: Path) -> Path:
             },
             {"token": f"c-{k}", "calibrated_sensor_token": "c-c", **shared, **size, "filename": picture},
         ]
-        if kind == "samples":
-            labels = np.fromfile(odometry / f"labels/{k:06d}.label", "<u4") & 0xFFFF
+        if kind == "samples" and labels:
+            classes = np.fromfile(odometry / f"labels/{k:06d}.label", "<u4") & 0xFFFF
             name = f"lidarseg/v1.0-mini/l-{k}_lidarseg.bin"
-            np.where(labels == 10, 17, 24).astype(np.uint8).tofile(root / name)
+            np.where(classes == 10, 17, 24).astype(np.uint8).tofile(root / name)
             lidarseg.append({"token": f"l-{k}", "sample_data_token": f"l-{k}", "filename": name})
     data.append({**data[0], "token": "x", "sample_token": "other", "filename": "samples/none.bin"})
     scenes = [{"token": "t-1", "name": "scene-0061"}, {"token": "t-2", "name": "scene-0103"}]

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TypeVar, cast
 
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
-from sst_graph.types import Frame
+from sst_graph.types import CameraImage, Frame, Scan
 
 FOLDER = "SST_GRAPH_TEST_FOLDER"
 """Environment variable: folder of the session, made by conftest.py before the workers start."""
@@ -49,6 +49,18 @@ def _name(key: object) -> str:
 @dataclass(frozen=True)
 class StoredDrive(SimulatedDrive):
     """A simulated drive whose frames are :func:`stored`."""
+
+    def read_scan(self, position: int) -> Scan:
+        scan = self[position].scan
+        assert scan is not None
+        return scan
+
+    def read_image(self, position: int) -> CameraImage:
+        if simulated(self.config) is not self:
+            return super().read_image(position)
+        image = self[position].image
+        assert image is not None
+        return image
 
     def __getitem__(self, position: int) -> Frame:
         if simulated(self.config) is not self:  # changed since: a drive of its own

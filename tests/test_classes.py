@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from sst_graph.classes import (
-    CITYSCAPES_IDS,
-    CITYSCAPES_TRAIN_IDS,
-    SEMANTIC_KITTI,
+    CLASS_MAPS,
     MaskEncoding,
+    cityscapes_ids_of,
+    class_map,
+    class_of_name,
     classes_of_mask,
     classes_of_points,
     guess_mask_encoding,
+    map_of_names,
+    semantic_kitti_of,
 )
-from sst_graph.errors import DataError
+from sst_graph.classes.data_sets import CITYSCAPES_IDS, CITYSCAPES_TRAIN_IDS, SEMANTIC_KITTI
+from sst_graph.errors import ConfigError, DataError
 from sst_graph.types import SemanticClass
 
 MOVING_TO_STATIC = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
@@ -47,7 +51,7 @@ def test_point_labels_split_into_class_and_instance() -> None:
 
 def test_moving_classes_fold_into_static_ones() -> None:
     for moving, static in MOVING_TO_STATIC.items():
-        assert SEMANTIC_KITTI[moving] == SEMANTIC_KITTI[static]
+        assert SEMANTIC_KITTI.classes[moving] == SEMANTIC_KITTI.classes[static]
 
 
 @pytest.mark.parametrize("label", [2, 12, 100, 260, 65535])
@@ -58,8 +62,8 @@ def test_undefined_point_label_is_refused(label: int) -> None:
 
 def test_ids_and_train_ids_name_the_same_classes() -> None:
     for train_id, name in enumerate(TRAIN_ID_NAMES):
-        assert CITYSCAPES_TRAIN_IDS[train_id].name == name
-    vehicles = {label for label, c in CITYSCAPES_IDS.items() if c == SemanticClass.VEHICLE}
+        assert CITYSCAPES_TRAIN_IDS.classes[train_id].name == name
+    vehicles = {label for label, c in CITYSCAPES_IDS.classes.items() if c == SemanticClass.VEHICLE}
     assert vehicles == {26, 27, 28, 29, 30, 31}
 
 
@@ -94,3 +98,73 @@ def test_encoding_is_guessed_from_the_masks(masks: list[np.ndarray], encoding: M
 def test_number_of_neither_encoding_is_refused() -> None:
     with pytest.raises(DataError, match="semantic_2: found label 77, expected Cityscapes ids"):
         guess_mask_encoding([mask_of(0, 13), mask_of(77)], "semantic_2")
+
+
+NUMBERED = {
+    "cityscapes-trainids": (19, {0: "road", 13: "car", 18: "bicycle"}),
+    "semantickitti-20": (20, {1: "car", 9: "road", 19: "traffic-sign"}),
+    "semantickitti-19": (19, {0: "car", 8: "road", 18: "traffic-sign"}),
+    "nuscenes-17": (17, {4: "car", 11: "driveable_surface", 16: "vegetation"}),
+    "nuscenes-16": (16, {3: "car", 15: "vegetation"}),
+    "coco": (201, {3: "car", 8: "truck", 13: "stop sign", 149: "road", 187: "sky-other-merged"}),
+    "coco-80": (80, {2: "car", 7: "truck", 11: "stop sign", 79: "toothbrush"}),
+    "coco-133": (133, {2: "car", 80: "banner", 132: "rug-merged"}),
+    "ade20k": (151, {7: "road", 21: "car", 81: "bus", 84: "truck", 103: "van", 150: "flag"}),
+    "ade20k-150": (150, {6: "road", 20: "car", 80: "bus", 93: "pole", 149: "flag"}),
+    "mapillary": (66, {13: "Road", 27: "Sky", 45: "Pole", 55: "Car", 61: "Truck", 65: "Unlabeled"}),
+}
+"""Outputs of a network, and some of the published names by number."""
+
+
+@pytest.mark.parametrize("name", NUMBERED)
+def test_numbers_are_the_published_ones(name: str) -> None:
+    outputs, names = NUMBERED[name]
+    one = class_map(name)
+    assert one.outputs == outputs
+    assert {number: one.names[number] for number in names} == names
+    assert SemanticClass.VEHICLE in one.known
+    meaning = {"car": "VEHICLE", "truck": "VEHICLE", "bus": "VEHICLE", "road": "GROUND"}
+    for number, label in names.items():
+        assert label.lower() not in meaning or one.classes[number].name == meaning[label.lower()]
+
+
+def test_every_map_is_known_by_its_name_and_says_where_it_is_from() -> None:
+    for name, one in CLASS_MAPS.items():
+        assert one.name == name
+        assert one.source
+        assert one.classes.keys() == one.names.keys()
+    with pytest.raises(ConfigError, match="class map 'pascal': expected one of cityscapes-ids, "):
+        class_map("pascal")
+
+
+def test_names_of_labels_mean_classes() -> None:
+    assert class_of_name("Traffic Sign (Front)") == SemanticClass.SIGN
+    assert class_of_name("building, edifice") == SemanticClass.BUILDING
+    assert class_of_name("moving_car") == SemanticClass.VEHICLE
+    assert class_of_name("LABEL_3") is None
+    cityscapes = [CITYSCAPES_TRAIN_IDS.names[k] for k in range(19)]
+    assert map_of_names(cityscapes) is CITYSCAPES_TRAIN_IDS
+    assert map_of_names(cityscapes[::-1]) is None
+
+
+def test_classes_come_back_from_their_stored_numbers() -> None:
+    classes = np.array([int(c) for c in SemanticClass], np.uint8)
+    assert (classes_of_mask(cityscapes_ids_of(classes[None]), MaskEncoding.IDS)[0] == classes).all()
+    points = classes[classes != SemanticClass.SKY]  # no point of a cloud is sky
+    instances = np.arange(len(points), dtype=np.uint16)
+    back, numbers = classes_of_points(semantic_kitti_of(points, instances))
+    assert (back == points).all()
+    assert (numbers == instances).all()
+
+
+@pytest.mark.parametrize(
+    ("encoding", "number", "label"),
+    [
+        ("coco", 3, "VEHICLE"),
+        ("ade20k-150", 20, "VEHICLE"),
+        ("mapillary", 17, "BUILDING"),
+        ("coco", 255, "IGNORE"),
+    ],
+)
+def test_masks_of_other_data_sets(encoding: str, number: int, label: str) -> None:
+    assert SemanticClass(classes_of_mask(mask_of(number), MaskEncoding(encoding))[0, 0]).name == label

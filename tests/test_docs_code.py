@@ -87,6 +87,8 @@ def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
     assert (np.abs([*apart, late]) < 4.0 * sigmas).all()
     start = truth.cTl.localCoordinates(found["drive"].nominal)
     assert np.linalg.norm(apart[:3]) < 0.25 * np.linalg.norm(start[:3]) and abs(late) < 0.01
+    factor, by_hand = found["factor"], found["matches"]
+    assert len(by_hand) > 50 and factor.error(solution.values) < len(by_hand)
 
 
 def test_links_between_pages_lead_somewhere() -> None:

@@ -81,7 +81,8 @@ def check_jacobians(
         FactorError: an error above the tolerance; the message names variable, row and column.
     """
     A, _ = factor.linearize(values).jacobian()
-    return _compare("Jacobian", factor, values, np.asarray(A), factor.whitenedError, tolerance, step)
+    numerical = _numerical(factor, values, factor.whitenedError, step)
+    return _report("Jacobian", np.asarray(A), numerical, tolerance)
 
 
 def check_gradient(
@@ -98,26 +99,29 @@ def check_gradient(
     def cost(x: gtsam.Values) -> FloatArray:
         return np.array([factor.error(x)])
 
-    return _compare("gradient", factor, values, gradient, cost, tolerance, step)
+    return _report("gradient", gradient, _numerical(factor, values, cost, step), tolerance)
 
 
-def _compare(
-    what: str,
+def _numerical(
     factor: gtsam.NonlinearFactor,
     values: gtsam.Values,
-    analytic: FloatArray,
     function: Callable[[gtsam.Values], FloatArray],
-    tolerance: float,
     step: float,
-) -> JacobianReport:
-    keys = [int(key) for key in factor.keys()]  # noqa: SIM118  (a gtsam factor, no dict)
+) -> dict[int, FloatArray]:
+    """(rows, dim) derivative of a function by each variable of a factor, in the factor's order."""
     zeros = values.localCoordinates(values)
-    dims = [len(zeros.at(key)) for key in keys]
-    numerical = [_derivative(function, values, key, dim, step) for key, dim in zip(keys, dims, strict=True)]
-    floor = 1e-6 * max(float(np.abs(block).max(initial=0.0)) for block in numerical)
-    pieces = np.split(analytic, np.cumsum(dims)[:-1], axis=1)
+    keys = [int(key) for key in factor.keys()]  # noqa: SIM118  (a gtsam factor, no dict)
+    return {key: _derivative(function, values, key, len(zeros.at(key)), step) for key in keys}
+
+
+def _report(
+    what: str, analytic: FloatArray, numerical: dict[int, FloatArray], tolerance: float
+) -> JacobianReport:
+    """The comparison; ``analytic`` has the columns of all variables."""
+    floor = 1e-6 * max(float(np.abs(block).max(initial=0.0)) for block in numerical.values())
+    ends = np.cumsum([block.shape[1] for block in numerical.values()])[:-1]
     blocks = []
-    for key, found, expected in zip(keys, pieces, numerical, strict=True):
+    for (key, expected), found in zip(numerical.items(), np.split(analytic, ends, axis=1), strict=True):
         scale = max(float(np.abs(expected).max(initial=0.0)), floor, 1e-12)
         difference = float(np.abs(found - expected).max(initial=0.0))
         blocks.append(JacobianBlock(key, found, expected, difference / scale))

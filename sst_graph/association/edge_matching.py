@@ -23,7 +23,7 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import move_points, moved_pose
+from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours
@@ -75,14 +75,6 @@ degrees are other edges."""
 MIN_OBJECT_SHARE = 0.1
 """Least fraction of an object's boundary points in view that must have a match. An object that the image's
 labels miss crosses contours of others in a few places only."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """Camera motion around one image: twist at its instant and the twist's rate of change, (6,) each."""
-
-    c_twist: FloatArray
-    c_acceleration: FloatArray
 
 
 class PointDeviation(Protocol):
@@ -146,7 +138,7 @@ class PairedEdges:
     owners: IntArray
     bounds: IntArray
     contours: Sequence[ContourMap | PictureGradients]
-    motions: Sequence[Motion]
+    motions: Sequence[CameraTwist]
     base_taus_s: FloatArray
     biases_px: FloatArray
     velocities: FloatArray | None = None
@@ -182,12 +174,12 @@ class PairedEdges:
         groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
         starts = [a for a, _, _ in groups]
         if not all((taus[a:b] == taus[a]).all() for a, b, _ in groups):
-            twists, accelerations = (self.repeated(each).T for each in self._motion_rows())
-            return np.asarray(move_points(cTl, columns, taus, twists, accelerations).cPs.T)
+            each = CameraTwist(*(self.repeated(rows).T for rows in self._motion_rows()))
+            return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
         # Every group moves as one rigid body.
         cPs = np.empty_like(columns)
         for (a, b, motion), tau_s in zip(groups, taus[starts].tolist(), strict=True):
-            moved = moved_pose(cTl, tau_s, motion.c_twist, motion.c_acceleration)
+            moved = moved_pose(cTl, tau_s, motion)
             np.matmul(moved.rotation().matrix(), columns[:, a:b], out=cPs[:, a:b])
             cPs[:, a:b] += np.asarray(moved.translation()).reshape(3, 1)
         return cPs.T
@@ -248,7 +240,7 @@ class ScanWithImage:
     contours: Mapping[SemanticClass, ContourMap | PictureGradients]
     camera: PinholeCamera
     base_tau_s: float
-    motion: Motion
+    motion: CameraTwist
     velocities: Mapping[SemanticClass, FloatArray] | None = None
 
 
@@ -340,7 +332,9 @@ def match_edges(
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = paired.projected(paired.points.outward, cTl, time_offset_s)
-        feet, shares = _contours_or_gradients(paired, uvs, tips - (uvs if shift is None else ideal[index]), kernel)
+        feet, shares = _contours_or_gradients(
+            paired, uvs, tips - (uvs if shift is None else ideal[index]), kernel
+        )
     else:
         feet, shares = nearest_contours(paired.contours, paired.spans, uvs), None
     residuals = feet.distances + paired.repeated(paired.biases_px)
@@ -392,13 +386,17 @@ def _contours_or_gradients(
         The contours, and (n,) the share of its full weight that each has.
     """
     n, biases = len(uvs), paired.repeated(paired.biases_px)
-    by_gradient = paired.repeated([isinstance(each, PictureGradients) for each in paired.contours]).astype(bool)
+    by_gradient = paired.repeated([isinstance(each, PictureGradients) for each in paired.contours]).astype(
+        bool
+    )
     distances, shares, valid = np.zeros(n), np.ones(n), np.zeros(n, np.bool_)
     normals, feet = np.tile([1.0, 0.0], (n, 1)), uvs.copy()
     masked, unmasked = np.flatnonzero(~by_gradient), np.flatnonzero(by_gradient)
     for index in (masked, unmasked):
         some = paired.take(index)
-        groups = [(each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]]
+        groups = [
+            (each, span) for each, span in zip(some.contours, some.spans, strict=True) if span[1] > span[0]
+        ]
         if not groups:
             continue
         spans, own = [span for _, span in groups], uvs[index]

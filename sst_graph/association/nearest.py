@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from sst_graph.factors import Alignment, MotionModel, PinholeCamera, move_points
+from sst_graph.factors import Alignment, CameraTwist, MotionModel, PinholeCamera, move_points
 
 FloatArray = NDArray[np.float64]
 
@@ -143,7 +143,8 @@ def match_nearest(
         max_px: points farther than this from their pixel are left out [px].
     """
     tau_s = time_offset_s + view.base_tau_s
-    cPs = move_points(cTl, view.lPs.T, tau_s, c_twist, np.zeros(6), _MOTION_MODEL).cPs.T
+    motion = CameraTwist(c_twist, np.zeros(6))
+    cPs = move_points(cTl, view.lPs.T, tau_s, motion, _MOTION_MODEL).cPs.T
     uvs = view.camera.project(cPs)
     on_image = np.flatnonzero(view.camera.in_front(cPs) & view.camera.in_image(uvs))
     if len(on_image) == 0:

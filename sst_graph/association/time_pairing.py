@@ -1,4 +1,4 @@
-"""Which image belongs to which scan, by true time."""
+"""Which images belong to which scan, by true time."""
 
 from __future__ import annotations
 
@@ -40,6 +40,18 @@ def pair_by_time(
     return [
         Pair(scan, int(images[0, scan]), float(base_taus_s[0, scan]))
         for scan in np.flatnonzero(images[0] >= 0).tolist()
+    ]
+
+
+def pair_every_image(
+    scan_stamps_ns: Sequence[int], image_stamps_ns: Sequence[int], time_offset_s: float, max_interval_s: float
+) -> list[Pair]:
+    """Each image with the scan closest to it in true time; arguments as of :func:`pair_by_time`."""
+    away_s = np.array([-time_offset_s])
+    scans, base_taus_s = nearest_images(image_stamps_ns, scan_stamps_ns, away_s, max_interval_s)
+    return [
+        Pair(int(scans[0, image]), image, -float(base_taus_s[0, image]))
+        for image in np.flatnonzero(scans[0] >= 0).tolist()
     ]
 
 

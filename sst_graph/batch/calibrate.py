@@ -13,13 +13,13 @@ from sst_graph.batch.baselines import paper_method, semalign_method, static_meth
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
+from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
     joint_diagnostics,
     joint_reasons,
     label_agreement,
     unknown_motion_remarks,
 )
-from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.method_estimate import (
     Guess,
     MethodEstimate,
@@ -31,7 +31,7 @@ from sst_graph.batch.method_estimate import (
 from sst_graph.batch.motion_factor import may_use_motion, with_motion
 from sst_graph.batch.motion_method import motion_method
 from sst_graph.batch.part_solver import PartSolver
-from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.problem import CalibrationProblem, JointEstimate, JointOutcome
 from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
@@ -89,6 +89,8 @@ def prepare_drives(
     prepare = config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
+    if config.method not in _NEED_DEPTH:
+        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     classes = config.classes
@@ -112,9 +114,18 @@ def calibrate_prepared(
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
     config = config or CalibrationConfig()
     guess = Guess(initial, initial_time_offset_s)
+    method = _METHODS[config.method]
+    return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
+
+
+def finished(
+    run: Callable[[], MethodEstimate], drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
+) -> tuple[CalibrationResult, MethodEstimate | None]:
+    """The result of what ``run`` estimates, and the estimate itself; None where it finds none."""
     began = time.perf_counter()
+    estimate = None
     try:
-        estimate = _METHODS[config.method](drives, guess, config, progress)
+        estimate = run()
         result = result_of(estimate, drives, guess, config)
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
@@ -125,7 +136,7 @@ def calibrate_prepared(
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
         diagnostics["left_out"] = left_out
-    return replace(result, diagnostics=diagnostics)
+    return replace(result, diagnostics=diagnostics), estimate
 
 
 def _check(sources: Sequence[Source], config: CalibrationConfig) -> None:
@@ -144,7 +155,12 @@ def joint_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> MethodEstimate:
     """The default: a global search, then object outlines over the whole drive in one factor graph."""
-    problem = CalibrationProblem.of(drives, guess, config, progress)
+    return solve_problem(CalibrationProblem.of(drives, guess, config, progress))
+
+
+def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
+    """The steps of the joint method."""
+    drives = problem.drives
     # 1. Start: a global search, whose candidates are compared on a few scans.
     start = problem.start()
     # 2. Outlines over all frames, from the best start and from others that are nearly as good.
@@ -179,6 +195,7 @@ def joint_method(
         | {"start_score": start.score, "contradictions": contradictions.diagnostics}
         | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
         | joint_diagnostics(problem, motion.estimate, lower),
+        JointOutcome(problem, motion.estimate, assumptions.considered),
     )
 
 
@@ -193,6 +210,9 @@ _METHODS: dict[Method, _Method] = {
 }
 _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 """Methods whose camera velocity comes from visual odometry."""
+_TRACK_INTERVAL_S = 0.07
+"""Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
+known as well after 33 ms as after 100 ms, the rate of turn is not."""
 _NO_LABELS = ("edges",)
 """Methods whose data nobody labelled, so that labels do not tell what is wrong."""
 _NEED_DEPTH = ("paper", "static")

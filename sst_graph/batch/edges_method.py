@@ -190,9 +190,7 @@ def _time_offsets(calibration: CalibrationProblem, motion: MotionSolution | None
     return tuple((guess + _OFFSETS_S).tolist()) if moving else (guess,)
 
 
-def _region(
-    guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[float, ...]
-) -> SearchRegion:
+def _region(guess: Guess, motion: MotionSolution | None, time_offsets_s: tuple[float, ...]) -> SearchRegion:
     """Guess and motion together; where one says nothing, what the other says."""
     if motion is None:
         assert guess.cTl is not None
@@ -276,9 +274,7 @@ def _solved(
 ) -> JointSolution:
     """The best candidate on all frames; one that begins at another roll, where that agrees better."""
     best = candidates[0]
-    rolled = [
-        replace(best[1].state, cTl=_rolled(best[1].state.cTl, np.radians(roll))) for roll in _ROLLS_DEG
-    ]
+    rolled = [replace(best[1].state, cTl=_rolled(best[1].state.cTl, np.radians(roll))) for roll in _ROLLS_DEG]
     again = _refined(problem, rolled)
     candidates += [one for one in again if angle_deg(one[1].state.cTl, best[1].state.cTl) > _SAME_DEG]
     candidates.sort(key=lambda pair: -pair[0])

@@ -59,9 +59,7 @@ class EdgeContrast:
         return asdict(self)
 
 
-def edge_contrast(
-    problem: JointProblem, state: State, others: Sequence[State], seed: int
-) -> EdgeContrast:
+def edge_contrast(problem: JointProblem, state: State, others: Sequence[State], seed: int) -> EdgeContrast:
     """Scores at the estimate, at random rotations around it, and at other solutions."""
     edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import gtsam
@@ -28,6 +28,9 @@ from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
 from sst_graph.result import CalibrationResult, DriveOffset, FrameId, Status, WeakDirection
+
+if TYPE_CHECKING:
+    from sst_graph.batch.problem import JointOutcome
 
 FloatArray = NDArray[np.float64]
 
@@ -71,6 +74,7 @@ class MethodEstimate:
         drive_offsets: an offset for each drive, with ``time_offset_per_drive``.
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
+        solved: the problem of the joint graph with its matches; None of methods without such a graph.
     """
 
     cTl: gtsam.Pose3
@@ -83,6 +87,7 @@ class MethodEstimate:
     drive_offsets: tuple[DriveOffset, ...] = ()
     by_drive: tuple[DriveCovariance, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    solved: JointOutcome | None = None
 
 
 def result_of(
@@ -153,10 +158,8 @@ def _jumps(drives: Sequence[Drive]) -> list[str]:
 
 def frames_used(drives: Sequence[Drive], solution: JointSolution) -> tuple[FrameId, ...]:
     """The scans of a joint solution's pairs."""
-    return tuple(
-        FrameId(drives[pair.drive].name, drives[pair.drive].scans[pair.pair.scan].index)
-        for pair in solution.pairs
-    )
+    scans = dict.fromkeys((pair.drive, pair.pair.scan) for pair in solution.pairs)
+    return tuple(FrameId(drives[drive].name, drives[drive].scans[scan].index) for drive, scan in scans)
 
 
 def drive_offsets(drives: Sequence[Drive], state: State, covariance: FloatArray) -> tuple[DriveOffset, ...]:

@@ -12,6 +12,7 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.lower_edges import WithLowerEdges, with_lower_edges
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.covariance.cluster_robust import RobustCovariance, robust_covariance
+from sst_graph.covariance.considered import Considered
 from sst_graph.covariance.static_objects import static_covariance
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.graph.building import GraphConfig, Tracks
@@ -61,6 +62,7 @@ class CalibrationProblem:
     ) -> CalibrationProblem:
         """The problem with objects tracked."""
         config = config.estimating
+        config = replace(config, noise=replace(config.noise, every_image=True))
         objects = [object_tracks(drive) for drive in drives]
         by_object = config.noise.object_bias_sigma_px > 0.0
         tracks = Tracks(drives, objects if by_object else None)
@@ -136,3 +138,18 @@ class JointEstimate:
         """The solution with the covariance of its last matches."""
         robust = robust_covariance(solution.graph, solution.values, solution.pairs, solution.state, objects)
         return cls(solution, robust, robust.matrix, static_covariance(robust, solution.pairs))
+
+
+@dataclass(frozen=True)
+class JointOutcome:
+    """A problem and its estimate, with the matches, the graph and the covariance's parts.
+
+    Attributes:
+        problem: with the noise that it was solved with.
+        estimate: of it.
+        considered: what assumptions add to the covariance.
+    """
+
+    problem: CalibrationProblem
+    estimate: JointEstimate
+    considered: Considered

@@ -94,6 +94,8 @@ def camera_from_camera_info(
         raise DataError(place, "binning or a region of interest", "images of the full sensor")
     if rectified:
         P = _matrix(_either(info, "P", "p", place), (3, 4), f"{place}: P")
+        if not P.any():
+            raise DataError(place, "P = 0, an uncalibrated camera", "a calibrated one")
         return BrownConradyCamera(_pinhole(P[:, :3], width, height, f"{place}: P"))
     K = _matrix(_either(info, "K", "k", place), (3, 3), f"{place}: K")
     if not K.any():
@@ -244,7 +246,7 @@ def camera_from_nuscenes(
             sixth is another model's).
     """
     values = calibrated_sensor.get("camera_intrinsic")
-    if values is None or not len(values):
+    if values is None or values == []:
         raise DataError(place, "no camera_intrinsic", "the record of a camera")
     K = _matrix(values, (3, 3), f"{place}: camera_intrinsic")
     given = calibrated_sensor.get("camera_distortion")

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import gtsam
 
+from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
 from sst_graph.errors import ConfigError
@@ -62,6 +63,17 @@ def settings(default: T, args: argparse.Namespace, flags: dict[str, Any]) -> T:
     config = default if args.config is None else read_config(type(default), args.config)
     given = [f"{name}={json.dumps(value)}" for name, value in flags.items() if value is not None]
     return with_overrides(config, [*given, *args.settings])
+
+
+def calibration_settings(args: argparse.Namespace) -> CalibrationConfig:
+    """The settings that ``calibrate`` was given."""
+    flags = {
+        "method": args.method,
+        "classes": chosen_classes(args.classes),
+        "time_offset_per_drive": args.time_offset_per_drive,
+        "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
+    }
+    return settings(CalibrationConfig(), args, flags)
 
 
 def chosen_classes(text: str | None) -> list[str] | None:

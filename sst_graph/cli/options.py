@@ -68,6 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_overlay,
         _add_export,
         _add_info,
+        _add_segment,
         _add_settings_command,
         _add_experiment,
     ):
@@ -115,6 +116,9 @@ def _add_simulate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
     simulate.add_argument(
         "--rolling", action="store_true", default=None, help="measure each point at its own time"
     )
+    simulate.add_argument(
+        "--stereo", action="store_true", help="write image_3 and semantic_3 as well, 0.53 m to the right"
+    )
     _add_settings(simulate)
     simulate.add_argument("--overwrite", action="store_true", help="replace an earlier drive in OUT")
     return simulate
@@ -129,9 +133,10 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         f"y down, z forward), {SIGN}. Several drives share one extrinsic.",
     )
     calibrate.add_argument(
-        "data", metavar="DATA", type=Path, nargs="+", help="dataset or sequence folder, or a bag"
+        "data", metavar="DATA", type=Path, nargs="*", help="dataset or sequence folder, or a bag"
     )
-    _add_source_options(calibrate)
+    _add_source_options(calibrate, several_cameras=True)
+    _add_label_options(calibrate)
     calibrate.add_argument(
         "--method",
         choices=("joint", "paper", "static", "semalign", "motion"),
@@ -157,6 +162,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     _add_estimate(calibrate)
     _add_settings(calibrate)
+    _add_rig(calibrate)
     calibrate.add_argument(
         "--out",
         type=Path,
@@ -166,6 +172,25 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
+
+
+def _add_rig(command: _Parser) -> None:
+    """What is known of several cameras."""
+    rig = command.add_argument_group("several cameras (docs/rigs.md)")
+    rig.add_argument(
+        "--rig",
+        metavar="dataset|FILE",
+        help="known poses between the cameras: those of the data's nominal calibration, or of Kalibr's "
+        "camchain.yaml (T_cn_cnm1) or KITTI's calib.txt",
+    )
+    rig.add_argument(
+        "--rig-sigma",
+        metavar="DEG,CM",
+        help="how well these are known, one sigma along each axis (default 0.03,0.2)",
+    )
+    rig.add_argument(
+        "--one-trigger", action="store_true", help="all cameras are triggered together: one time offset"
+    )
 
 
 def _add_estimate(command: _Parser) -> None:
@@ -183,6 +208,7 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
     track = commands.add_parser("track", help=text, description=text)
     track.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
     _add_source_options(track)
+    _add_label_options(track)
     track.add_argument(
         "--init",
         metavar="dataset|none|FILE",
@@ -251,6 +277,7 @@ def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argu
     overlay.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     overlay.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder")
     _add_source_options(overlay)
+    _add_label_options(overlay)
     overlay.add_argument(
         "--frame", type=int, metavar="K", help="index of the frame to draw (default: the middle one)"
     )
@@ -314,8 +341,27 @@ def _add_info(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argumen
     info = commands.add_parser("info", help=text, description=text)
     info.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
     _add_source_options(info)
+    _add_label_options(info)
     info.add_argument("--json", action="store_true", help="print JSON (units in the names)")
     return info
+
+
+def _add_segment(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "label a drive by networks ahead of its calibration, and keep the labels"
+    segment = commands.add_parser(
+        "segment", help=text, description=f"{text[0].upper()}{text[1:]}; docs/networks.md has examples."
+    )
+    segment.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
+    _add_source_options(segment)
+    _add_networks(segment.add_argument_group("networks (docs/networks.md)"))
+    segment.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="folder of labels, for --labels DIR; what it has is not made again (default: the user's cache, "
+        "where the other commands look for the labels of their networks)",
+    )
+    return segment
 
 
 def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
@@ -368,12 +414,16 @@ SOURCE_DEFAULTS: dict[str, str | int | float | None] = {
     "info_topic": None,
     "mask_topic": None,
     "stamps": "header",
+    "label_encoding": "auto",
+    "image_model": None,
+    "lidar_model": None,
+    "labels": None,
 }
 """How a drive is read where neither the command line nor a result says it. The parser leaves these options
 None where they are not given: :mod:`sst_graph.cli.reading` fills them in."""
 
 
-def _add_source_options(command: argparse.ArgumentParser) -> None:
+def _add_source_options(command: argparse.ArgumentParser, several_cameras: bool = False) -> None:
     """How a drive is read."""
     source = command.add_argument_group("data")
     source.add_argument(
@@ -382,13 +432,23 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
     )
     source.add_argument("--sequence", metavar="NN", help="sequence of a dataset folder, such as 00")
     source.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
-    source.add_argument("--camera", help=f"camera folder (default {SOURCE_DEFAULTS['camera']})")
+    named = f"camera folder, nuScenes channel or image topic (default {SOURCE_DEFAULTS['camera']})"
+    if several_cameras:
+        source.add_argument("--camera", nargs="+", metavar="NAME", help=f"{named}; several: a rig")
+    else:
+        source.add_argument("--camera", metavar="NAME", help=named)
     source.add_argument("--cloud", help=f"folder of the scans (default {SOURCE_DEFAULTS['cloud']})")
     source.add_argument(
         "--image-shift",
         type=int,
         metavar="N",
         help="pair scan k with image k+N, stamped as if it were image k: an offset of N frame times",
+    )
+    source.add_argument(
+        "--label-encoding",
+        choices=("auto", "ids", "trainids", "coco", "coco-133", "ade20k", "ade20k-150", "mapillary"),
+        help="numbers of stored masks: Cityscapes ids or trainids (auto: the one that fits), or those of "
+        "another data set",
     )
     source.add_argument(
         "--sweep",
@@ -427,6 +487,32 @@ def _add_source_options(command: argparse.ArgumentParser) -> None:
         "--stamps",
         choices=("header", "received"),
         help="stamps of the headers (default), or the times of recording, where headers have none",
+    )
+
+
+def _add_label_options(command: argparse.ArgumentParser) -> None:
+    """Labels in the place of the data's own."""
+    networks = command.add_argument_group("labels by networks (docs/networks.md)")
+    _add_networks(networks)
+    networks.add_argument(
+        "--labels",
+        metavar="DIR",
+        help="folder of labels that segment wrote; labels that networks make now are kept there, too",
+    )
+
+
+def _add_networks(group: argparse._ArgumentGroup) -> None:
+    group.add_argument(
+        "--image-model",
+        metavar="MODEL",
+        help="label the pictures: a YAML file that describes an ONNX network, a folder with a model of "
+        "Hugging Face, or hf:NAME",
+    )
+    group.add_argument(
+        "--lidar-model",
+        metavar="MODEL",
+        help="label the scans: a YAML file that describes an ONNX network on range images, or a folder of "
+        "lidar-bonnetal",
     )
 
 

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sst_graph.cli.labels import LABEL_OPTIONS, labelled
 from sst_graph.cli.messages import complain
 from sst_graph.cli.options import SOURCE_DEFAULTS
 from sst_graph.data import open_source
@@ -22,7 +24,7 @@ from sst_graph.types import Source
 PAIRING = ("image_shift", "camera", "image_topic", "info_topic", "stamps")
 """Options without which a result means something else: they may not be contradicted."""
 
-MEASUREMENT = ("cloud", "sweep", "cloud_topic", "mask_topic")
+MEASUREMENT = ("cloud", "sweep", "cloud_topic", "mask_topic", "label_encoding", *LABEL_OPTIONS)
 """Options that change what is measured; another choice is allowed, and said."""
 
 OF_ONE_DRIVE = ("sequence", "frames")
@@ -43,7 +45,7 @@ def open_drive(args: argparse.Namespace, path: Path) -> Source:
     Raises:
         ConfigError, DataError: an option or the data cannot be used.
     """
-    return _checked_name(open_source(path, **options_of(args)), path)
+    return _checked_name(_opened(path, options_of(args)), path)
 
 
 def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResult, place: Path) -> Source:
@@ -58,6 +60,7 @@ def open_drive_of(args: argparse.Namespace, path: Path, result: CalibrationResul
     _check_given(args, stored, place)
     options = dict(SOURCE_DEFAULTS)
     options |= {name: stored[name] for name in (*PAIRING, *MEASUREMENT) if name in stored}
+    options |= {name: None for name in LABEL_OPTIONS if not _is_here(options[name])}
     options |= {name: getattr(args, name) for name in SOURCE_DEFAULTS if getattr(args, name) is not None}
     source, options = _opened_like(args, path, options, stored, {one.drive for one in result.frames_used})
     for name, value in options.items():
@@ -86,6 +89,17 @@ def reading_words(read_as: Mapping[str, Any]) -> str:
     )
 
 
+def _opened(path: Path, options: Mapping[str, Any]) -> Source:
+    """The drive at a path, with labels by networks where the options ask for them."""
+    drive = {name: value for name, value in options.items() if name not in LABEL_OPTIONS}
+    return labelled(open_source(path, **drive), options)
+
+
+def _is_here(place: Any) -> bool:
+    """Whether what a result was labelled by is still there; a name on a hub is left to the hub."""
+    return isinstance(place, str) and (place.startswith("hf:") or os.path.exists(place))
+
+
 def _opened_like(
     args: argparse.Namespace, path: Path, options: dict[str, Any], stored: Mapping[str, Any], drives: set[str]
 ) -> tuple[Source, dict[str, Any]]:
@@ -97,12 +111,12 @@ def _opened_like(
     }
     if own:
         try:
-            source = open_source(path, **{**options, **own})
+            source = _opened(path, {**options, **own})
         except SstGraphError:
             source = None
         if source is not None and source.name in drives:
             return source, {**options, **own}
-    return open_source(path, **options), options
+    return _opened(path, options), options
 
 
 def _check_given(args: argparse.Namespace, stored: Mapping[str, Any], place: Path) -> None:
@@ -139,7 +153,7 @@ def _stored_in(path: Path) -> Mapping[str, Any]:
 
 
 def _given(args: argparse.Namespace, name: str, default: str | int | float | None) -> Any:
-    value = getattr(args, name)
+    value = getattr(args, name, None)
     return default if value is None else value
 
 

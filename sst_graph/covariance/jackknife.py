@@ -55,6 +55,13 @@ class ObjectSpread:
         mean = float(np.exp(np.log(np.maximum(ratios, 1e-12)).mean()))
         return min(max(mean, 1.0), _LARGEST_DISAGREEMENT)
 
+    def shares(self, covariance: FloatArray) -> tuple[float, float]:
+        """Factors of a covariance (n, n) under the error model, and of the jackknife, in the estimate's."""
+        # From less than two objects of like weight a jackknife cannot estimate how they vary.
+        alone = self.correction / _OF_TWO
+        model = _MODEL_SHARE * max(self.disagreement(covariance), alone)
+        return model, _OBJECT_SHARE * self.correction
+
 
 def composed(
     covariance: FloatArray, spread: ObjectSpread | None, weight_curvature_ratio: float
@@ -67,10 +74,8 @@ def composed(
         weight_curvature_ratio: mean robust weight over mean curvature.
     """
     if spread is not None:
-        # From less than two objects of like weight a jackknife cannot estimate how they vary.
-        alone = spread.correction / _OF_TWO
-        model = _MODEL_SHARE * max(spread.disagreement(covariance), alone) * covariance
-        covariance = model + _OBJECT_SHARE * spread.correction * spread.jackknife
+        model, objects = spread.shares(covariance)
+        covariance = model * covariance + objects * spread.jackknife
     return np.asarray(covariance * bounded_ratio(weight_curvature_ratio) ** 2)
 
 

@@ -109,14 +109,16 @@ def match_table(
             curvatures.append(curvatures_of(matches.alignment.kernel, root, r))
             track = np.array([tracks[pair.drive][pair.pair.scan, c, int(o)] for o in matches.objects])
             sides.append((track * _MOST_DRIVES + pair.drive) * SIDES + matches.sides)
-    counts = [len(pair) for pair in pairs]
+    # What several images show of one scan errs together: its points are the same.
+    scans: dict[tuple[int, int], int] = {}
+    frames = [scans.setdefault((pair.drive, pair.pair.scan), len(scans)) for pair in pairs]
     return MatchTable(
         sparse.vstack(blocks, format="csr"),
         np.concatenate(roots),
         np.concatenate(curvatures),
         np.concatenate(residuals),
         np.concatenate(sides),
-        np.repeat(np.arange(len(pairs)), counts),
+        np.repeat(frames, [len(pair) for pair in pairs]),
     )
 
 

@@ -57,8 +57,8 @@ def numbered_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, Path]:
     return dict(sorted(files.items()))
 
 
-def read_points(path: Path) -> NDArray[np.float32]:
-    """Points (n, 3) float32 [m] of a KITTI cloud: x y z reflectance, float32 little-endian.
+def read_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points (n, 3) float32 [m] and reflectances (n,) of a KITTI cloud: x y z r, float32 little-endian.
 
     Points that are NaN or inf, as drivers give for beams without a return, are left in: they have labels.
 
@@ -67,9 +67,10 @@ def read_points(path: Path) -> NDArray[np.float32]:
             no length.
     """
     values = _values(read_file(path, SCAN), path, "<f4", 4, "x y z r in float32")
-    points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    values = values.reshape(-1, 4)
+    points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)
-    return points
+    return points, np.ascontiguousarray(values[:, 3])
 
 
 def check_metres(points: NDArray[np.float32], path: Path) -> None:

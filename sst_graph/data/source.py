@@ -13,14 +13,14 @@ from sst_graph.sweep_timing import SweepStamp
 from sst_graph.types import Source
 
 Sweep = Literal["auto", "compensated", "clockwise", "counterclockwise", "instant", "azimuth"]
-LabelEncoding = Literal["auto", "ids", "trainids"]
+LabelEncoding = Literal["auto", "ids", "trainids", "coco", "coco-133", "ade20k", "ade20k-150", "mapillary"]
 Stamps = Literal["header", "received"]
 
 SWEEPS: tuple[Sweep, ...] = get_args(Sweep)
 TURNS = {"clockwise": -1.0, "azimuth": -1.0, "counterclockwise": 1.0}
 """Share of the sweep in the points, as :class:`~sst_graph.sweep_timing.SweepTiming` counts it."""
 STAMPS: tuple[Stamps, ...] = get_args(Stamps)
-LABEL_ENCODINGS: tuple[LabelEncoding, ...] = ("auto", "ids", "trainids")
+LABEL_ENCODINGS: tuple[LabelEncoding, ...] = get_args(LabelEncoding)
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class SourceOptions:
         image_shift: scan k is paired with image k + image_shift, stamped as if it were image k.
         camera: name of the camera, "image_2".
         cloud: name of the folder that holds the scans.
-        label_encoding: how mask numbers are to be read; "auto" decides over several masks.
+        label_encoding: how mask numbers are to be read; "auto" decides between the two of Cityscapes (ids,
+            trainids) over several masks.
         sweep: "auto" uses the points' times where the data have them; where not, a calibration decides from
             the scans. "compensated" (or "instant"): all points share the stamp, stored times are ignored.
             "clockwise" (or "azimuth"), "counterclockwise": points as measured by a scanner that turns that

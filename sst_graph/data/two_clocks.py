@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.data.info.facts import SensorFacts, SourceFacts
 from sst_graph.data.source import SourceOptions, Sweep
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -29,10 +30,12 @@ class Sensor(Generic[T]):
     Attributes:
         stamps_ns: (n,) in the sensor's own clock, rising strictly [ns].
         read: measurement k of n, stamped ``stamps_ns[k]``; DataError where its files cannot be used.
+        place: where its data stand: a topic, a folder.
     """
 
     stamps_ns: NDArray[np.int64]
     read: Callable[[int], T]
+    place: str = ""
 
     def __len__(self) -> int:
         return len(self.stamps_ns)
@@ -49,6 +52,8 @@ class DriveProperties:
         truth: what is known to be true, or None.
         truth_is_reference: the truth is a published calibration, not known to hold.
         sweep, sweep_stamp: as :class:`~sst_graph.data.source.SourceOptions` has them.
+        nominal_reason: where the nominal extrinsic comes from, or why there is none.
+        notes: sentences on what else was found.
     """
 
     name: str
@@ -58,6 +63,8 @@ class DriveProperties:
     truth_is_reference: bool = False
     sweep: Sweep = "auto"
     sweep_stamp: SweepStamp = "forward"
+    nominal_reason: str = ""
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -153,6 +160,18 @@ class TwoClockSource:
         """Index of the frame at a position; nothing is read."""
         return self.indices[position]
 
+    def facts(self) -> SourceFacts:
+        """Sensors and their stamps."""
+        places = [self.places[index] for index in self.indices]
+        scans = [place.scan for place in places if place.scan is not None]
+        images = [place.image for place in places if place.image is not None]
+        return SourceFacts(
+            SensorFacts(self.scans.place, self.scans.stamps_ns[scans]),
+            SensorFacts(self.images.place, self.images.stamps_ns[images]),
+            self.properties.nominal_reason,
+            self.properties.notes,
+        )
+
     def read_scan(self, position: int) -> Scan | None:
         """Scan of the frame at a position; errors as of the frame."""
         place = self.places[self.indices[position]]
@@ -219,11 +238,20 @@ def _shifted(images: Sensor[CameraImage], shift: int) -> tuple[Sensor[CameraImag
     first = max(0, -shift)
     stamps = images.stamps_ns[first : first + count]
     real = images.stamps_ns[first + shift : first + shift + count]
+    shifted = _Shifted(images, first + shift, stamps)
+    return Sensor(stamps, shifted.read, images.place), float(np.mean(real - stamps)) * 1e-9
 
-    def read(k: int) -> CameraImage:
-        return replace(images.read(first + shift + k), stamp_ns=int(stamps[k]))
 
-    return Sensor(stamps, read), float(np.mean(real - stamps)) * 1e-9
+@dataclass(frozen=True, eq=False)
+class _Shifted:
+    """Images from one on, under other stamps."""
+
+    images: Sensor[CameraImage]
+    first: int
+    stamps_ns: NDArray[np.int64]
+
+    def read(self, k: int) -> CameraImage:
+        return replace(self.images.read(self.first + k), stamp_ns=int(self.stamps_ns[k]))
 
 
 def _selected(places: tuple[Place, ...], options: SourceOptions) -> tuple[int, ...]:

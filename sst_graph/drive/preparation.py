@@ -19,7 +19,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_edges import MAX_RANGE_M, Boundaries, Edge, find_boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.features.picture_gradients import PictureGradients
-from sst_graph.files.array_store import ArrayStore, storable
+from sst_graph.files.array_store import IN_MEMORY_BYTES, ArrayStore, storable
 from sst_graph.files.object_store import PackedArray
 from sst_graph.odometry.features import FeatureTracker
 from sst_graph.odometry.lidar import LidarOdometry, LidarOdometryConfig
@@ -40,6 +40,9 @@ SAMPLE_POINTS = 3000
 """Most labelled points of a scan that are kept for search and checks, of each class."""
 _SAMPLE_NEAR_M, _FAR_M = 2.0, 60.0
 """Ranges between which points are kept [m]."""
+DENSE_SHARE = 0.8
+"""Images are dense where their period is a smaller share of the scans' than this: stamps of equal rates
+differ by some per cent."""
 _DEPTH_POINTS = 30_000
 """Points of a scan that are kept for the depth of image features, about."""
 
@@ -53,12 +56,16 @@ class PrepareConfig(Settings):
         image_edges: move the contours of the masks to the edges in the picture.
         lidar_odometry: motion between scans.
         use_visual_odometry: track image features for the motion of the camera.
+        in_memory_bytes: of what is kept, the rest lies in a temporary file.
+        track_interval_s: images that follow a tracked one sooner are not tracked [s].
     """
 
     max_range_m: float = internal(MAX_RANGE_M)
     image_edges: bool = internal(True)
     lidar_odometry: LidarOdometryConfig = field(default_factory=LidarOdometryConfig)
     use_visual_odometry: bool = internal(True)
+    in_memory_bytes: int = internal(IN_MEMORY_BYTES)
+    track_interval_s: float = internal(0.0)
 
 
 @storable("lPs", "classes", "offsets_s", "depth_lPs", "depth_offsets_s")
@@ -192,7 +199,7 @@ class Drive:
         camera: of all images.
         scans, images: in the order of their stamps.
         lidar_motions: between consecutive scans; empty for a single scan.
-        image_pairs: tracks between consecutive images; empty for a single image.
+        image_pairs: tracks between consecutive images that are tracked; empty for a single one.
         left_out: what the data lacked.
         statistics: of the raw frames, for the search for causes; None where they were not collected.
         sweep: decision about the times of the points; None where there was none.
@@ -227,6 +234,17 @@ class Drive:
     def part(self, scans: Sequence[int]) -> Drive:
         """The drive with some of its scans only, by position, rising; all images and motions stay."""
         return replace(self, scans=tuple(self.scans[position] for position in scans))
+
+    @cached_property
+    def has_dense_images(self) -> bool:
+        """Whether there are clearly more images than scans."""
+        return self.image_period_s < DENSE_SHARE * self.lidar_period_s
+
+    @cached_property
+    def lidar_period_s(self) -> float:
+        """As :attr:`scan_period_s`, but a part of a drive has that of the whole one [s]."""
+        spans_ns = [motion.to_ns - motion.from_ns for motion in self.lidar_motions]
+        return 1e-9 * float(np.median(spans_ns)) if spans_ns else self.scan_period_s
 
     @cached_property
     def scan_period_s(self) -> float:
@@ -266,7 +284,7 @@ def prepare_drive(
     tracker = FeatureTracker()
     scans, images, motions, pairs = [], [], [], []
     total = len(source)
-    left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore()
+    left_out, collector, store = LeftOut(), StatisticsCollector(total), ArrayStore(config.in_memory_bytes)
     for position, frame in enumerate(source):
         frame = _checked(frame, source.camera, f"{source.name}, frame {frame.index}")
         left_out.add(frame)
@@ -278,7 +296,7 @@ def prepare_drive(
             features = scan_features(frame.index, frame.scan, classes, config, depth, with_lower_edges)
             scans.append(features.stored_in(store))
         if frame.image is not None:
-            if config.use_visual_odometry:
+            if config.use_visual_odometry and tracker.seconds_to(frame.image) >= config.track_interval_s:
                 tracks = tracker.add(frame.image)
                 if tracks is not None:
                     pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))

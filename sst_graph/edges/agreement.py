@@ -126,9 +126,7 @@ class BlurredScore:
             for each in (paired.points.lPs, paired.points.outward)
         )
         numbers = np.array([names.get(k, -1) for k in range(len(paired.contours))])
-        return cls(
-            paired, lPs.astype(np.float32), tips.astype(np.float32), fields, numbers[group], every
-        )
+        return cls(paired, lPs.astype(np.float32), tips.astype(np.float32), fields, numbers[group], every)
 
     def scores(self, rotations: FloatArray, translations: FloatArray) -> FloatArray:
         """(m,) scores of poses cRl (m, 3, 3), ctl (m, 3) [m]."""

@@ -16,6 +16,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.drive.trajectory import TwistTrack
 from sst_graph.factors import (
     Between,
+    CameraMotion,
     GroupedBias,
     RobustKernel,
     camera_motion_factor,
@@ -24,7 +25,7 @@ from sst_graph.factors import (
 )
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.odometry import LoopClosure, metric_motions
-from sst_graph.slam.align import align_frame
+from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
 from sst_graph.types import RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -118,7 +119,8 @@ def with_camera(
         whole = gtsam.NonlinearFactorGraph(graph)
         _add_priors(whole, nominal, config)
         if config.silhouettes:
-            values = _add_silhouettes(whole, values, drive, places, tracks, kernel_px, config)
+            silhouettes = _Silhouettes(drive, tracks, places, kernel_px)
+            values = _add_silhouettes(whole, values, silhouettes, config)
         if config.visual_odometry:
             _add_visual_odometry(whole, values, drive, places, config)
         values = gtsam.LevenbergMarquardtOptimizer(whole, values).optimize()
@@ -139,10 +141,6 @@ class _Place:
     between: Between
     twist: FloatArray
     acceleration: FloatArray
-
-    @property
-    def image_after_middle_s(self) -> float:
-        return self.between.image_after_a_s - 0.5 * self.between.seconds
 
 
 def _places(drive: Drive, values: gtsam.Values) -> list[_Place]:
@@ -172,49 +170,51 @@ def _add_priors(graph: gtsam.NonlinearFactorGraph, nominal: gtsam.Pose3, config:
     graph.add(time_offset_prior(BIAS, 0.0, config.bias_sigma_px))
 
 
+@dataclass(frozen=True)
+class _Silhouettes:
+    """What is matched in a round.
+
+    Attributes:
+        drive: its scans and images.
+        tracks: of their objects.
+        places: of the images.
+        kernel_px: scale of the robust kernel [px].
+    """
+
+    drive: Drive
+    tracks: Mapping[ObjectId, int]
+    places: Sequence[_Place]
+    kernel_px: float
+
+
 def _add_silhouettes(
     graph: gtsam.NonlinearFactorGraph,
     values: gtsam.Values,
-    drive: Drive,
-    places: Sequence[_Place],
-    tracks: Mapping[ObjectId, int],
-    kernel_px: float,
+    silhouettes: _Silhouettes,
     config: CameraGraphConfig,
 ) -> gtsam.Values:
     """Every image aligned with the scan before it, with a mask bias for each object; the values then."""
-    seen: set[int] = set()
-    for image, place in zip(drive.images, places, strict=True):
-        found = align_frame(
-            drive.scans[place.scan],
-            image,
-            drive.camera,
-            values.atPose3(EXTRINSIC),
-            float(values.atVector(TIME_OFFSET)[0]),
-            place.twist,
-            l_acceleration=place.acceleration,
-            biases_px={VEHICLE: float(values.atVector(BIAS)[0])},
-            kernel=RobustKernel("geman_mcclure", kernel_px),
-            config=config.match,
-        )
+    drive, seen = silhouettes.drive, set[int]()
+    calibration = CameraCalibration(
+        drive.camera,
+        values.atPose3(EXTRINSIC),
+        float(values.atVector(TIME_OFFSET)[0]),
+        {VEHICLE: float(values.atVector(BIAS)[0])},
+    )
+    kernel = RobustKernel("geman_mcclure", silhouettes.kernel_px)
+    matching = FrameMatching(kernel=kernel, config=config.match)
+    for image, place in zip(drive.images, silhouettes.places, strict=True):
+        motion = ScanMotion(place.twist, place.acceleration)
+        found = align_frame(drive.scans[place.scan], image, calibration, motion, matching)
         if not len(found):
             continue
-        of_match = [_object_key(tracks[place.scan, VEHICLE, int(number)]) for number in found.objects[0]]
+        tracks = [silhouettes.tracks[place.scan, VEHICLE, int(number)] for number in found.objects[0]]
+        of_match = [_object_key(track) for track in tracks]
         keys, groups = np.unique(np.array(of_match, dtype=np.uint64), return_inverse=True)
         objects = [int(key) for key in keys]
         seen.update(objects)
-        b = place.between
-        graph.add(
-            pose_alignment_factor(
-                found.alignments,
-                b.X_a,
-                b.X_b,
-                EXTRINSIC,
-                TIME_OFFSET,
-                b.seconds,
-                biases_px=GroupedBias(tuple(objects), groups),
-                image_after_middle_s=place.image_after_middle_s,
-            )
-        )
+        biases = GroupedBias(tuple(objects), groups)
+        graph.add(pose_alignment_factor(found.alignments, place.between, EXTRINSIC, TIME_OFFSET, biases))
     return _with_object_biases(graph, values, seen, config)
 
 
@@ -260,13 +260,6 @@ def _add_visual_odometry(
     between = np.diag(np.repeat([config.between_rad, config.between_m], 3) ** 2)
     for (first, second), motion in zip(itertools.pairwise(places), motions, strict=True):
         if motion.ok:
-            graph.add(
-                camera_motion_factor(
-                    first.between,
-                    second.between,
-                    EXTRINSIC,
-                    TIME_OFFSET,
-                    motion.aTb,
-                    motion.covariance + between,
-                )
-            )
+            camera_motion = CameraMotion(motion.aTb, motion.covariance + between)
+            ends = first.between, second.between
+            graph.add(camera_motion_factor(*ends, EXTRINSIC, TIME_OFFSET, camera_motion))

@@ -321,9 +321,7 @@ def _nearest_in_ring(beams: Beams, index: IntArray, ring: IntArray) -> tuple[Int
     return found, (beams.ring[found] == ring) & (np.abs(keys[place] - wanted) < beams.step)
 
 
-def _is_behind(
-    rho: FloatArray, last: IntArray, following: IntArray, behind_m: float
-) -> NDArray[np.bool_]:
+def _is_behind(rho: FloatArray, last: IntArray, following: IntArray, behind_m: float) -> NDArray[np.bool_]:
     return np.asarray(rho[following] > rho[last] + behind_m)
 
 

@@ -30,9 +30,9 @@ that each is read in a tenth of a millisecond, and those of a long drive do not 
 class ArrayStore:
     """Arrays in memory up to a number of bytes, the others in one temporary file."""
 
-    def __init__(self, in_memory_bytes: int | None = None) -> None:
-        """in_memory_bytes: of the first arrays, which stay in memory; by default :data:`IN_MEMORY_BYTES`."""
-        self._left = IN_MEMORY_BYTES if in_memory_bytes is None else in_memory_bytes
+    def __init__(self, in_memory_bytes: int = IN_MEMORY_BYTES) -> None:
+        """in_memory_bytes: of the first arrays, which stay in memory."""
+        self._left = in_memory_bytes
         self._file: FileIO | None = None
         self._end = 0
         self._writable = True

@@ -13,6 +13,7 @@ from sst_graph.assumptions import ASSUMPTIONS, named_sigmas
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors import (
     GroupedBias,
+    LidarTwist,
     LinearTerm,
     frame_factor,
     time_offset_prior,
@@ -134,8 +135,8 @@ def motion_factor(
     if pair.l_twist is None:
         return velocity_factor(V, np.zeros(6), np.diag(UNKNOWN_TWIST_SIGMAS**2))
     covariance = camera_twist(pair.l_twist, cTl).covariance
-    twist, acceleration = pair.l_twist.twist, pair.l_twist.acceleration
-    return twist_transfer_factor(V, E, D, twist, acceleration, time_offset_s, covariance)
+    lidar_twist = LidarTwist(pair.l_twist.twist, pair.l_twist.acceleration, time_offset_s)
+    return twist_transfer_factor(V, E, D, lidar_twist, covariance)
 
 
 def bias_groups(pair: PairMatches, c: SemanticClass) -> list[tuple[int, NDArray[np.intp] | None]]:

@@ -21,13 +21,12 @@ from sst_graph.association.edge_matching import (
     BOTTOM,
     EdgeMatches,
     MatchConfig,
-    Motion,
     PairedEdges,
     SilhouetteMatches,
     match_edges,
     numbered_through,
 )
-from sst_graph.association.time_pairing import Pair, pair_by_time
+from sst_graph.association.time_pairing import Pair, pair_by_time, pair_every_image
 from sst_graph.assumptions import named_sigmas
 from sst_graph.assumptions.model import Scene
 from sst_graph.config import internal, setting
@@ -35,6 +34,7 @@ from sst_graph.drive.preparation import Drive, boundaries_of
 from sst_graph.drive.trajectory import GrowingTrack, TwistSample, TwistSamples, TwistTrack
 from sst_graph.errors import ConfigError
 from sst_graph.factors.matches import Alignment
+from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, joined
 from sst_graph.graph.nuisances import deviation_of, moved_twists, residual_columns
@@ -63,6 +63,8 @@ class GraphConfig(MatchConfig):
             alike; hand-drawn outlines often cover the gap above the ground.
         estimate: assumptions whose parameters are variables: ``name=sigma`` with the deviation from 0; from
             the settings of the assumptions.
+        every_image: match a scan with every image that is nearest to it, where images are denser than scans;
+            otherwise with the nearest one alone.
     """
 
     mask_bias_sigma_px: float = setting(
@@ -87,6 +89,7 @@ class GraphConfig(MatchConfig):
     )
     lower_edges: tuple[SemanticClass, ...] = internal(())
     estimate: tuple[str, ...] = internal(())
+    every_image: bool = internal(False)
 
     def __post_init__(self) -> None:
         if 0.0 < self.object_bias_sigma_px < 0.001:
@@ -95,6 +98,9 @@ class GraphConfig(MatchConfig):
             )
 
 
+EVERY_IMAGE_REACH = 0.6
+"""Farthest image of a scan where every image is matched, in periods of the scans: half of one, and what
+stamps vary by."""
 DYNAMIC_REACH_M = 0.003
 """A dynamic object whose unknown motion between its scan and its image is this long keeps half of its weight;
 one that moves a little farther keeps none [m]: a quarter of a pixel at 10 m with KITTI's camera."""
@@ -119,7 +125,7 @@ class PairMatches:
     drive: int
     pair: Pair
     l_twist: TwistSample | None
-    motion: Motion
+    motion: CameraTwist
     matches: Mapping[SemanticClass, SilhouetteMatches]
     tracks: Mapping[SemanticClass, NDArray[np.intp]] = field(default_factory=dict)
     scene: Scene | None = None
@@ -317,20 +323,23 @@ class DriveEdges:
         )
 
     def paired(self, state: State) -> PairedEdges | None:
-        """The points with their images in true time under a state, those aside whose objects move in an unknown
-        way; None without any."""
+        """The points with their images in true time under a state, without those whose objects move in an
+        unknown way; None without any."""
         at = self._at(state)
         return None if at is None else at.paired
 
     def _at(self, state: State) -> _PairedAtState | None:
         drive, time_offset_s = self.drive, state.time_offset_s(self.number)
-        pairs = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
-        # 1. The groups that have an image, and in it a contour of their class.
-        numbers = {pair.scan: number for number, pair in enumerate(pairs)}
+        pairs = self.pairs(time_offset_s)
+        # 1. The groups that have an image, and in it a contour of their class; once for each image.
+        numbers: dict[int, list[int]] = {}
+        for number, pair in enumerate(pairs):
+            numbers.setdefault(pair.scan, []).append(number)
         groups = [
-            (g, numbers[k])
+            (g, number)
             for g, (k, c) in enumerate(zip(self.scans, self.classes, strict=True))
-            if k in numbers and c in drive.images[pairs[numbers[k]].image].contours
+            for number in numbers.get(k, ())
+            if c in drive.images[pairs[number].image].contours
         ]
         if not groups:
             return None
@@ -348,6 +357,14 @@ class DriveEdges:
         chosen, group_pairs = [g for g, _ in groups], [p for _, p in groups]
         return _PairedAtState(pairs, chosen, group_pairs, motions, paired, index, shares)
 
+    def pairs(self, time_offset_s: float) -> list[Pair]:
+        """Scans and images that belong together in true time under an offset."""
+        drive = self.drive
+        stamps = drive.scan_stamps_ns, drive.image_stamps_ns
+        if self.config.every_image and drive.has_dense_images:
+            return pair_every_image(*stamps, time_offset_s, EVERY_IMAGE_REACH * drive.lidar_period_s)
+        return pair_by_time(*stamps, time_offset_s, drive.image_period_s)
+
     def _paired(
         self, groups: Sequence[tuple[int, int]], pairs: Sequence[Pair], motions: _Motions, state: State
     ) -> tuple[PairedEdges, IntArray]:
@@ -355,7 +372,7 @@ class DriveEdges:
         drive, biases = self.drive, state.biases_of(self.number)
         spans = [(int(self.bounds[g]), int(self.bounds[g + 1])) for g, _ in groups]
         bounds = np.cumsum([0, *(b - a for a, b in spans)])
-        whole = len(groups) == len(self.scans)
+        whole = [g for g, _ in groups] == list(range(len(self.scans)))
         index = np.concatenate([np.arange(a, b) for a, b in spans])
         points = self.points if whole else self.points.take(index)
         velocities = self.velocities if whole or self.velocities is None else self.velocities[index]
@@ -366,7 +383,7 @@ class DriveEdges:
         paired = PairedEdges(
             drive.camera,
             points,
-            self.owners if whole else self.owners[index],
+            self.owners if whole else self._owners(groups, index),
             bounds,
             [drive.images[pairs[p].image].contours[c] for (_, p), c in zip(groups, classes, strict=True)],
             [motions.of_images[p] for _, p in groups],
@@ -375,6 +392,13 @@ class DriveEdges:
             velocities,
         )
         return paired, index
+
+    def _owners(self, groups: Sequence[tuple[int, int]], index: IntArray) -> IntArray:
+        """(n,) numbers of the objects of some points; an object in two images counts as two."""
+        chosen = np.array([g for g, _ in groups])
+        nth = np.arange(len(chosen)) - np.searchsorted(chosen, chosen)
+        counts = np.diff(self.bounds)[chosen]
+        return np.asarray(self.owners[index] + np.repeat(nth, counts) * (int(self.owners.max()) + 1))
 
 
 @dataclass(frozen=True)
@@ -388,7 +412,7 @@ class _Motions:
         since_s: (p,) stamps of the images minus that of the drive's first [s].
     """
 
-    of_images: Sequence[Motion]
+    of_images: Sequence[CameraTwist]
     l_twists: TwistSamples | None
     measured: FloatArray
     since_s: FloatArray
@@ -403,7 +427,7 @@ class _Motions:
         since_s = np.array([stamp - origin_ns for stamp in stamps]) * 1e-9
         l_twists = edges.tracks.at_all(number, [stamp + shift_ns for stamp in stamps])
         if l_twists is None:
-            rest = Motion(np.zeros(6), np.zeros(6))
+            rest = CameraTwist(np.zeros(6), np.zeros(6))
             return cls([rest] * len(pairs), None, np.zeros((len(pairs), 6)), since_s)
         measured = l_twists.twists
         l_twists = moved_twists(
@@ -411,7 +435,7 @@ class _Motions:
         )
         Ad = np.asarray(state.cTl.AdjointMap())
         rows = zip(l_twists.twists @ Ad.T, l_twists.accelerations @ Ad.T, strict=True)
-        return cls([Motion(*row) for row in rows], l_twists, measured, since_s)
+        return cls([CameraTwist(*row) for row in rows], l_twists, measured, since_s)
 
     def scene(self, drive: Drive, of: IntArray | int) -> Scene:
         """What assumptions depend on, of some of the pairs."""
@@ -581,7 +605,7 @@ class DriveMatches:
             },
         )
 
-    def _alignment_of(self, own: slice, motion: Motion) -> Alignment:
+    def _alignment_of(self, own: slice, motion: CameraTwist) -> Alignment:
         """Of one group."""
         alone = own == slice(0, len(self)) and self.alignment.c_acceleration.ndim == 1
         return self.alignment if alone else self.alignment.of_one_image(own, motion.c_acceleration)

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 
 from sst_graph.drive.path import PathStep, SensorPath
 from sst_graph.drive.preparation import Drive
-from sst_graph.factors import hand_eye_factor, rotation_hand_eye, time_offset_prior
+from sst_graph.factors import (
+    CameraMotion,
+    LidarMotion,
+    hand_eye_factor,
+    rotation_hand_eye,
+    time_offset_prior,
+)
 from sst_graph.factors.custom.factor import recipe_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
@@ -80,11 +86,12 @@ class NoiseScales:
 
 
 def camera_steps(drives: Sequence[Drive]) -> list[CameraStep]:
-    """The camera's motion between consecutive images of all drives, where at least its rotation is known."""
+    """The camera's motion between tracked images of all drives, where at least its rotation is known."""
+    indices = [{image.stamp_ns: image.index for image in drive.images} for drive in drives]
     return [
-        CameraStep(number, image.index, pair.tracks.from_ns, pair.tracks.to_ns, pair.direction)
+        CameraStep(number, indices[number][tracks.from_ns], tracks.from_ns, tracks.to_ns, pair.direction)
         for number, drive in enumerate(drives)
-        for image, pair in zip(drive.images, drive.image_pairs, strict=False)
+        for pair, tracks in ((pair, pair.tracks) for pair in drive.image_pairs)
         if np.trace(pair.direction.covariance[:3, :3]) < 3.0 * MAX_ROTATION_SIGMA_RAD**2
     ]
 
@@ -196,19 +203,18 @@ def _term(pair: MotionPair, state: State) -> HandEyeTerm:
     Ad = np.asarray(state.cTl.AdjointMap())
     covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
     # 2. The factor.
-    time_offset_0_s, turn = state.time_offsets_s[0], pair.camera.rotation
+    turn, D = pair.camera.rotation, time_offset_key()
+    lidar_motion = LidarMotion(step.aTb, step.twist_a, step.twist_b, state.time_offsets_s[0])
     if directed:
         measured = gtsam.Pose3(turn, length * motion.direction)
-        motions = (measured, step.aTb, step.twist_a, step.twist_b)
-        D = time_offset_key()
-        factor = hand_eye_factor(EXTRINSIC, D, *motions, time_offset_0_s, covariance, scale_known=False)
+        camera_motion = CameraMotion(measured, covariance, scale_known=False)
+        factor = hand_eye_factor(EXTRINSIC, D, camera_motion, lidar_motion)
         noise = factor.noiseModel()
         assert isinstance(noise, gtsam.noiseModel.Gaussian)
         own = np.asarray(noise.covariance())
     else:
         own = covariance[:3, :3]
-        turns = (turn, step.aTb.rotation(), step.twist_a[:3], step.twist_b[:3])
-        factor = rotation_hand_eye(EXTRINSIC, time_offset_key(), *turns, time_offset_0_s, own)
+        factor = rotation_hand_eye(EXTRINSIC, D, turn, lidar_motion, own)
     # 3. How the LiDAR's noise reaches the residual.
     transfer = np.eye(6)
     d = motion.direction

@@ -85,14 +85,14 @@ def frame_gains(
     drives: Sequence[Drive],
     robust: RobustCovariance,
 ) -> tuple[FrameInformation, ...]:
-    """Information of each pair, in the order of the pairs; pairs that share an image count as one."""
+    """Information of each pair, in their order; pairs that share a scan or an image count as one."""
     unknowns, table, model = robust.unknowns, robust.table, robust.model
     # 1. Of each frame its factors and the scores of its matches.
     prior, twisted = _frame_information(graph, values, unknowns)
     groups = _groups(pairs)
-    terms = [twisted[key] for key in groups]
-    scores = [_scores(table, rows, term) for (_, rows), term in zip(groups.values(), terms, strict=True)]
-    columns = [_own(unknowns, state, pair) for pair, _ in groups.values()]
+    terms = [_joined([twisted[key] for key in group.twists]) for group in groups]
+    scores = [_scores(table, group.rows, term) for group, term in zip(groups, terms, strict=True)]
+    columns = [_own(unknowns, state, group.pair) for group in groups]
     # 2. One frame after the other.
     sums, before = CovarianceSums(prior, ScoreSums.none(len(prior))), []
     for term, own_scores, own in zip(terms, scores, columns, strict=True):
@@ -101,12 +101,12 @@ def frame_gains(
     # 3. Each by itself, and added to all the others.
     found, prior_covariance = [], np.asarray(np.linalg.inv(prior))
     after = np.diag(sums.covariance(model))
-    for k, (pair, rows) in enumerate(groups.values()):
+    for k, group in enumerate(groups):
         own = columns[k]
-        without = _left_out(robust, sums, terms[k], scores[k], rows)[np.ix_(own, own)]
+        without = _left_out(robust, sums, terms[k], scores[k], group.rows)[np.ix_(own, own)]
         view = _view(terms[k], scores[k], prior_covariance, int(own[6]), model)
-        full, so_far = robust.matrix[np.ix_(own, own)], before[k] / after[own]
-        found.append(_entry(pair, len(rows), drives, state, view, full, without, so_far))
+        gain = _Gain(robust.matrix[np.ix_(own, own)], without, before[k] / after[own])
+        found.append(_entry(group, drives[group.pair.drive], state.cTl, view, gain))
     return tuple(found)
 
 
@@ -130,16 +130,47 @@ def _left_out(
     return covariance_of(bread, table, fit_error_model(table.residuals), others)
 
 
-def _groups(pairs: Sequence[PairMatches]) -> dict[int, tuple[PairMatches, IntArray]]:
-    """For each image's twist: its (first) pair, and its rows in the table of matches."""
+@dataclass(frozen=True)
+class _Group:
+    """Pairs that share a scan or an image.
+
+    Attributes:
+        pair: the first of them.
+        rows: in the table of matches.
+        twists: keys of their images' twists.
+    """
+
+    pair: PairMatches
+    rows: IntArray
+    twists: tuple[int, ...]
+
+
+def _groups(pairs: Sequence[PairMatches]) -> list[_Group]:
+    """In the order of their first pairs."""
     from_row = np.cumsum([0, *(len(pair) for pair in pairs)])
-    groups: dict[int, tuple[PairMatches, IntArray]] = {}
+    groups: dict[tuple[int, int], _Group] = {}
+    owners: dict[int, tuple[int, int]] = {}
     for k, pair in enumerate(pairs):
-        rows = np.arange(from_row[k], from_row[k + 1])
-        key = twist_key(pair.drive, pair.pair.image)
-        first, before = groups.get(key, (pair, rows[:0]))
-        groups[key] = (first, np.concatenate([before, rows]))
-    return groups
+        rows, twist = np.arange(from_row[k], from_row[k + 1]), twist_key(pair.drive, pair.pair.image)
+        # A scan with several images, or an image with several scans, is a group; never both at once.
+        owner = owners.setdefault(twist, (pair.drive, pair.pair.scan))
+        group = groups.get(owner, _Group(pair, rows[:0], ()))
+        twists = dict.fromkeys((*group.twists, twist))
+        groups[owner] = _Group(group.pair, np.concatenate([group.rows, rows]), tuple(twists))
+    return list(groups.values())
+
+
+def _joined(terms: Sequence[FrameTerm]) -> FrameTerm:
+    """The sum of some frames' factors."""
+    if len(terms) == 1:
+        return terms[0]
+    columns = np.unique(np.concatenate([term.columns for term in terms]))
+    H, g = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
+    for term in terms:
+        at = np.searchsorted(columns, term.columns)
+        H[np.ix_(at, at)] += term.information
+        g[at] += term.vector
+    return FrameTerm(columns, H, g)
 
 
 def _own(unknowns: Unknowns, state: State, pair: PairMatches) -> IntArray:
@@ -209,29 +240,35 @@ def _view(
     return positive_part(np.linalg.inv(covariance) - own)
 
 
-def _entry(
-    pair: PairMatches,
-    matches: int,
-    drives: Sequence[Drive],
-    state: State,
-    view: FloatArray,
-    full: FloatArray,
-    without: FloatArray,
-    so_far: FloatArray,
-) -> FrameInformation:
-    """``full``, ``without``: (7, 7) covariances; ``so_far``: (7,) variances over those of all frames."""
-    drive = drives[pair.drive]
+@dataclass(frozen=True)
+class _Gain:
+    """Uncertainty of extrinsic and time offset with and without a frame.
+
+    Attributes:
+        full: (7, 7) covariance with all frames.
+        without: (7, 7) covariance without this one.
+        so_far: (7,) variances with the frames up to this one, over those with all.
+    """
+
+    full: FloatArray
+    without: FloatArray
+    so_far: FloatArray
+
+
+def _entry(group: _Group, drive: Drive, cTl: gtsam.Pose3, view: FloatArray, gain: _Gain) -> FrameInformation:
+    """``view``: (6, 6) information by itself."""
+    pair = group.pair
     lPs = np.concatenate([m.alignment.lPs for m in pair.matches.values()])
     us = np.concatenate([m.alignment.pixels[:, 0] for m in pair.matches.values()])
-    sigmas = np.sqrt(np.diag(full))
+    sigmas = np.sqrt(np.diag(gain.full))
     return FrameInformation(
         FrameId(drive.name, drive.scans[pair.pair.scan].index),
-        bits_between(without, full),
-        np.sqrt(np.maximum(np.diag(without), 0.0)) / sigmas,
-        np.sqrt(np.maximum(so_far, 0.0)),
+        bits_between(gain.without, gain.full),
+        np.sqrt(np.maximum(np.diag(gain.without), 0.0)) / sigmas,
+        np.sqrt(np.maximum(gain.so_far, 0.0)),
         view,
-        np.asarray(state.cTl.inverse().AdjointMap() @ pair.motion.c_twist),
-        matches,
+        np.asarray(cTl.inverse().AdjointMap() @ pair.motion.c_twist),
+        len(group.rows),
         sum(len(np.unique(m.objects)) for m in pair.matches.values()),
         float(np.linalg.norm(lPs, axis=1).min()),
         float((us < drive.camera.cx).mean()),

@@ -63,6 +63,10 @@ class FeatureTracker:
     def __init__(self) -> None:
         self._last: tuple[CameraImage, NDArray[np.uint8]] | None = None
 
+    def seconds_to(self, image: CameraImage) -> float:
+        """Time from the last image to this one; infinite before the first [s]."""
+        return np.inf if self._last is None else (image.stamp_ns - self._last[0].stamp_ns) * 1e-9
+
     def add(self, image: CameraImage) -> Tracks | None:
         """Tracks from the image before to this one; None for the first, none where a picture is missing.
 

@@ -76,6 +76,7 @@ class SimulatedDrive:
         truth: the true extrinsic and time offset.
         street: the world; ``street.ego`` is the LiDAR's true motion.
         stamps_ns: (n,) stamp of each scan, and in its own clock of each image [ns].
+        camera_number: of several cameras of one vehicle; noise and mistakes differ by it.
     """
 
     config: SimulationConfig
@@ -84,6 +85,7 @@ class SimulatedDrive:
     truth: GroundTruth
     street: Street
     stamps_ns: NDArray[np.int64]
+    camera_number: int = 0
 
     @property
     def name(self) -> str:
@@ -134,6 +136,18 @@ class SimulatedDrive:
         times = offsets if self.config.gives_times else None
         return Scan(int(self.stamps_ns[index]), points, SEMANTIC_CLASS[kinds], instances, times, rings)
 
+    def frame_number(self, position: int) -> int:
+        """Index of the frame at a position."""
+        return self._checked(position)
+
+    def read_scan(self, position: int) -> Scan:
+        """As :meth:`scan`."""
+        return self.scan(position)
+
+    def read_image(self, position: int) -> CameraImage:
+        """As :meth:`image`."""
+        return self.image(position)
+
     def raw(self, position: int) -> RawFrame:
         """The frame in the simulator's own kinds."""
         index = self._checked(position)
@@ -170,11 +184,16 @@ class SimulatedDrive:
         kinds, instances = noisy_points(kinds, instances, returns, config.label_noise, (config.seed, index))
         return returns.points, returns.offsets_s, returns.rings.astype(np.uint16), kinds, instances
 
+    def raw_image(self, position: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint16]]:
+        """Picture (h, w, 3), kinds and instances (h, w) of a frame, without its scan."""
+        return self._image(self._checked(position))
+
     def _image(self, index: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.uint16]]:
         """Picture and labels of image ``index``."""
         light, kinds, numbers = self.look_through(index, self.camera)
-        pixels = developed(light, np.random.default_rng([self.config.seed, 30, index]))
-        return pixels, *noisy_mask(kinds, numbers, self.config.label_noise, (self.config.seed, index))
+        of_noise = index + _FRAMES_APART * self.camera_number
+        pixels = developed(light, np.random.default_rng([self.config.seed, 30, of_noise]))
+        return pixels, *noisy_mask(kinds, numbers, self.config.label_noise, (self.config.seed, of_noise))
 
     def look_through(
         self, index: int, camera: PinholeCamera, cRv: FloatArray | None = None
@@ -201,11 +220,23 @@ class SimulatedDrive:
         return light, kinds, numbers
 
 
+_FRAMES_APART = 1_000_002
+"""The noise of a further camera is that of frames so much later."""
+
+
 @lru_cache(maxsize=2)
 def _textures(seed: int) -> tuple[Atlas, Atlas, NDArray[np.uint8]]:
     """Materials, fine grain and sky of a seed (some 60 MB, 0.3 s: kept for the last two seeds)."""
     rng = np.random.default_rng([seed, 11])
     return material_atlas(rng), detail_atlas(rng), sky_panorama(rng)
+
+
+def mounting_error(config: SimulationConfig, rng: np.random.Generator) -> gtsam.Pose3:
+    """From the nominal to the true extrinsic, in the LiDAR's frame: of the configured size, any direction."""
+    axis, way = rng.standard_normal(3), rng.standard_normal(3)
+    turn = np.deg2rad(config.rotation_error_deg) * axis / np.linalg.norm(axis)
+    shift = config.translation_error_m * way / np.linalg.norm(way)
+    return gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift)
 
 
 def simulate(config: SimulationConfig) -> SimulatedDrive:
@@ -214,11 +245,7 @@ def simulate(config: SimulationConfig) -> SimulatedDrive:
     focal = KITTI_FOCAL_PX * config.width / KITTI_WIDTH_PX
     centre = (KITTI_CENTRE[0] * config.width, KITTI_CENTRE[1] * config.height)
     camera = PinholeCamera(focal, focal, *centre, config.width, config.height)
-    axis, way = rng.standard_normal(3), rng.standard_normal(3)
-    turn = np.deg2rad(config.rotation_error_deg) * axis / np.linalg.norm(axis)
-    shift = config.translation_error_m * way / np.linalg.norm(way)
-    error = gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift)
-    truth = GroundTruth(NOMINAL_CTL * error, config.time_offset_s)
+    truth = GroundTruth(NOMINAL_CTL * mounting_error(config, rng), config.time_offset_s)
     # Whole microseconds, so that times.txt says the same as the frames.
     jitter = rng.normal(0.0, 0.00017, config.frames)
     jitter[0] = 0.0

@@ -10,9 +10,11 @@ from pathlib import Path
 import cv2
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
 from sst_graph.files import OutputKind, atomic_directory
 from sst_graph.simulator.drive import RawFrame, SimulatedDrive
+from sst_graph.simulator.rig import beside, with_mounts
 from sst_graph.simulator.surfaces import CITYSCAPES, SEMANTIC_KITTI
 from sst_graph.types import FloatArray
 
@@ -25,6 +27,7 @@ CAMERA_SHIFTS_M = (
 """Camera 0's origin in cameras 0 to 3 [m], as in KITTI: P_i = K [I | shift_i]."""
 PNG_SPEED = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 FOLDERS = ("image_2", "semantic_2", "velodyne", "labels")
+RIGHT_FOLDERS = ("image_3", "semantic_3")
 DRIVE = OutputKind("simulated drive", exclusive=("sequences",))
 FRAME_NAME = "{:06d}"
 
@@ -32,7 +35,11 @@ Progress = Callable[[int, int], None]
 
 
 def write_drive(
-    drive: SimulatedDrive, path: str | Path, overwrite: bool = False, progress: Progress | None = None
+    drive: SimulatedDrive,
+    path: str | Path,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    stereo: bool = False,
 ) -> Path:
     """Write the drive as ``path``/sequences/00 and return that folder; all of it or nothing appears.
 
@@ -46,45 +53,66 @@ def write_drive(
         path: folder to be made.
         overwrite: whether a simulated drive that stands there, its files unchanged, may be replaced.
         progress: called with (frames done, frames in all).
+        stereo: write image_3 and semantic_3 as well: the right camera, where calib.txt has it.
 
     Raises:
         ConfigError: ``path`` is there and may not be replaced.
         OSError: it cannot be written.
     """
     with atomic_directory(path, overwrite, DRIVE) as root:
-        fill_drive(drive, root, progress)
+        fill_drive(drive, root, progress, stereo)
     return Path(path) / "sequences" / "00"
 
 
-def fill_drive(drive: SimulatedDrive, root: Path, progress: Progress | None = None) -> None:
+def fill_drive(
+    drive: SimulatedDrive, root: Path, progress: Progress | None = None, stereo: bool = False
+) -> None:
     """Write the drive's files into ``root``/sequences/00, which must not be there; :func:`write_drive`.
 
     Raises:
         OSError: it cannot be written.
     """
     folder = root / "sequences" / "00"
-    for name in (*FOLDERS, *(("velodyne_times",) if drive.config.gives_times else ())):
+    right = right_camera(drive) if stereo else None
+    more = (*(("velodyne_times",) if drive.config.gives_times else ()), *(RIGHT_FOLDERS if stereo else ()))
+    for name in (*FOLDERS, *more):
         (folder / name).mkdir(parents=True)
     (folder / "calib.txt").write_text(_calibration(drive))
     (folder / "times.txt").write_text("".join(f"{stamp * 1e-9:.9e}\n" for stamp in drive.stamps_ns))
     (folder / "poses.txt").write_text(_poses(drive))
     (folder / "groundtruth.json").write_text(json.dumps(_truth(drive), indent=1) + "\n")
     for index in range(len(drive)):
-        _write_frame(folder, FRAME_NAME.format(index), drive.raw(index), drive.config.gives_times)
+        name = FRAME_NAME.format(index)
+        _write_frame(folder, name, drive.raw(index), drive.config.gives_times)
+        if right is not None:
+            _write_image(folder, name, 3, *right.raw_image(index)[:2])
         if progress is not None:
             progress(index + 1, len(drive))
 
 
 def _write_frame(folder: Path, name: str, raw: RawFrame, times: bool) -> None:
     """One frame's image, mask, cloud and labels."""
-    _write_png(folder / "image_2" / f"{name}.png", raw.pixels)
-    _write_png(folder / "semantic_2" / f"{name}.png", CITYSCAPES[raw.pixel_kinds])
+    _write_image(folder, name, 2, raw.pixels, raw.pixel_kinds)
     cloud = np.column_stack([raw.points, np.zeros(len(raw.points), np.float32)])
     (folder / "velodyne" / f"{name}.bin").write_bytes(cloud.astype("<f4").tobytes())
     labels = SEMANTIC_KITTI[raw.point_kinds] | (raw.point_instances.astype(np.uint32) << 16)
     (folder / "labels" / f"{name}.label").write_bytes(labels.astype("<u4").tobytes())
     if times:
         (folder / "velodyne_times" / f"{name}.bin").write_bytes(raw.offsets_s.astype("<f4").tobytes())
+
+
+def _write_image(
+    folder: Path, name: str, camera: int, pixels: NDArray[np.uint8], kinds: NDArray[np.uint8]
+) -> None:
+    """Picture and mask of one camera."""
+    _write_png(folder / f"image_{camera}" / f"{name}.png", pixels)
+    _write_png(folder / f"semantic_{camera}" / f"{name}.png", CITYSCAPES[kinds])
+
+
+def right_camera(drive: SimulatedDrive) -> SimulatedDrive:
+    """The drive seen by KITTI's image_3, right of image_2; both have one trigger."""
+    right = gtsam.Pose3(gtsam.Rot3(), CAMERA_SHIFTS_M[3] - CAMERA_SHIFTS_M[2])
+    return with_mounts(drive, {"image_3": beside(drive, right)}, "image_2")["image_3"]
 
 
 def _write_png(path: Path, image: np.typing.NDArray[np.uint8]) -> None:

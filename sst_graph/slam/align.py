@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from sst_graph.association.edge_matching import (
     MatchConfig,
-    Motion,
     ScanWithImage,
     SilhouetteMatches,
     match_silhouettes,
@@ -26,6 +25,7 @@ from sst_graph.drive.preparation import (
 from sst_graph.errors import DataError
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
@@ -63,61 +63,119 @@ class FrameAlignments:
         return sum(len(alignment) for alignment in self.alignments)
 
 
+@dataclass(frozen=True)
+class CameraCalibration:
+    """What is known of a camera at present.
+
+    Attributes:
+        camera: of the image.
+        cTl: extrinsic.
+        time_offset_s: time offset [s].
+        biases_px: mask bias by class [px]; 0 where one is missing.
+    """
+
+    camera: PinholeCamera
+    cTl: gtsam.Pose3
+    time_offset_s: float
+    biases_px: Mapping[SemanticClass, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class ScanMotion:
+    """How the LiDAR and the objects in its scan move about the instant of an image.
+
+    Attributes:
+        l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
+        l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
+        l_velocities: (3,) over ground of objects that move, in the scan's LiDAR frame, by class and number
+            within the scan (the data's instance, where all points of the class carry one) [m/s]; all others
+            stand. Not with ``lTs``.
+        lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
+            at ``from_ns``, ``wTl_a.between(wTl_s)``; the scan deskewed to its stamp, no moving vehicles.
+        from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
+
+    Raises:
+        DataError: one of ``lTs`` and ``from_ns``, or both with velocities; arrays of a wrong shape.
+    """
+
+    l_twist: FloatArray
+    l_acceleration: FloatArray | None = None
+    l_velocities: Mapping[ObjectName, FloatArray] = field(default_factory=dict)
+    lTs: gtsam.Pose3 | None = None
+    from_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.lTs is None) != (self.from_ns is None):
+            raise DataError("ScanMotion", "one of lTs and from_ns", "both, or none")
+        if self.lTs is not None and self.l_velocities:
+            found = "l_velocities with lTs"
+            raise DataError("ScanMotion", found, "objects that stand in a scan of another time")
+        acceleration = np.zeros(6) if self.l_acceleration is None else self.l_acceleration
+        velocities = {
+            (c, n): _finite(f"l_velocities[{c.name}, {n}]", velocity, 3)
+            for (c, n), velocity in self.l_velocities.items()
+        }
+        object.__setattr__(self, "l_twist", _finite("l_twist", self.l_twist, 6))
+        object.__setattr__(self, "l_acceleration", _finite("l_acceleration", acceleration, 6))
+        object.__setattr__(self, "l_velocities", velocities)
+
+    def of_camera(self, cTl: gtsam.Pose3) -> CameraTwist:
+        """The camera's motion, by the extrinsic."""
+        Ad = np.asarray(cTl.AdjointMap())
+        assert self.l_acceleration is not None
+        return CameraTwist(Ad @ self.l_twist, Ad @ self.l_acceleration)
+
+
+@dataclass(frozen=True)
+class FrameMatching:
+    """What is matched, and how.
+
+    Attributes:
+        classes: to match.
+        kernel: robust kernel of the matches; its scale, times ``GATE``, is also the farthest match [px].
+        config: how boundary points meet contours.
+    """
+
+    classes: Sequence[SemanticClass] = VEHICLES
+    kernel: RobustKernel = SLAM_KERNEL
+    config: MatchConfig = SLAM_MATCHES
+
+
+SLAM_MATCHING = FrameMatching()
+
+
 def align_frame(
     scan: Scan | ScanFeatures,
     image: CameraImage | ImageFeatures,
-    camera: PinholeCamera,
-    cTl: gtsam.Pose3,
-    time_offset_s: float,
-    l_twist: ArrayLike,
-    *,
-    l_acceleration: ArrayLike | None = None,
-    lTs: gtsam.Pose3 | None = None,
-    from_ns: int | None = None,
-    classes: Sequence[SemanticClass] = VEHICLES,
-    biases_px: Mapping[SemanticClass, float] | None = None,
-    l_velocities: Mapping[ObjectName, ArrayLike] | None = None,
-    kernel: RobustKernel = SLAM_KERNEL,
-    config: MatchConfig = SLAM_MATCHES,
+    calibration: CameraCalibration,
+    motion: ScanMotion,
+    matching: FrameMatching = SLAM_MATCHING,
 ) -> FrameAlignments:
     """Boundary points of a scan matched to the contours of an image, at the current estimate.
 
     Args:
         scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
-        camera: of the image.
-        cTl, time_offset_s: current extrinsic, and time offset [s].
-        l_twist: (6,) of the LiDAR, ``Pose3.Logmap(wTl_a.between(wTl_b)) / seconds`` [rad/s, m/s].
-        l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
-        lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
-            at ``from_ns``, ``wTl_a.between(wTl_s)``; the scan deskewed to its stamp, no moving vehicles.
-        from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
-        classes: to match.
-        biases_px: current mask biases by class [px].
-        l_velocities: (3,) over ground of objects that move, in the scan's LiDAR frame, by class and number
-            within the scan (the data's instance, where all points of the class carry one) [m/s]; all others
-            stand. Not with ``lTs``.
-        kernel: robust kernel of the matches; its scale, times ``GATE``, is also the farthest match [px].
-        config: how boundary points meet contours.
+        calibration: of the image's camera, as it is known at present.
+        motion: of the LiDAR and of objects about the image's instant, and where the scan was taken.
+        matching: classes, kernel and settings.
 
     Returns:
         The matches, possibly none: a frame without any gives no factor.
-
-    Raises:
-        DataError: one of ``lTs`` and ``from_ns``, or both with velocities; arrays of a wrong shape.
     """
-    _check_time(lTs, from_ns, l_velocities)
-    points, contours = features_of(scan, image, classes)
-    boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
+    points, contours = features_of(scan, image, matching.classes)
+    boundaries = {c: some for c, some in points.boundaries.items() if c in matching.classes}
+    from_ns = points.stamp_ns if motion.from_ns is None else motion.from_ns
     pair = ScanWithImage(
         boundaries,
         contours.contours,
-        camera,
-        (contours.stamp_ns - (points.stamp_ns if from_ns is None else from_ns)) * 1e-9,
-        _camera_motion(cTl, l_twist, l_acceleration),
-        velocities_of_points(_velocities(l_velocities or {}), boundaries),
+        calibration.camera,
+        (contours.stamp_ns - from_ns) * 1e-9,
+        motion.of_camera(calibration.cTl),
+        velocities_of_points(motion.l_velocities, boundaries),
     )
-    place = cTl if lTs is None else cTl * lTs
-    found = match_silhouettes(pair, place, time_offset_s, biases_px or {}, kernel, config)
+    place = calibration.cTl if motion.lTs is None else calibration.cTl * motion.lTs
+    offset_s, biases_px = calibration.time_offset_s, calibration.biases_px
+    found = match_silhouettes(pair, place, offset_s, biases_px, matching.kernel, matching.config)
     return _frame_alignments(found)
 
 
@@ -132,17 +190,6 @@ def features_of(
     return points, contours
 
 
-def _check_time(
-    lTs: gtsam.Pose3 | None, from_ns: int | None, l_velocities: Mapping[ObjectName, ArrayLike] | None
-) -> None:
-    if (lTs is None) != (from_ns is None):
-        raise DataError("align_frame", "one of lTs and from_ns", "both, or none")
-    if lTs is not None and l_velocities:
-        raise DataError(
-            "align_frame", "l_velocities with lTs", "objects that stand in a scan of another time"
-        )
-
-
 def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> FrameAlignments:
     return FrameAlignments(
         tuple(found),
@@ -152,20 +199,8 @@ def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> Frame
     )
 
 
-def _camera_motion(cTl: gtsam.Pose3, l_twist: ArrayLike, l_acceleration: ArrayLike | None) -> Motion:
-    Ad = np.asarray(cTl.AdjointMap())
-    acceleration = np.zeros(6) if l_acceleration is None else _finite("l_acceleration", l_acceleration, 6)
-    return Motion(Ad @ _finite("l_twist", l_twist, 6), Ad @ acceleration)
-
-
-def _velocities(given: Mapping[ObjectName, ArrayLike]) -> dict[ObjectName, FloatArray]:
-    return {
-        (c, n): _finite(f"l_velocities[{c.name}, {n}]", velocity, 3) for (c, n), velocity in given.items()
-    }
-
-
 def _finite(name: str, value: ArrayLike, count: int) -> FloatArray:
     array = np.asarray(value, dtype=np.float64)
     if array.shape != (count,) or not np.isfinite(array).all():
-        raise DataError(f"align_frame: {name}", f"shape {array.shape}", f"{count} finite numbers")
+        raise DataError(f"{name} of ScanMotion", f"shape {array.shape}", f"{count} finite numbers")
     return array

@@ -22,12 +22,22 @@ from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
+from sst_graph.factors.between import Between
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.pose_alignment import pose_alignment_factor
 from sst_graph.factors.reprojection import residuals
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.objects.occupancy import ObjectName
-from sst_graph.slam.align import SLAM_MATCHES, VEHICLES, FrameAlignments, align_frame, features_of
+from sst_graph.slam.align import (
+    SLAM_MATCHES,
+    VEHICLES,
+    CameraCalibration,
+    FrameAlignments,
+    FrameMatching,
+    ScanMotion,
+    align_frame,
+    features_of,
+)
 from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
 from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.types import CameraImage, Scan, SemanticClass
@@ -63,25 +73,24 @@ class TermState(Enum):
 
 @dataclass(frozen=True)
 class TermPlace:
-    """Where an image falls in the trajectory.
+    """Where an image falls in the trajectory, and which scan it is aligned with.
 
     Attributes:
-        X_a, X_b, X_scan: keys of the poses before and after stamp + offset, and of the scan's pose.
+        between: the poses before and after stamp + offset, and the scan's pose.
         stamp_a_ns: stamp of X_a [ns].
-        seconds: from X_a to X_b [s].
-        image_after_a_s: image stamp minus stamp of X_a [s].
         position: of X_a in the trajectory.
         scan: position of the scan among the term's.
     """
 
-    X_a: int
-    X_b: int
-    X_scan: int
+    between: Between
     stamp_a_ns: int
-    seconds: float
-    image_after_a_s: float
     position: int
     scan: int
+
+    @property
+    def poses(self) -> set[int]:
+        """Keys of the poses that the term's factor is on."""
+        return {self.between.X_a, self.between.X_b, self.between.X_s}
 
 
 @dataclass(frozen=True)
@@ -157,8 +166,9 @@ class TermMatches:
         """How far stamp + offset now lies outside of the two poses that the factor is on [s]; 0 within."""
         if self.term is None or self.place is None:
             return 0.0
-        late = self.place.image_after_a_s + self.term.keys.offset(values)
-        return float(max(-late, late - self.place.seconds, 0.0))
+        between = self.place.between
+        late = between.image_after_a_s + self.term.keys.offset(values)
+        return float(max(-late, late - between.seconds, 0.0))
 
     def moved_px(self, values: gtsam.Values) -> float:
         """How far the values have moved the matched points across the contours since matching, RMS [px]."""
@@ -203,7 +213,7 @@ class AlignmentTerm:
     camera: PinholeCamera
     keys: AlignmentKeys
     config: TermConfig = field(default_factory=TermConfig)
-    l_velocities: Sequence[Mapping[ObjectName, ArrayLike]] = ()
+    l_velocities: Sequence[Mapping[ObjectName, FloatArray]] = ()
 
     def __post_init__(self) -> None:
         given = [self.scans] if isinstance(self.scans, Scan | ScanFeatures) else list(self.scans)
@@ -247,7 +257,8 @@ class AlignmentTerm:
         if not all(values.exists(key) for key in poses):
             return TermMatches(TermState.POSE_MISSING, 0.0)
         seconds, late_s = 1e-9 * (stamps[a + 1] - stamps[a]), 1e-9 * (self.stamp_ns - stamps[a])
-        return TermPlace(*poses, stamps[a], seconds, late_s, a, scan)
+        between = Between(poses[0], poses[1], seconds, late_s, X_scan=poses[2], bTl=self.keys.bTl)
+        return TermPlace(between, stamps[a], a, scan)
 
     def _nearest_scan(self, true_ns: float, values: gtsam.Values) -> tuple[int, int | None]:
         """Which scan is nearest in true time of those whose pose is known, and where in the trajectory."""
@@ -281,7 +292,7 @@ class AlignmentTerm:
         place = matches.place
         if matches.factor is None or place is None:
             return TermRows.none()
-        scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.X_scan)
+        scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.between.X_s)
         found, parts = matches.found, []
         for c, alignment, numbers, (r, J) in zip(
             found.classes,
@@ -304,16 +315,11 @@ class AlignmentTerm:
     def _factor(self, place: TermPlace, found: FrameAlignments, information: float) -> gtsam.CustomFactor:
         return pose_alignment_factor(
             found.alignments,
-            place.X_a,
-            place.X_b,
+            place.between,
             self.keys.cTl,
             self.keys.time_offset_s,
-            place.seconds,
-            X_scan=place.X_scan,
-            bTl=self.keys.bTl,
-            biases_px=[self.keys.biases_px.get(c) for c in found.classes],
-            image_after_middle_s=place.image_after_a_s - 0.5 * place.seconds,
-            noise=gtsam.noiseModel.Isotropic.Sigma(1, information**-0.5),
+            [self.keys.biases_px.get(c) for c in found.classes],
+            gtsam.noiseModel.Isotropic.Sigma(1, information**-0.5),
         )
 
     def residuals_of(self, matches: TermMatches, values: gtsam.Values) -> list[tuple[FloatArray, FloatArray]]:
@@ -323,13 +329,14 @@ class AlignmentTerm:
         if place is None:
             return []
         cTl, time_offset_s = self.keys.extrinsic(values), self.keys.offset(values)
-        a, b = values.atPose3(place.X_a), values.atPose3(place.X_b)
+        between = place.between
+        a, b = values.atPose3(between.X_a), values.atPose3(between.X_b)
         c_twist = cTl.AdjointMap() @ self._in_lidar(
-            np.asarray(gtsam.Pose3.Logmap(a.between(b))) / place.seconds
+            np.asarray(gtsam.Pose3.Logmap(a.between(b))) / between.seconds
         )
         lTs = self._lTs(values, place)
         moved = cTl if lTs is None else cTl * lTs
-        late_s = time_offset_s + place.image_after_a_s - 0.5 * place.seconds
+        late_s = time_offset_s + between.image_after_a_s - 0.5 * between.seconds
         found = []
         for alignment in matches.found.alignments:
             twist = c_twist + late_s * alignment.c_acceleration
@@ -344,25 +351,22 @@ class AlignmentTerm:
         twist = trajectory.twist(values, place.position)
         assert twist is not None  # place() has looked
         acceleration = trajectory.acceleration(values, place.position)
-        late_s = keys.offset(values) + place.image_after_a_s - 0.5 * place.seconds
+        between = place.between
+        late_s = keys.offset(values) + between.image_after_a_s - 0.5 * between.seconds
         lTs = self._lTs(values, place)
         scan, moving = self.features[place.scan], self.l_velocities[place.scan]
-        return align_frame(
-            scan if lTs is None else _without(scan, moving),
-            self.image,
-            self.camera,
-            keys.extrinsic(values),
-            keys.offset(values),
-            self._in_lidar(twist + late_s * acceleration),
-            l_acceleration=self._in_lidar(acceleration),
-            lTs=lTs,
-            from_ns=None if lTs is None else place.stamp_a_ns,
-            classes=self.config.classes,
-            biases_px={c: keys.bias(values, c) for c in keys.biases_px},
-            l_velocities=moving if lTs is None else None,
-            kernel=RobustKernel("geman_mcclure", kernel_px),
-            config=self.config.match,
+        biases_px = {c: keys.bias(values, c) for c in keys.biases_px}
+        calibration = CameraCalibration(self.camera, keys.extrinsic(values), keys.offset(values), biases_px)
+        l_twist, l_acceleration = self._in_lidar(twist + late_s * acceleration), self._in_lidar(acceleration)
+        motion = (
+            ScanMotion(l_twist, l_acceleration, moving)
+            if lTs is None
+            else ScanMotion(l_twist, l_acceleration, lTs=lTs, from_ns=place.stamp_a_ns)
         )
+        kernel = RobustKernel("geman_mcclure", kernel_px)
+        matching = FrameMatching(self.config.classes, kernel, self.config.match)
+        of_scan = scan if lTs is None else _without(scan, moving)
+        return align_frame(of_scan, self.image, calibration, motion, matching)
 
     def _in_lidar(self, b_twist: FloatArray) -> FloatArray:
         if self.keys.bTl is None:
@@ -371,9 +375,10 @@ class AlignmentTerm:
 
     def _lTs(self, values: gtsam.Values, place: TermPlace) -> gtsam.Pose3 | None:
         """Pose of the scan in the LiDAR's frame at X_a; None where it was taken there."""
-        if place.X_scan == place.X_a:
+        between = place.between
+        if between.X_s == between.X_a:
             return None
-        aTs = values.atPose3(place.X_a).between(values.atPose3(place.X_scan))
+        aTs = values.atPose3(between.X_a).between(values.atPose3(between.X_s))
         bTl = self.keys.bTl
         return aTs if bTl is None else bTl.inverse() * aTs * bTl
 

@@ -295,7 +295,7 @@ class IncrementalTerms:
         slots = []
         for placed in self._terms:
             place = None if placed.matches is None else placed.matches.place
-            if place is not None and leaving & {place.X_a, place.X_b, place.X_scan}:
+            if place is not None and leaving & place.poses:
                 slots += self._slots_of(placed.slots)
                 placed.slots, placed.sums = {}, TermSums()
         return slots
@@ -316,9 +316,7 @@ class _Placed:
     def is_gone(self, estimate: gtsam.Values) -> bool:
         """Whether a pose of its factor, or every pose it could be on, has left the solver."""
         place = None if self.matches is None else self.matches.place
-        if place is not None and not all(
-            estimate.exists(key) for key in (place.X_a, place.X_b, place.X_scan)
-        ):
+        if place is not None and not all(estimate.exists(key) for key in place.poses):
             return True
         return self.matches is not None and self.matches.state == TermState.BEFORE_TRAJECTORY
 

@@ -66,7 +66,7 @@ def current_update(tracker: Tracker, last: TrackUpdate | None = None) -> TrackUp
     update = make_update(tracker, tracker.inputs.window.last_stamp_ns or 0)
     if last is None:
         return update
-    of_frame = ["stamp_ns", "refused", "chi2", "alarm", "adopted"]
+    of_frame = ["frame", "stamp_ns", "refused", "chi2", "alarm", "adopted"]
     if last.covariance is not None or update.covariance is None or last.refused:
         of_frame += ["accepted", "reason"]
     return dataclasses.replace(update, **{name: getattr(last, name) for name in of_frame})

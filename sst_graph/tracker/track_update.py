@@ -49,6 +49,7 @@ class TrackUpdate(ByValue):
         converged: whether the solution of the whole window after this frame did (:meth:`Tracker.optimize`);
             None where it was not solved.
         contradictions: what the data contradict of what is assumed, with estimate, deviation and remedy.
+        frame: index of the frame; None where a scan or an image was added alone.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
     """
@@ -72,6 +73,7 @@ class TrackUpdate(ByValue):
     covariance_reason: str = ""
     converged: bool | None = None
     contradictions: tuple[str, ...] = ()
+    frame: int | None = None
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -84,7 +86,8 @@ class TrackUpdate(ByValue):
     def to_dict(self) -> dict[str, Any]:
         """As one line of strict JSON; degrees nowhere, units in the names."""
         sigmas = self.sigmas.tolist()
-        return {
+        line = {} if self.frame is None else {"frame": self.frame}
+        return line | {
             "stamp_ns": self.stamp_ns,
             "T_camera_lidar": self.T_camera_lidar.matrix().tolist(),
             "time_offset_s": self.time_offset_s,

@@ -53,6 +53,7 @@ class Tracker:
         initializer: the start that is being made.
         estimate: extrinsic, time offset and their covariance.
         monitor: whether the calibration has changed, and which one to use.
+        last_update: of the last frame given to :meth:`add`, or None.
     """
 
     def __init__(
@@ -71,21 +72,14 @@ class Tracker:
         self.initializer = Initializer(guess, config)
         self.estimate = OnlineEstimate(self.matcher, config, guess)
         self.monitor = Monitor(self.matcher, config)
+        self.last_update: TrackUpdate | None = None
 
     def add(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image and scan; either may be missing, and either may be refused alone."""
         if not isinstance(frame, Frame) or (frame.image is None and frame.scan is None):
             return make_update(self, 0, "a frame without scan and without image")
-        of_image = None if frame.image is None else self.add_image(frame.image)
-        if frame.scan is None:
-            assert of_image is not None
-            return of_image
-        update = self.add_scan(frame.scan)
-        if of_image is None or of_image.accepted:
-            return update
-        reason = "; ".join(filter(None, (of_image.reason, update.reason)))
-        refused = (*of_image.refused, *update.refused)
-        return dataclasses.replace(update, accepted=False, reason=reason, refused=refused)
+        self.last_update = dataclasses.replace(self._add_sensors(frame), frame=frame.index)
+        return self.last_update
 
     def add_image(self, image: CameraImage) -> TrackUpdate:
         """Add an image; it is used as soon as a scan close to it in true time is there."""
@@ -126,23 +120,22 @@ class Tracker:
         except Exception as error:
             return self._not_added("scan", scan, error)
 
-    def optimize(self, last: TrackUpdate | None = None, max_iterations: int = 20) -> TrackUpdate:
+    def optimize(self, max_iterations: int = 20) -> TrackUpdate:
         """Solve the whole window as the batch does, as at the end of a drive.
 
         A start that is under way is completed first.
 
         Args:
-            last: update of the last frame; its fields about that frame are kept.
             max_iterations: under the narrowest kernel.
 
         Returns:
-            The update with the solution; ``converged`` says whether it converged.
+            The last frame's update with the solution; ``converged`` says whether it converged.
         """
         at_end = not self.estimate.exists and self._finish_start()
         converged = self.estimate.optimize(max_iterations)
         if converged is not None and at_end:
             self.monitor.check_start_at_end(self.estimate)
-        return dataclasses.replace(current_update(self, last), converged=converged)
+        return dataclasses.replace(current_update(self, self.last_update), converged=converged)
 
     def result(self, drive: str = "stream", camera_name: str = UNNAMED_CAMERA) -> CalibrationResult:
         """The present estimate as a calibration result; the frames used are those of the window."""
@@ -206,6 +199,19 @@ class Tracker:
         return load_checkpoint(path, setup)
 
     # ------------------------------------------------------------------ steps
+
+    def _add_sensors(self, frame: Frame) -> TrackUpdate:
+        """Add a frame's image, then its scan."""
+        of_image = None if frame.image is None else self.add_image(frame.image)
+        if frame.scan is None:
+            assert of_image is not None
+            return of_image
+        update = self.add_scan(frame.scan)
+        if of_image is None or of_image.accepted:
+            return update
+        reason = "; ".join(filter(None, (of_image.reason, update.reason)))
+        refused = (*of_image.refused, *update.refused)
+        return dataclasses.replace(update, accepted=False, reason=reason, refused=refused)
 
     def _initialize(self, stamp_ns: int) -> TrackUpdate:
         """Do the work of one frame towards a first estimate."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 from sst_graph.inspect.inspection import Inspection
@@ -35,7 +36,8 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
         clock = tops[f"D{drive}" if offsets else "D"]
         mine = [at for (owner, _), at in bases.items() if owner in ("", drive)]
         name = f"{drive}:{frame}" if len({owner for owner, _ in frames}) > 1 else f"frame {frame}"
-        _draw_frame(ax, float(k), frame, name, twists, [tops["E"], clock], mine)
+        drawn = _Frame(float(k), f"V{frame}" if twists else None, name, [tops["E"], clock], mine)
+        _draw_frame(ax, drawn)
     if len(shown) < len(frames):
         words = f"…\n{len(frames) - len(shown)}\nmore\n…"
         ax.text(n - 1.37, _TWIST, words, ha="center", va="center", fontsize=9)
@@ -47,33 +49,44 @@ def draw_graph(figure: Any, inspection: Inspection) -> Any:
     return figure
 
 
-def _draw_frame(
-    ax: Any,
-    x: float,
-    frame: int,
-    name: str,
-    twists: bool,
-    tops: Sequence[tuple[float, float]],
-    bases: Sequence[tuple[float, float]],
-) -> None:
-    """One frame: its twist, its motion and its silhouettes, with their edges."""
-    silhouette = (x, _SILHOUETTE)
-    for at in bases:
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of the picture.
+
+    Attributes:
+        x: where its column stands.
+        twist: name of its twist's variable; None where it has none.
+        name: of its silhouettes.
+        tops: places of its extrinsic and time offset.
+        bases: places of its mask biases.
+    """
+
+    x: float
+    twist: str | None
+    name: str
+    tops: Sequence[tuple[float, float]]
+    bases: Sequence[tuple[float, float]]
+
+
+def _draw_frame(ax: Any, frame: _Frame) -> None:
+    """Its twist, its motion and its silhouettes, with their edges."""
+    x, silhouette = frame.x, (frame.x, _SILHOUETTE)
+    for at in frame.bases:
         _edge(ax, silhouette, at, "tab:orange")
-    if twists:
+    if frame.twist is not None:
         motion = (x, _MOTION)
-        for at in tops:
+        for at in frame.tops:
             _edge(ax, motion, at, "tab:green")
             _bent(ax, silhouette, at)
         _edge(ax, motion, (x, _TWIST), "tab:green")
         _edge(ax, (x, _TWIST), silhouette, "tab:blue")
         _square(ax, motion, "tab:green")
-        ax.text(x, _TWIST, f"V{frame}", ha="center", va="center", fontsize=9, bbox=_VARIABLE, zorder=4)
+        ax.text(x, _TWIST, frame.twist, ha="center", va="center", fontsize=9, bbox=_VARIABLE, zorder=4)
     else:
-        for at in tops:
+        for at in frame.tops:
             _edge(ax, silhouette, at, "tab:blue")
     _square(ax, silhouette, "tab:blue")
-    ax.text(x - 0.1, _SILHOUETTE + 0.08, name, ha="right", fontsize=8, color="tab:blue", zorder=4)
+    ax.text(x - 0.1, _SILHOUETTE + 0.08, frame.name, ha="right", fontsize=8, color="tab:blue", zorder=4)
 
 
 def _draw_shared(

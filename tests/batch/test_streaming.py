@@ -20,9 +20,8 @@ from streets import standing_street
 from sst_graph import open_source
 from sst_graph.batch import CalibrationConfig, prepare_drives
 from sst_graph.cli.outputs import write_calibration
-from sst_graph.drive.preparation import Drive
+from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files import array_store as store
 from sst_graph.result import CalibrationResult, FrameId
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import Frame, SemanticClass
@@ -58,21 +57,25 @@ class Long:
         return (self[position] for position in range(self.count))
 
 
+def prepared(frames: int, in_memory_bytes: int) -> Drive:
+    """The drive with so much of it in memory."""
+    config = replace(CalibrationConfig().prepare, use_visual_odometry=False, in_memory_bytes=in_memory_bytes)
+    return prepare_drive(Long(frames), CalibrationConfig().classes, config, depth=False)
+
+
 def traced(frames: int) -> tuple[int, int, Drive]:
     """Bytes that preparing so many frames leaves behind, and their peak on the way."""
-    source = Long(frames)
     gc.collect()
     tracemalloc.start()
-    (drive,) = prepare_drives([source], CalibrationConfig())
+    drive = prepared(frames, in_memory_bytes=1_000_000)
     gc.collect()
     kept, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return kept, peak, drive
 
 
-def test_little_of_a_frame_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_little_of_a_frame_stays_in_memory() -> None:
     """Its fields alone take 0.5 MB at half the usual size, its labelled points and mask as much."""
-    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 1_000_000)
     few, few_peak, _ = traced(6)
     many, many_peak, drive = traced(18)
     fields = sum(contour.distance.nbytes for image in drive.images for contour in image.contours.values())
@@ -81,10 +84,8 @@ def test_little_of_a_frame_stays_in_memory(monkeypatch: pytest.MonkeyPatch) -> N
     assert (many_peak - few_peak) / 12 < 100_000
 
 
-def test_a_drive_in_the_array_store_is_the_same_drive(monkeypatch: pytest.MonkeyPatch) -> None:
-    (plain,) = prepare_drives([Long(2)], CalibrationConfig())
-    monkeypatch.setattr(store, "IN_MEMORY_BYTES", 0)
-    (stored,) = prepare_drives([Long(2)], CalibrationConfig())
+def test_a_drive_in_the_array_store_is_the_same_drive() -> None:
+    plain, stored = prepared(2, in_memory_bytes=100_000_000), prepared(2, in_memory_bytes=0)
     for a, b in zip(plain.scans, stored.scans, strict=True):
         assert len(a.lPs) > 100 and a.lPs.dtype == b.lPs.dtype == float
         assert (a.lPs == b.lPs).all() and (a.classes == b.classes).all()

@@ -171,7 +171,7 @@ def test_two_files_of_one_number_are_refused(drive: Path) -> None:
     [
         {"loader": "rosbag9"},
         {"camera": "left"},
-        {"label_encoding": "coco"},
+        {"label_encoding": "pascal"},
         {"sweep": "spiral"},
     ],
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes
+from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes, row, write_raw_calibration
 from stored import written
 from streets import CROWDED_STREET
 
@@ -64,6 +64,36 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     for found, raw in zip(drive[1:3], plain[1:3], strict=True):  # type: ignore[misc]
         assert found.image == rectification.image(raw.image) and found.scan == raw.scan
         assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
+
+
+def test_raw_pictures_as_recorded_are_rectified(tmp_path: Path) -> None:
+    raw = as_kitti_raw(written(CROWDED_STREET) / "sequences" / "00", tmp_path / "raw")
+    plain = open_source(raw)
+    camera, size = plain.camera, (plain.camera.width, plain.camera.height)
+    P2 = np.column_stack([camera.matrix, [30.0, 0.0, 0.0]])
+    c0Tl = gtsam.Pose3(gtsam.Rot3.RzRyRx(-1.5, 0.1, -1.6), np.array([0.1, -0.2, -0.3]))
+    turn = gtsam.Rot3.RzRyRx(0.01, 0.02, 0.03)
+    write_raw_calibration(
+        raw.parent,
+        P2,
+        c0Tl,
+        size,
+        S_02=row(size),
+        S_rect_02=row((size[0] - 9, size[1] - 7)),
+        D_02=row((-0.37, 0.2, 1e-3, 2e-3, -0.07)),
+        R_02=row(turn.matrix()),
+        R_rect_00=row(np.eye(3)),
+    )
+    source = open_source(raw)
+    rectification = Rectification.of(BrownConradyCamera(camera, (-0.37, 0.2, 1e-3, 2e-3, -0.07)))
+    assert source.camera == rectification.camera and len(source) == len(plain)
+    for found, raw_frame in zip(source[1:3], plain[1:3], strict=True):  # type: ignore[misc]
+        assert found.image == rectification.image(raw_frame.image) and found.scan == raw_frame.scan
+    # Undistorted pixels are those of K after R_02, T_02: the rectification of the stereo pair plays no part.
+    velo = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.004, -0.007, 0.009).inverse(), np.zeros(3)) * c0Tl
+    wanted = gtsam.Pose3(turn, np.array([30.0 / camera.fx, 0.0, 0.0])) * velo
+    assert source.nominal is not None and source.nominal.equals(wanted, 1e-9)
+    assert source.truth is not None and source.truth.cTl.equals(wanted, 1e-9)
 
 
 def test_nuscenes_brings_the_points_and_pictures_of_kitti_odometry(kitti_drive: Path, tmp_path: Path) -> None:

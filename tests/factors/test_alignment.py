@@ -22,6 +22,9 @@ from sst_graph.factors import (
     point_to_pixel_factor,
     residuals,
     silhouette_factor,
+    stacked,
+    time_offset_prior,
+    twist_jerk_factor,
 )
 
 E, D, V, B, B2 = (gtsam.symbol(*name) for name in (("e", 0), ("d", 0), ("v", 0), ("b", 0), ("b", 1)))
@@ -44,14 +47,14 @@ def nearby(cTl, time_offset_s, twist, bias=None, seed=0):
 def test_jacobians_at_100_states(make_scene, factory):
     for seed in range(100):
         alignment, *state = make_scene(seed, 4, per_point=bool(seed % 2))
-        check_jacobians(factory(alignment, E, D, V, condensed=False), nearby(*state, seed=seed), 1e-6)
+        check_jacobians(stacked(factory(alignment, E, D, V)), nearby(*state, seed=seed), 1e-6)
 
 
 @pytest.mark.parametrize("factory", FACTORIES.values(), ids=FACTORIES)
 def test_predicted_less_measured(make_scene, factory):
     alignment, *state = make_scene(1, 5, noise_px=0.0)
     shifted = replace(alignment, pixels=alignment.pixels - [2.0, -1.0], sigmas_px=1.0)
-    factor = factory(shifted, E, D, V, condensed=False)
+    factor = stacked(factory(shifted, E, D, V))
     values = gtsam.Values()
     for key, value in zip((E, D, V), state, strict=True):
         values.insert(key, np.atleast_1d(value) if key == D else value)
@@ -67,7 +70,8 @@ def test_gradient_is_that_of_the_robust_cost(make_scene, kind, condensed, normal
             seed, 25, normals=normals, per_point=bool(seed % 2), kernel=RobustKernel(kind, 4.0)
         )
         bias = B if normals else None
-        factor = frame_factor([scene[0]], E, D, V, bias, condensed=condensed)
+        factor = frame_factor([scene[0]], E, D, V, bias)
+        factor = factor if condensed else stacked(factor)
         # a short step: the kernels' second derivatives jump
         check_gradient(factor, nearby(*scene[1:], bias=0.2 if normals else None, seed=seed), 1e-5, step=1e-6)
 
@@ -182,8 +186,8 @@ def test_objects_with_a_bias_each_are_alignments_of_their_own(make_scene, per_po
     assert whole.error(values) == pytest.approx(split.error(values), rel=1e-12)
     found, expected = (f.linearize(values).information() for f in (whole, split))
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
-    stacked = frame_factor([alignment], E, D, V, [GroupedBias((B, second), groups)], condensed=False)
-    assert stacked.error(values) == pytest.approx(split.error(values), rel=1e-12)
+    tall = stacked(frame_factor([alignment], E, D, V, [GroupedBias((B, second), groups)]))
+    assert tall.error(values) == pytest.approx(split.error(values), rel=1e-12)
 
 
 def test_extrinsic_and_delay_are_found_again(make_scene):
@@ -206,8 +210,8 @@ def test_every_point_behind_the_camera_leaves_a_constant(make_scene):
     alignment, cTl, *_ = make_scene(2, 10)
     values = gtsam.Values()
     values.insert(E, gtsam.Pose3(gtsam.Rot3.Ry(np.pi), np.zeros(3)) * cTl)
-    for condensed in (True, False):
-        factor = point_to_pixel_factor(alignment, E, condensed=condensed)
+    condensed = point_to_pixel_factor(alignment, E)
+    for factor in (condensed, stacked(condensed)):
         A, b = factor.linearize(values).jacobian()
         assert (A == 0.0).all()
         assert 0.5 * b @ b == pytest.approx(factor.error(values))
@@ -237,7 +241,7 @@ def test_outside_is_positive_and_a_dilated_mask_hides_more_of_it():
     values = gtsam.Values()
     values.insert(E, gtsam.Pose3())
     values.insert(B, np.array([2.0]))
-    factor = silhouette_factor(alignment, E, bias_px=B, condensed=False)
+    factor = stacked(silhouette_factor(alignment, E, bias_px=B))
     np.testing.assert_allclose(factor.unwhitenedError(values), [5.0, 0.0], atol=1e-12)
     assert silhouette_factor(alignment, E, bias_px=2.0).error(values) == pytest.approx(12.5)
     assert silhouette_factor(alignment, E).error(values) == pytest.approx(4.5)
@@ -251,7 +255,7 @@ def test_silhouette_jacobians_at_100_states(make_scene):
         values.insert(D, np.array([time_offset_s + 0.01]))
         values.insert(V, twist)
         values.insert(B, np.array([0.4]))
-        check_jacobians(silhouette_factor(alignment, E, D, V, B, condensed=False), values, 1e-6)
+        check_jacobians(stacked(silhouette_factor(alignment, E, D, V, B)), values, 1e-6)
 
 
 def test_silhouettes_of_a_circle_give_the_distance_to_it():
@@ -264,7 +268,7 @@ def test_silhouettes_of_a_circle_give_the_distance_to_it():
     alignment = Alignment(CAMERA, lPs, 0.0, centre + radius * normals, 1.0, normals)
     values = gtsam.Values()
     values.insert(E, gtsam.Pose3())
-    error = silhouette_factor(alignment, E, condensed=False).unwhitenedError(values)
+    error = stacked(silhouette_factor(alignment, E)).unwhitenedError(values)
     np.testing.assert_allclose(error[:-1], distance - radius, atol=1e-9)
 
 
@@ -273,14 +277,14 @@ def test_a_silhouette_needs_normals(make_scene):
         silhouette_factor(make_scene(0)[0], E)
 
 
-def test_a_factor_is_condensed_unless_it_is_asked_not_to_be(make_scene):
+def test_a_factor_is_condensed_and_stacked_has_the_rows_of_its_matches(make_scene):
     points, contour = make_scene(0)[0], make_scene(0, normals=True)[0]
-    for make in (*FACTORIES.values(), lambda *args, **options: frame_factor([args[0]], *args[1:], **options)):
+    for make in (*FACTORIES.values(), lambda *args: frame_factor([args[0]], *args[1:])):
         assert make(points, E, D, V).noiseModel().dim() == 13 + 2
-        assert make(points, E, D, V, condensed=False).noiseModel().dim() == 2 * len(points) + 1
+        assert stacked(make(points, E, D, V)).noiseModel().dim() == 2 * len(points) + 1
         assert make(points, E).noiseModel().dim() == 6 + 2  # offset and twist are zero
     assert silhouette_factor(contour, E, D, V, B).noiseModel().dim() == 14 + 2
-    assert silhouette_factor(contour, E, D, V, B, condensed=False).noiseModel().dim() == len(contour) + 1
+    assert stacked(silhouette_factor(contour, E, D, V, B)).noiseModel().dim() == len(contour) + 1
 
 
 def test_offset_and_twist_are_zero_where_they_are_not_given(make_scene):
@@ -299,3 +303,11 @@ def test_one_bias_belongs_to_the_silhouettes_alone(make_scene):
     both = frame_factor([points, contour], E, D, V, B)
     assert both.error(values) == alone.error(values)
     np.testing.assert_array_equal(*(f.linearize(values).augmentedInformation() for f in (alone, both)))
+
+
+def test_only_alignments_are_stacked():
+    prior = time_offset_prior(D, 0.0, 1.0)
+    jerk = twist_jerk_factor(V, 1, 2, (0.1, 0.1), 1.0, 1.0)
+    for factor, found in ((prior, "a PriorFactorVector"), (jerk, "twist_jerk_factor")):
+        with pytest.raises(FactorError, match=f"to be stacked: found {found}, expected an alignment factor"):
+            stacked(factor)

@@ -6,7 +6,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import Between, FactorError, camera_motion_factor, check_jacobians, hand_eye_factor
+from sst_graph.factors import (
+    Between,
+    CameraMotion,
+    FactorError,
+    LidarMotion,
+    camera_motion_factor,
+    check_jacobians,
+    hand_eye_factor,
+)
 
 E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)
 X = [gtsam.symbol("x", k) for k in range(8)]
@@ -42,7 +50,8 @@ def test_by_hand():
     poses = [gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])) for x in (0.0, 1.0, 3.0)]
     seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.4]))
     first, second = Between(X[0], X[1], 0.1, 0.02), Between(X[1], X[2], 0.1, 0.02)
-    factor = camera_motion_factor(first, second, gtsam.Pose3(OPTICAL, np.zeros(3)), D, seen, COVARIANCE)
+    cTl = gtsam.Pose3(OPTICAL, np.zeros(3))
+    factor = camera_motion_factor(first, second, cTl, D, CameraMotion(seen, COVARIANCE))
     error = factor.unwhitenedError(values_of(poses, time_offset_s=0.03))
     np.testing.assert_allclose(error, [0, 0, 0, 0, 0, 0.1], atol=1e-12)
 
@@ -54,15 +63,13 @@ def test_jacobians_at_100_states(scale_known):
         poses = wandering(seed)
         measured = gtsam.Pose3.Expmap(rng.normal(0.0, 1.0, 6) * [0.1, 0.1, 0.1, 0.5, 0.3, 1.0])
         second = [(1, 2), (2, 3), (0, 1), (1, 0)][seed % 4]
+        bTl = BTL if seed % 3 else None
         factor = camera_motion_factor(
-            Between(X[0], X[1], 0.12, rng.uniform(-0.05, 0.15)),
-            Between(X[second[0]], X[second[1]], 0.1, rng.uniform(-0.05, 0.15)),
+            Between(X[0], X[1], 0.12, rng.uniform(-0.05, 0.15), bTl=bTl),
+            Between(X[second[0]], X[second[1]], 0.1, rng.uniform(-0.05, 0.15), bTl=bTl),
             CTL if seed % 5 == 0 else E,
             0.03 if seed % 7 == 0 else D,
-            measured,
-            COVARIANCE,
-            bTl=BTL if seed % 3 else None,
-            scale_known=scale_known,
+            CameraMotion(measured, COVARIANCE, scale_known=scale_known),
         )
         values = values_of(poses, CTL.retract(rng.normal(0.0, 0.3, 6)), 0.02)
         # the direction of a short translation turns fast: a short step there
@@ -72,8 +79,8 @@ def test_jacobians_at_100_states(scale_known):
 def test_camera_poses_worked_out_one_by_one_say_the_same():
     poses, time_offset_s = wandering(3), 0.04
     measured = gtsam.Pose3.Expmap(np.array([0.02, -0.1, 0.05, 0.1, 0.2, 0.9]))
-    places = Between(X[0], X[1], 0.12, 0.01), Between(X[2], X[3], 0.1, 0.05)
-    factor = camera_motion_factor(*places, E, D, measured, COVARIANCE, bTl=BTL)
+    places = Between(X[0], X[1], 0.12, 0.01, bTl=BTL), Between(X[2], X[3], 0.1, 0.05, bTl=BTL)
+    factor = camera_motion_factor(*places, E, D, CameraMotion(measured, COVARIANCE))
     cameras = []
     for (a, b), place in zip(((0, 1), (2, 3)), places, strict=True):
         s = (place.image_after_a_s + time_offset_s) / place.seconds
@@ -95,12 +102,10 @@ def test_is_the_hand_eye_factor_where_the_trajectory_is_known():
     twist = np.array([0.1, -0.05, 0.4, 8.0, 0.3, 0.1])
     poses = [gtsam.Pose3.Expmap(k * PERIOD_S * twist) for k in range(4)]
     measured = CTL * gtsam.Pose3.Expmap(1.03 * PERIOD_S * twist) * CTL.inverse()
-    ours = camera_motion_factor(
-        Between(X[0], X[1], PERIOD_S, 0.0), Between(X[1], X[2], PERIOD_S, 0.0), E, D, measured, COVARIANCE
-    )
-    known = hand_eye_factor(
-        E, D, measured, poses[0].between(poses[1]), twist, twist, 0.0, COVARIANCE, scale_known=True
-    )
+    seen = CameraMotion(measured, COVARIANCE)
+    places = Between(X[0], X[1], PERIOD_S, 0.0), Between(X[1], X[2], PERIOD_S, 0.0)
+    ours = camera_motion_factor(*places, E, D, seen)
+    known = hand_eye_factor(E, D, seen, LidarMotion(poses[0].between(poses[1]), twist, twist, 0.0))
     for time_offset_s in (0.0, 0.03, -0.06):
         values = values_of(poses, CTL.retract(np.full(6, 0.01)), time_offset_s)
         assert ours.error(values) == pytest.approx(known.error(values), rel=1e-9)
@@ -148,7 +153,7 @@ def slam(lidar_sigmas, offset):
     for k in range(count - 2):
         measured = camera(k).between(camera(k + 1)).retract(rng.normal(0.0, fine))
         places = [Between(keys[i], keys[i + 1], PERIOD_S, 0.0) for i in (k, k + 1)]
-        graph.add(camera_motion_factor(*places, E, offset, measured, np.diag(fine**2)))
+        graph.add(camera_motion_factor(*places, E, offset, CameraMotion(measured, np.diag(fine**2))))
     about = CTL.retract(np.repeat([0.001, -0.01], 3))
     known = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([0.002, 0.02], 3))
     graph.add(gtsam.PriorFactorPose3(E, about, known))
@@ -183,7 +188,9 @@ def test_refuses_what_makes_no_factor():
     with pytest.raises(FactorError, match="seconds"):
         Between(X[0], X[1], 0.0, 0.0)
     places = Between(X[0], X[1], 0.1, 0.0), Between(X[1], X[2], 0.1, 0.0)
+    seen = CameraMotion(gtsam.Pose3(), COVARIANCE)
     with pytest.raises(FactorError, match="x0 for X_a of the first and cTl"):
-        camera_motion_factor(*places, X[0], D, gtsam.Pose3(), COVARIANCE)
-    with pytest.raises(FactorError, match="direction"):
-        camera_motion_factor(*places, E, D, gtsam.Pose3(), COVARIANCE, scale_known=False)
+        camera_motion_factor(*places, X[0], D, seen)
+    elsewhere = Between(X[1], X[2], 0.1, 0.0, bTl=BTL)
+    with pytest.raises(FactorError, match="bTl of camera_motion_factor: found one at the first image"):
+        camera_motion_factor(places[0], elsewhere, E, D, seen)

@@ -6,7 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import RobustKernel, condense, frame_factor, time_offset_prior, velocity_factor
+from sst_graph.factors import (
+    RobustKernel,
+    condense,
+    frame_factor,
+    stacked,
+    time_offset_prior,
+    velocity_factor,
+)
 from sst_graph.factors.condensed import gram
 
 E, D, B = (gtsam.symbol(letter, 0) for letter in "edb")
@@ -57,7 +64,8 @@ def graph_of(scenes, bias, condensed):
     for k, ((points, _, _, twist), (contour, *_)) in enumerate(scenes):
         V = gtsam.symbol("v", k)
         values.insert(V, twist + 0.05)
-        graph.add(frame_factor([points, contour], E, D, V, [None, B], condensed=condensed))
+        factor = frame_factor([points, contour], E, D, V, [None, B])
+        graph.add(factor if condensed else stacked(factor))
         graph.add(velocity_factor(V, twist, 0.01 * np.eye(6)))
     graph.add(time_offset_prior(D, time_offset_s, 0.05))
     return graph, values
@@ -81,16 +89,16 @@ def relative(a, b):
 
 
 def test_condensed_factors_agree_with_stacked_ones(graphs):
-    (condensed, values), (stacked, _) = graphs
-    assert condensed.error(values) == pytest.approx(stacked.error(values), rel=1e-9)
+    (condensed, values), (tall, _) = graphs
+    assert condensed.error(values) == pytest.approx(tall.error(values), rel=1e-9)
     for k in range(condensed.size()):
-        linear, tall = condensed.at(k).linearize(values), stacked.at(k).linearize(values)
-        assert relative(linear.augmentedInformation(), tall.augmentedInformation()) < 1e-9
+        linear, whole = condensed.at(k).linearize(values), tall.at(k).linearize(values)
+        assert relative(linear.augmentedInformation(), whole.augmentedInformation()) < 1e-9
     assert condensed.at(0).linearize(values).rows() == 14 + 2
     keys = [E, D, B]
     covariances = [
         gtsam.Marginals(graph, values).jointMarginalCovariance(keys).fullMatrix()
-        for graph in (condensed, stacked)
+        for graph in (condensed, tall)
     ]
     sigmas = np.sqrt(np.diag(covariances[1]))
     assert (

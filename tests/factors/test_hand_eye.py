@@ -6,7 +6,14 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import FactorError, check_jacobians, hand_eye_factor, rotation_hand_eye
+from sst_graph.factors import (
+    CameraMotion,
+    FactorError,
+    LidarMotion,
+    check_jacobians,
+    hand_eye_factor,
+    rotation_hand_eye,
+)
 
 E, D = gtsam.symbol("e", 0), gtsam.symbol("d", 0)
 TRUE = gtsam.Pose3(
@@ -28,8 +35,8 @@ def l_twist(t, h=1e-5):
 def pair(t1, t2, offset_true, time_offset_0_s):
     """Camera motion over its stamps, LiDAR motion over the interval that time_offset_0_s takes for it."""
     c1Tc2 = TRUE * wTl(t1 + offset_true).between(wTl(t2 + offset_true)) * TRUE.inverse()
-    ends = t1 + time_offset_0_s, t2 + time_offset_0_s
-    return c1Tc2, wTl(ends[0]).between(wTl(ends[1])), l_twist(ends[0]), l_twist(ends[1])
+    a, b = t1 + time_offset_0_s, t2 + time_offset_0_s
+    return c1Tc2, LidarMotion(wTl(a).between(wTl(b)), l_twist(a), l_twist(b), time_offset_0_s)
 
 
 def at(pose, offset=None):
@@ -46,7 +53,7 @@ def test_by_hand():
     step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0.0, 0.0]))
     seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.9]))
     still = np.zeros(6)
-    factor = hand_eye_factor(E, None, seen, step, still, still, 0.0, COVARIANCE)
+    factor = hand_eye_factor(E, None, CameraMotion(seen, COVARIANCE), LidarMotion(step, still, still, 0.0))
     error = factor.unwhitenedError(at(gtsam.Pose3(cRl, np.zeros(3))))
     np.testing.assert_allclose(error, [0, 0, 0, 0, 0, 0.1], atol=1e-12)
 
@@ -55,7 +62,7 @@ def test_a_later_offset_takes_later_motion():
     # speeding up from 10 to 12 m/s over the pair: 0.1 s later the LiDAR covers 0.2 m more
     step = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 11.0]))
     twists = np.array([0, 0, 0, 0, 0, 10.0]), np.array([0, 0, 0, 0, 0, 12.0])
-    factor = hand_eye_factor(E, D, step, step, *twists, 0.05, COVARIANCE)
+    factor = hand_eye_factor(E, D, CameraMotion(step, COVARIANCE), LidarMotion(step, *twists, 0.05))
     error = factor.unwhitenedError(at(gtsam.Pose3(), 0.15))
     np.testing.assert_allclose(error, [0, 0, 0, 0, 0, 0.2], atol=1e-12)
 
@@ -65,14 +72,13 @@ def test_a_later_offset_takes_later_motion():
 def test_jacobians_at_100_states(kind, with_offset):
     rng = np.random.default_rng(4)
     for _ in range(100):
-        c1Tc2, l1Tl2, twist_1, twist_2 = pair(*np.sort(rng.uniform(0.0, 5.0, 2)), 0.1, 0.05)
+        c1Tc2, lidar = pair(*np.sort(rng.uniform(0.0, 5.0, 2)), 0.1, 0.05)
         key, offset = (D, 0.13) if with_offset else (None, None)
         if kind == "rotation":
-            motions = c1Tc2.rotation(), l1Tl2.rotation(), twist_1[:3], twist_2[:3]
-            factor = rotation_hand_eye(E, key, *motions, 0.05, COVARIANCE[:3, :3])
+            factor = rotation_hand_eye(E, key, c1Tc2.rotation(), lidar, COVARIANCE[:3, :3])
         else:
-            motions = c1Tc2, l1Tl2, twist_1, twist_2
-            factor = hand_eye_factor(E, key, *motions, 0.05, COVARIANCE, scale_known=kind == "full")
+            camera = CameraMotion(c1Tc2, COVARIANCE, scale_known=kind == "full")
+            factor = hand_eye_factor(E, key, camera, lidar)
         check_jacobians(factor, at(TRUE.retract(rng.normal(0.0, 0.1, 6)), offset), 1e-6)
 
 
@@ -83,13 +89,12 @@ def test_a_weaving_drive_gives_extrinsic_and_delay_back(kind):
     for _ in range(3):  # outer loop: the LiDAR's motion is taken again over the interval found
         graph, time_offset_0_s = gtsam.NonlinearFactorGraph(), float(values.atVector(D)[0])
         for t1 in np.arange(0.0, 12.0, 0.5):
-            c1Tc2, *lidar = pair(t1, t1 + 0.5, offset_true, time_offset_0_s)
+            c1Tc2, lidar = pair(t1, t1 + 0.5, offset_true, time_offset_0_s)
             if kind == "direction":
                 t = c1Tc2.translation()
                 c1Tc2 = gtsam.Pose3(c1Tc2.rotation(), t / np.linalg.norm(t))
-            graph.add(
-                hand_eye_factor(E, D, c1Tc2, *lidar, time_offset_0_s, COVARIANCE, scale_known=kind == "full")
-            )
+            camera = CameraMotion(c1Tc2, COVARIANCE, scale_known=kind == "full")
+            graph.add(hand_eye_factor(E, D, camera, lidar))
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert values.atVector(D)[0] == pytest.approx(offset_true, abs=1e-4)
     error = TRUE.localCoordinates(values.atPose3(E))
@@ -105,21 +110,32 @@ def test_rotation_only_gives_rotation_and_delay_back():
             gtsam.PriorFactorPose3(E, TRUE, gtsam.noiseModel.Diagonal.Sigmas(np.repeat([10.0, 0.1], 3)))
         )
         for t1 in np.arange(0.0, 12.0, 0.5):
-            c1Tc2, l1Tl2, twist_1, twist_2 = pair(t1, t1 + 0.5, 0.08, time_offset_0_s)
-            motions = c1Tc2.rotation(), l1Tl2.rotation(), twist_1[:3], twist_2[:3]
-            graph.add(rotation_hand_eye(E, D, *motions, time_offset_0_s, COVARIANCE[:3, :3]))
+            c1Tc2, lidar = pair(t1, t1 + 0.5, 0.08, time_offset_0_s)
+            graph.add(rotation_hand_eye(E, D, c1Tc2.rotation(), lidar, COVARIANCE[:3, :3]))
         values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     assert values.atVector(D)[0] == pytest.approx(0.08, abs=1e-4)
     assert np.abs(TRUE.localCoordinates(values.atPose3(E))[:3]).max() < 1e-4
 
 
+def test_a_turn_is_the_rotation_of_a_motion():
+    c1Tc2, lidar = pair(1.0, 1.5, 0.08, 0.02)
+    turn = LidarMotion.of_turn(lidar.l1Tl2.rotation(), lidar.l_twist_1[:3], lidar.l_twist_2[:3], 0.02)
+    values = at(TRUE.retract(np.full(6, 0.05)), 0.05)
+    factors = [
+        rotation_hand_eye(E, D, c1Tc2.rotation(), motion, COVARIANCE[:3, :3]) for motion in (lidar, turn)
+    ]
+    errors = [factor.unwhitenedError(values) for factor in factors]
+    assert np.abs(errors[0]).max() > 1e-3
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-12)
+
+
 def test_length_of_a_scaleless_motion_does_not_matter():
-    c1Tc2, *lidar = pair(1.0, 1.5, 0.08, 0.02)
+    c1Tc2, lidar = pair(1.0, 1.5, 0.08, 0.02)
     errors = []
     for scale in (0.1, 1.0, 7.0):
         scaled = gtsam.Pose3(c1Tc2.rotation(), scale * c1Tc2.translation())
         carried = np.diag([1e-6] * 3 + [1e-4 * scale**2] * 3)
-        factor = hand_eye_factor(E, D, scaled, *lidar, 0.02, carried, scale_known=False)
+        factor = hand_eye_factor(E, D, CameraMotion(scaled, carried, scale_known=False), lidar)
         errors.append(factor.error(at(TRUE.retract(np.full(6, 0.05)), 0.05)))
     np.testing.assert_allclose(errors, errors[0], rtol=1e-9)
 
@@ -127,7 +143,24 @@ def test_length_of_a_scaleless_motion_does_not_matter():
 def test_nothing_breaks_at_rest():
     rest, still = gtsam.Pose3(), np.zeros(6)
     seen = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 1.0]))
-    factor = hand_eye_factor(E, D, seen, rest, still, still, 0.0, COVARIANCE, scale_known=False)
+    camera = CameraMotion(seen, COVARIANCE, scale_known=False)
+    factor = hand_eye_factor(E, D, camera, LidarMotion(rest, still, still, 0.0))
     assert np.isfinite(factor.linearize(at(TRUE, 0.1)).augmentedInformation()).all()
-    with pytest.raises(FactorError, match="direction"):
-        hand_eye_factor(E, D, rest, rest, still, still, 0.0, COVARIANCE, scale_known=False)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: CameraMotion(gtsam.Pose3(), COVARIANCE, scale_known=False), "c1Tc2: found zero.*direction"),
+        (lambda: CameraMotion(np.eye(4), COVARIANCE), "c1Tc2 of CameraMotion: found an array.*Pose3"),
+        (lambda: CameraMotion(TRUE, -COVARIANCE), "covariance of CameraMotion"),
+        (lambda: LidarMotion(TRUE.rotation(), np.zeros(6), np.zeros(6), 0.0), "l1Tl2 of LidarMotion"),
+        (lambda: LidarMotion(TRUE, np.zeros(6), np.zeros(3), 0.0), "l_twist_2 of LidarMotion"),
+        (lambda: LidarMotion(TRUE, np.zeros(6), np.zeros(6), np.nan), "time_offset_0_s of LidarMotion"),
+        (lambda: LidarMotion.of_turn(TRUE, np.zeros(3), np.zeros(3), 0.0), "l1Rl2 of LidarMotion.*Rot3"),
+        (lambda: LidarMotion.of_turn(TRUE.rotation(), np.zeros(6), np.zeros(3), 0.0), "l_omega"),
+    ],
+)
+def test_what_is_no_motion_is_refused(make, message):
+    with pytest.raises(FactorError, match=message):
+        make()

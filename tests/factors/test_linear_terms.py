@@ -8,7 +8,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import Alignment, FactorError, LinearTerm, PinholeCamera, RobustKernel, frame_factor
+from sst_graph.factors import (
+    Alignment,
+    FactorError,
+    LinearTerm,
+    PinholeCamera,
+    RobustKernel,
+    frame_factor,
+    stacked,
+)
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 AXES = gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
@@ -43,13 +51,14 @@ def two_terms(condensed: bool) -> tuple[gtsam.CustomFactor, list[Alignment], np.
     a, b, c = rng.standard_normal(30), rng.standard_normal(20), rng.standard_normal(20)
     terms = [[LinearTerm(N, a, 0.1)], [LinearTerm(N, b, 0.1), LinearTerm(M, c)]]
     twist = np.array([0.0, 0.01, 0.0, 0.1, 0.0, 8.0])
-    return frame_factor(parts, E, D, twist, B, terms=terms, condensed=condensed), parts, np.append(a, b)
+    factor = frame_factor(parts, E, D, twist, B, terms=terms)
+    return factor if condensed else stacked(factor), parts, np.append(a, b)
 
 
 def test_the_residual_moves_by_coefficient_times_step() -> None:
     factor, parts, coefficients = two_terms(condensed=False)
     whitened = coefficients / np.concatenate([part.sigmas_px for part in parts])
-    plain = frame_factor(parts, E, D, np.array([0.0, 0.01, 0.0, 0.1, 0.0, 8.0]), B, condensed=False)
+    plain = stacked(frame_factor(parts, E, D, np.array([0.0, 0.01, 0.0, 0.1, 0.0, 8.0]), B))
     at = plain.unwhitenedError(values_at(0.1, 0.0))
     np.testing.assert_allclose(factor.unwhitenedError(values_at(0.1, 0.0)), at, atol=1e-12)
     # Of a wide kernel the weights hardly change: the residual moves by the column.
@@ -59,10 +68,10 @@ def test_the_residual_moves_by_coefficient_times_step() -> None:
 
 def test_condensed_and_stacked_have_one_cost_gradient_and_hessian() -> None:
     values = values_at(0.15, -0.2)
-    stacked, condensed = (two_terms(condensed)[0].linearize(values) for condensed in (False, True))
-    np.testing.assert_allclose(condensed.information(), stacked.information(), rtol=1e-9, atol=1e-6)
+    tall, condensed = (two_terms(condensed)[0].linearize(values) for condensed in (False, True))
+    np.testing.assert_allclose(condensed.information(), tall.information(), rtol=1e-9, atol=1e-6)
     np.testing.assert_allclose(
-        condensed.augmentedInformation(), stacked.augmentedInformation(), rtol=1e-9, atol=1e-6
+        condensed.augmentedInformation(), tall.augmentedInformation(), rtol=1e-9, atol=1e-6
     )
 
 
@@ -90,7 +99,7 @@ def test_an_optimiser_finds_the_scalar() -> None:
     column = np.random.default_rng(9).standard_normal(200)
     twist = np.zeros(6)
     pose = gtsam.Pose3(AXES, np.array([0.1, 0.0, -0.2]))
-    r = frame_factor([part], pose, D, twist, None, condensed=False).unwhitenedError(values_at(0, 0))[:200]
+    r = stacked(frame_factor([part], pose, D, twist)).unwhitenedError(values_at(0, 0))[:200]
     pixels = part.pixels + (r * part.sigmas_px + 0.3 * column)[:, None] * part.normals
     rest = part.sigmas_px, part.normals, RobustKernel()
     exact = Alignment(CAMERA, part.lPs, part.base_taus_s, pixels, *rest)
@@ -127,9 +136,10 @@ def test_a_point_behind_the_camera_tells_nothing_of_a_term(condensed: bool) -> N
     values = values_at(0.3, 0.0)
     twist = np.zeros(6)
     both = [
-        frame_factor([matches], E, D, twist, B, terms=[[LinearTerm(N, own)]], condensed=condensed)
+        frame_factor([matches], E, D, twist, B, terms=[[LinearTerm(N, own)]])
         for matches, own in ((behind, column), (front, np.delete(column, 3)))
     ]
+    both = both if condensed else [stacked(factor) for factor in both]
     hessians = [factor.linearize(values).augmentedInformation()[:-1, :-1] for factor in both]
     np.testing.assert_allclose(*hessians, rtol=1e-9, atol=1e-9 * np.abs(hessians[0]).max())
     costs = [factor.error(values_at(theta, 0.0)) for factor in both for theta in (0.3, 0.4)]

@@ -6,16 +6,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import move_points
+from sst_graph.factors import CameraTwist, move_points
 from sst_graph.factors.motion import exponential_coefficients, se3_left_jacobian
 
 STILL = np.zeros(6)
 
 
 def moved(cTl, lPs, taus, twist, acceleration=STILL, model="se3"):
-    return move_points(
-        cTl, np.asarray(lPs, dtype=float).T, taus, np.asarray(twist), acceleration, model
-    ).cPs.T
+    motion = CameraTwist(np.asarray(twist), acceleration)
+    return move_points(cTl, np.asarray(lPs, dtype=float).T, taus, motion, model).cPs.T
 
 
 @pytest.mark.parametrize("model", ["se3", "translation"])
@@ -95,11 +94,11 @@ def test_an_object_that_drives_along_stays_where_it_is():
     """Camera and object go forward at 10 m/s: LiDAR x is camera z, and the point stays where it is."""
     cTl = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.zeros(3))
     lPs, velocity = np.array([[20.0], [3.0], [1.0]]), np.array([[10.0], [0.0], [0.0]])
-    forward = np.array([0, 0, 0, 0, 0, 10.0])
+    forward = CameraTwist(np.array([0, 0, 0, 0, 0, 10.0]), STILL)
     for taus in (0.3, np.array([0.3])):
-        point = move_points(cTl, lPs, taus, forward, STILL, l_velocities=velocity)
+        point = move_points(cTl, lPs, taus, forward, l_velocities=velocity)
         np.testing.assert_allclose(point.cPs.T, [[-3.0, -1.0, 20.0]], atol=1e-12)
-        parked = move_points(cTl, lPs, taus, forward, STILL)
+        parked = move_points(cTl, lPs, taus, forward)
         np.testing.assert_allclose(parked.cPs.T, [[-3.0, -1.0, 17.0]], atol=1e-12)
 
 
@@ -116,17 +115,12 @@ def test_derivatives_at_100_points(model, rigid, speed, objects):
     velocities = rng.normal(0.0, 10.0, (3, 100)) if objects else None
 
     def cPs(x):
-        return move_points(
-            cTl.retract(x[:6]),
-            lPs,
-            time_offset_s + x[6] + base,
-            twist + x[7:],
-            acceleration,
-            model,
-            velocities,
-        ).cPs
+        motion = CameraTwist(twist + x[7:], acceleration)
+        taus_s = time_offset_s + x[6] + base
+        return move_points(cTl.retract(x[:6]), lPs, taus_s, motion, model, velocities).cPs
 
-    point = move_points(cTl, lPs, time_offset_s + base, twist, acceleration, model, velocities)
+    motion = CameraTwist(twist, acceleration)
+    point = move_points(cTl, lPs, time_offset_s + base, motion, model, velocities)
     g = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 100)).copy()
     lifted = rigid and not objects
     rows = np.empty((6 if lifted else 13, 3, 100))

@@ -11,6 +11,7 @@ import pytest
 
 from sst_graph.factors import (
     Alignment,
+    Between,
     FactorError,
     PinholeCamera,
     RobustKernel,
@@ -18,6 +19,7 @@ from sst_graph.factors import (
     check_jacobians,
     frame_factor,
     pose_alignment_factor,
+    stacked,
 )
 
 E, D, B = gtsam.symbol("e", 0), gtsam.symbol("d", 0), gtsam.symbol("b", 0)
@@ -56,7 +58,7 @@ def test_sign_by_hand():
     values.insert(X[0], gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 5.0])))
     values.insert(X[1], gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 7.0])))
     values.insert(D, np.array([0.05]))
-    factor = pose_alignment_factor([alignment], X[0], X[1], gtsam.Pose3(), D, 0.2, condensed=False)
+    factor = stacked(pose_alignment_factor([alignment], Between(X[0], X[1], 0.2, 0.05), gtsam.Pose3(), D))
     np.testing.assert_allclose(factor.unwhitenedError(values), [2.0, -1.0, 0.0], atol=1e-9)
 
 
@@ -68,9 +70,8 @@ def test_sign_of_a_scan_at_another_pose_by_hand():
     for key, z in zip(X, (5.0, 7.0, 4.0), strict=True):
         values.insert(key, gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, z])))
     values.insert(D, np.array([0.05]))
-    factor = pose_alignment_factor(
-        [alignment], X[0], X[1], gtsam.Pose3(), D, 0.2, X_scan=X[2], condensed=False
-    )
+    between = Between(X[0], X[1], 0.2, 0.05, X_scan=X[2])
+    factor = stacked(pose_alignment_factor([alignment], between, gtsam.Pose3(), D))
     np.testing.assert_allclose(factor.unwhitenedError(values), [2.0, -1.0, 0.0], atol=1e-9)
 
 
@@ -79,20 +80,12 @@ def test_jacobians_at_100_states(make_scene, normals):
     for seed in range(100):
         alignment, cTl, time_offset_s, _ = make_scene(seed, 4, per_point=bool(seed % 2), normals=normals)
         bTl = BTL if seed % 3 else gtsam.Pose3()
-        factor = pose_alignment_factor(
-            [alignment],
-            X[0],
-            X[1],
-            E,
-            D,
-            SECONDS,
-            X_scan=[None, X[2], X[1], X[0]][seed % 4],
-            bTl=bTl,
-            biases_px=B if normals else None,
-            image_after_middle_s=-0.03 if seed % 5 else None,
-            condensed=False,
-        )
-        check_jacobians(factor, trajectory(seed, cTl, time_offset_s, bTl), 1e-6)
+        if seed % 5 == 0:
+            alignment = replace(alignment, c_acceleration=np.zeros(6))
+        X_scan = [None, X[2], X[1], X[0]][seed % 4]
+        between = Between(X[0], X[1], SECONDS, 0.5 * SECONDS - 0.03, X_scan=X_scan, bTl=bTl)
+        factor = pose_alignment_factor([alignment], between, E, D, B if normals else None)
+        check_jacobians(stacked(factor), trajectory(seed, cTl, time_offset_s, bTl), 1e-6)
 
 
 @pytest.mark.parametrize("kind", ["none", "geman_mcclure"])
@@ -101,18 +94,9 @@ def test_condensed_gradient_is_that_of_the_robust_cost(make_scene, kind):
         alignment, cTl, time_offset_s, _ = make_scene(
             seed, 25, normals=True, per_point=bool(seed % 2), kernel=RobustKernel(kind, 4.0)
         )
-        factor = pose_alignment_factor(
-            [alignment],
-            X[0],
-            X[1],
-            E,
-            D,
-            SECONDS,
-            X_scan=X[2] if seed % 3 else None,
-            bTl=BTL,
-            biases_px=B,
-            image_after_middle_s=0.02,
-        )
+        X_scan = X[2] if seed % 3 else None
+        between = Between(X[0], X[1], SECONDS, 0.5 * SECONDS + 0.02, X_scan=X_scan, bTl=BTL)
+        factor = pose_alignment_factor([alignment], between, E, D, B)
         # a kernel's second derivative jumps: a short step there
         step = 1e-3 if kind == "none" else 1e-6
         check_gradient(factor, trajectory(seed, cTl, time_offset_s, BTL), 1e-5, step=step)
@@ -132,17 +116,9 @@ def test_a_gtsam_camera_at_the_interpolated_pose_says_the_same(make_scene, elsew
     wTs = values.atPose3(X[2] if elsewhere else X[0]) * BTL
     pinhole = gtsam.PinholeCameraCal3_S2(wTc, K)
     uvs = np.array([pinhole.project(wTs.transformFrom(lP)) for lP in alignment.lPs])
-    factor = pose_alignment_factor(
-        [alignment],
-        X[0],
-        X[1],
-        E,
-        D,
-        SECONDS,
-        X_scan=X[2] if elsewhere else None,
-        bTl=BTL,
-        condensed=False,
-    )
+    late_s = float(alignment.base_taus_s[0])
+    between = Between(X[0], X[1], SECONDS, late_s, X_scan=X[2] if elsewhere else None, bTl=BTL)
+    factor = stacked(pose_alignment_factor([alignment], between, E, D))
     expected = np.append((uvs - alignment.pixels).T.reshape(-1), 0.0)
     np.testing.assert_allclose(factor.unwhitenedError(values), expected, atol=1e-6)
 
@@ -151,9 +127,8 @@ def test_the_twist_is_that_of_the_frame_factor(make_scene):
     # same cost as the factor on a twist variable, with the mean twist carried to the image's instant
     alignment, cTl, time_offset_s, _ = make_scene(5, 20, normals=True)
     values = trajectory(5, cTl, time_offset_s, BTL)
-    factor = pose_alignment_factor(
-        [alignment], X[0], X[1], E, D, SECONDS, bTl=BTL, biases_px=B, image_after_middle_s=-0.04
-    )
+    between = Between(X[0], X[1], SECONDS, 0.5 * SECONDS - 0.04, bTl=BTL)
+    factor = pose_alignment_factor([alignment], between, E, D, B)
     late = float(values.atVector(D)[0]) - 0.04
     twist = c_twist(values, X[0], X[1], BTL) + late * alignment.c_acceleration
     other = frame_factor([alignment], E, D, twist, B)
@@ -164,8 +139,9 @@ def test_constants_stand_in_for_the_calibration(make_scene):
     alignment, cTl, time_offset_s, _ = make_scene(6, 10)
     values = trajectory(6, cTl, time_offset_s, BTL)
     pose, offset = values.atPose3(E), float(values.atVector(D)[0])
-    full = pose_alignment_factor([alignment], X[0], X[1], E, D, SECONDS, bTl=BTL)
-    fixed = pose_alignment_factor([alignment], X[0], X[1], pose, offset, SECONDS, bTl=BTL)
+    between = Between(X[0], X[1], SECONDS, 0.03, bTl=BTL)
+    full = pose_alignment_factor([alignment], between, E, D)
+    fixed = pose_alignment_factor([alignment], between, pose, offset)
     assert tuple(full.keys()) == (X[0], X[1], E, D) and tuple(fixed.keys()) == (X[0], X[1])
     assert fixed.error(values) == pytest.approx(full.error(values), rel=1e-12)
     whole, part = full.linearize(values).information(), fixed.linearize(values).information()
@@ -189,9 +165,10 @@ def street(make_scene, frames=6):
     factors = []
     for a, b in itertools.pairwise(keys):
         seen = replace(base, pixels=np.zeros((len(base), 2)))
-        blank = pose_alignment_factor([seen], a, b, E, D, SECONDS, condensed=False)
+        between = Between(a, b, SECONDS, float(base.base_taus_s[0]))
+        blank = stacked(pose_alignment_factor([seen], between, E, D))
         pixels = blank.unwhitenedError(truth)[:-1].reshape(2, -1).T
-        factors.append((a, b, pose_alignment_factor([replace(seen, pixels=pixels)], a, b, E, D, SECONDS)))
+        factors.append((a, b, pose_alignment_factor([replace(seen, pixels=pixels)], between, E, D)))
     return factors, truth
 
 
@@ -265,18 +242,19 @@ def test_calibration_in_a_pose_graph_frame_by_frame(make_scene, smoother):
 def test_refuses_what_makes_no_factor(make_scene):
     alignment, *_ = make_scene(1)
     with pytest.raises(FactorError, match="distinct keys"):
-        pose_alignment_factor([alignment], X[0], X[0], E, D, SECONDS)
-    with pytest.raises(FactorError, match="x1 for X_b and cTl"):
-        pose_alignment_factor([alignment], X[0], X[1], X[1], D, SECONDS)
+        Between(X[0], X[0], SECONDS, 0.03)
     with pytest.raises(FactorError, match="seconds"):
-        pose_alignment_factor([alignment], X[0], X[1], E, D, 0.0)
+        Between(X[0], X[1], 0.0, 0.03)
+    between = Between(X[0], X[1], SECONDS, 0.03)
+    with pytest.raises(FactorError, match="x1 for X_b and cTl"):
+        pose_alignment_factor([alignment], between, X[1], D)
     other = replace(alignment, c_acceleration=np.ones(6))
     with pytest.raises(FactorError, match="one for all"):
-        pose_alignment_factor([alignment, other], X[0], X[1], E, D, SECONDS, image_after_middle_s=0.0)
+        pose_alignment_factor([alignment, other], between, E, D)
 
 
-def test_a_factor_is_condensed_unless_it_is_asked_not_to_be(make_scene):
+def test_a_factor_is_condensed_and_stacked_has_the_rows_of_its_matches(make_scene):
     points = make_scene(1)[0]
-    assert pose_alignment_factor([points], X[0], X[1], E, D, SECONDS).noiseModel().dim() == 6 + 6 + 6 + 1 + 2
-    tall = pose_alignment_factor([points], X[0], X[1], E, D, SECONDS, condensed=False)
-    assert tall.noiseModel().dim() == 2 * len(points) + 1
+    factor = pose_alignment_factor([points], Between(X[0], X[1], SECONDS, 0.03), E, D)
+    assert factor.noiseModel().dim() == 6 + 6 + 6 + 1 + 2
+    assert stacked(factor).noiseModel().dim() == 2 * len(points) + 1

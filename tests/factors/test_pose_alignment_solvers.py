@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import Between, camera_motion_factor, pose_alignment_factor
+from sst_graph.factors import Between, CameraMotion, camera_motion_factor, pose_alignment_factor, stacked
 
 E, D, IMU_BIAS = gtsam.symbol("E", 0), gtsam.symbol("D", 0), gtsam.symbol("b", 0)
 BTL = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, -0.2, 0.3), np.array([0.8, -0.3, 1.7]))
@@ -83,7 +83,7 @@ def drive(make_scene):
     camera = [[] for _ in range(FRAMES)]
     for k in range(FRAMES - 1):
         camera[k + 1].append(_seen(base, k, truth))
-    places = [Between(X(k), X(k + 1), PERIOD_S, -0.02) for k in range(FRAMES - 1)]
+    places = [Between(X(k), X(k + 1), PERIOD_S, -0.02, bTl=BTL) for k in range(FRAMES - 1)]
     for k in range(FRAMES - 2):
         camera[k + 2].append(_moved(places[k], places[k + 1], k, truth))
     return Drive(truth, camera)
@@ -92,10 +92,10 @@ def drive(make_scene):
 def _seen(base, k, truth):
     """The alignment factor of image k, its pixels those of the truth."""
     blank = replace(base, pixels=np.zeros((len(base), 2)))
-    args = X(k), X(k + 1), E, D, PERIOD_S
-    error = pose_alignment_factor([blank], *args, bTl=BTL, condensed=False).unwhitenedError(truth)
+    args = Between(X(k), X(k + 1), PERIOD_S, 0.0, bTl=BTL), E, D
+    error = stacked(pose_alignment_factor([blank], *args)).unwhitenedError(truth)
     pixels = error[:-1].reshape(2, -1).T
-    return pose_alignment_factor([replace(blank, pixels=pixels)], *args, bTl=BTL)
+    return pose_alignment_factor([replace(blank, pixels=pixels)], *args)
 
 
 def _moved(first, second, k, truth):
@@ -107,7 +107,8 @@ def _moved(first, second, k, truth):
         wTl = truth.atPose3(X(a)) * gtsam.Pose3.Expmap(s * step) * BTL
         cameras.append(wTl * truth.atPose3(E).inverse())
     covariance = np.diag(np.repeat([1e-3, 1e-2], 3) ** 2)
-    return camera_motion_factor(first, second, E, D, cameras[0].between(cameras[1]), covariance, bTl=BTL)
+    measured = CameraMotion(cameras[0].between(cameras[1]), covariance)
+    return camera_motion_factor(first, second, E, D, measured)
 
 
 def bias_key(k, combined):

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.factors import FactorError, check_jacobians, twist_transfer_factor
+from sst_graph.factors import FactorError, LidarTwist, check_jacobians, twist_transfer_factor
 from sst_graph.factors.velocity import transferred
 
 V, E, D = gtsam.symbol("V", 0), gtsam.symbol("E", 0), gtsam.symbol("D", 0)
@@ -38,7 +38,7 @@ def test_signs_by_hand() -> None:
     cTl = gtsam.Pose3(cRl, np.array([0.0, 0.0, -2.0]))
     forward_and_left_turn = np.array([0.0, 0.0, 0.5, 10.0, 0.0, 0.0])
     braking = np.array([0.0, 0.0, 0.0, -3.0, 0.0, 0.0])
-    factor = twist_transfer_factor(V, E, D, forward_and_left_turn, braking, 0.1, np.eye(6))
+    factor = twist_transfer_factor(V, E, D, LidarTwist(forward_and_left_turn, braking, 0.1), np.eye(6))
     # 0.3 s later it drives 9.1 m/s; a left turn of 0.5 rad/s swings the camera leftward by 1 m/s.
     expected = np.array([0.0, -0.5, 0.0, -1.0, 0.0, 9.1])
     error = factor.unwhitenedError(values_at(expected, cTl, 0.4))
@@ -53,7 +53,8 @@ def test_signs_by_hand() -> None:
 def test_jacobians(seed: int) -> None:
     rng = np.random.default_rng(seed)
     twist, rate = rng.normal(0.0, 3.0, (2, 6))
-    factor = twist_transfer_factor(V, E, D, twist, rate, rng.normal(0.0, 0.1), random_covariance(rng))
+    lidar_twist = LidarTwist(twist, rate, rng.normal(0.0, 0.1))
+    factor = twist_transfer_factor(V, E, D, lidar_twist, random_covariance(rng))
     values = values_at(rng.normal(0.0, 3.0, 6), random_pose(rng), rng.normal(0.0, 0.3))
     assert check_jacobians(factor, values).error < 1e-6
 
@@ -66,7 +67,7 @@ def test_conjugated_motion(seed: int) -> None:
     aTb = gtsam.Pose3.Expmap(seconds * l_twist)
     c_motion = cTl.compose(aTb).compose(cTl.inverse())
     c_twist = np.asarray(gtsam.Pose3.Logmap(c_motion)) / seconds
-    factor = twist_transfer_factor(V, E, D, l_twist, np.zeros(6), 0.2, np.eye(6))
+    factor = twist_transfer_factor(V, E, D, LidarTwist(l_twist, np.zeros(6), 0.2), np.eye(6))
     values = values_at(c_twist, cTl, rng.normal())
     np.testing.assert_allclose(factor.unwhitenedError(values), 0.0, atol=1e-10)
 
@@ -74,7 +75,7 @@ def test_conjugated_motion(seed: int) -> None:
 def test_whitened_by_the_covariance() -> None:
     rng = np.random.default_rng(3)
     covariance, l_twist, twist = random_covariance(rng), rng.normal(size=6), rng.normal(size=6)
-    factor = twist_transfer_factor(V, E, D, l_twist, np.zeros(6), 0.0, covariance)
+    factor = twist_transfer_factor(V, E, D, LidarTwist(l_twist, np.zeros(6), 0.0), covariance)
     error = twist - l_twist
     cost = factor.error(values_at(twist, gtsam.Pose3(), 0.0))
     assert cost == pytest.approx(0.5 * error @ np.linalg.solve(covariance, error))
@@ -91,7 +92,7 @@ def test_whitened_by_the_covariance() -> None:
 )
 def test_bad_arguments(twist: np.ndarray, rate: np.ndarray, covariance: np.ndarray) -> None:
     with pytest.raises(FactorError):
-        twist_transfer_factor(V, E, D, twist, rate, 0.0, covariance)
+        twist_transfer_factor(V, E, D, LidarTwist(twist, rate, 0.0), covariance)
 
 
 def test_many_images_at_once_are_each_by_itself() -> None:
@@ -100,7 +101,7 @@ def test_many_images_at_once_are_each_by_itself() -> None:
     cTl, time_offset_s = random_pose(rng), 0.13
     found = transferred(l_twists, rates, np.full((7, 1), time_offset_s - 0.1), c_twists, cTl, True)
     for k, (error, by_cTl, by_offset) in enumerate(zip(*found, strict=True)):
-        factor = twist_transfer_factor(V, E, D, l_twists[k], rates[k], 0.1, np.eye(6))
+        factor = twist_transfer_factor(V, E, D, LidarTwist(l_twists[k], rates[k], 0.1), np.eye(6))
         values = values_at(c_twists[k], cTl, time_offset_s)
         np.testing.assert_allclose(error, factor.unwhitenedError(values), atol=1e-12)
         linear = factor.linearize(values)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sst_graph.factors import (
+    DirectionSigmas,
     FactorError,
     check_jacobians,
     mean_velocity_factor,
@@ -32,9 +33,7 @@ def direction_factor(**changes):
         "omega": [0.0, 0.1, 0.0],
         "direction": [0.0, 0.0, 2.0],
         "speed_mps": 10.0,
-        "sigma_omega": 0.01,
-        "sigma_direction_rad": 0.02,
-        "sigma_speed_mps": 0.3,
+        "sigmas": DirectionSigmas(0.01, 0.02, 0.3),
     }
     return velocity_direction_factor(V[0], **(measured | changes))
 
@@ -109,7 +108,7 @@ def test_smoothness_by_hand():
 
 
 def test_jerk_is_blind_to_constant_acceleration_and_sees_a_parabola():
-    factor = twist_jerk_factor(V[0], V[1], V[2], 0.1, 0.3, 1.0, 1.0)
+    factor = twist_jerk_factor(V[0], V[1], V[2], (0.1, 0.3), 1.0, 1.0)
     times = np.array([0.0, 0.1, 0.4])
     base, acceleration, jerk = np.random.default_rng(3).normal(size=(3, 6))
     steady = [base + acceleration * t for t in times]
@@ -124,7 +123,7 @@ FACTORS = {
     "direction_low": lambda: direction_factor(low_speed_mps=5.0, direction=[1.0, 2.0, 3.0]),
     "mean": lambda: mean_velocity_factor(V[0], V[1], np.ones(6), COVARIANCE),
     "smoothness": lambda: twist_smoothness_factor(V[0], V[1], 0.1, 0.5, 2.0),
-    "jerk": lambda: twist_jerk_factor(V[0], V[1], V[2], 0.1, 0.3, 1.0, 2.0),
+    "jerk": lambda: twist_jerk_factor(V[0], V[1], V[2], (0.1, 0.3), 1.0, 2.0),
 }
 
 
@@ -143,10 +142,14 @@ def test_jacobians_at_100_twists(name):
         lambda: velocity_factor(V[0], np.ones(6), np.diag([1.0, 1, 1, 1, 1, 0])),
         lambda: velocity_factor(V[0], np.ones(6), np.triu(np.ones((6, 6)))),
         lambda: direction_factor(direction=[0.0, 0.0, 0.0]),
-        lambda: direction_factor(sigma_speed_mps=0.0),
+        lambda: direction_factor(low_speed_mps=0.0),
+        lambda: DirectionSigmas(0.0, 0.02, 0.3),
+        lambda: DirectionSigmas(0.01, -0.02, 0.3),
+        lambda: DirectionSigmas(0.01, 0.02, np.nan),
         lambda: direction_factor(speed_mps=np.nan),
         lambda: twist_smoothness_factor(V[0], V[1], -0.1, 0.5, 2.0),
-        lambda: twist_jerk_factor(V[0], V[1], V[2], 0.1, 0.0, 1.0, 2.0),
+        lambda: twist_jerk_factor(V[0], V[1], V[2], (0.1, 0.0), 1.0, 2.0),
+        lambda: twist_jerk_factor(V[0], V[1], V[2], 0.1, 1.0, 2.0),
     ],
 )
 def test_bad_measurements_raise(build):

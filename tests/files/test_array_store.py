@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import pickle
+import resource
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -89,15 +90,18 @@ def test_where_no_file_can_be_written_arrays_stay_in_memory(
     assert store.file_bytes == 0 and len(caplog.records) == 1
 
 
-def test_a_full_disk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Linux's /dev/full refuses every byte; what was written before comes back all the same."""
+def test_a_file_that_may_not_grow() -> None:
+    """As on a full disk: what was written before comes back all the same, the rest stays in memory."""
     store = ArrayStore(0)
     first, second = np.arange(4.0), np.arange(5.0)
     kept = store.put(first)
-    with open("/dev/full", "r+b", buffering=0) as full:
-        monkeypatch.setattr(store, "_file", full, raising=True)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (first.nbytes, limits[1]))
+    try:
         refused = store.put(second)
-        monkeypatch.undo()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert store.file_bytes == first.nbytes
     np.testing.assert_array_equal(refused.get(), second)
     np.testing.assert_array_equal(kept.get(), first)
 

@@ -28,6 +28,7 @@ from sst_graph.files import (
     check_folder_target,
     output_file,
 )
+from sst_graph.files.manifest import carry_over, give_back
 
 KIND = OutputKind("thing")
 CLOSED = OutputKind("thing", exclusive=("own",))
@@ -276,23 +277,20 @@ def test_what_others_keep_in_a_folder_survives(tmp_path: Path) -> None:
     assert (out / "link").is_symlink() and (out / "empty").is_dir() and names(tmp_path) == {"out"}
 
 
-def test_notes_saved_while_the_folder_is_replaced_survive(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
+def test_notes_saved_while_the_folder_is_replaced_survive(tmp_path: Path) -> None:
+    """They are written to the former folder, after what others keep there has been carried over."""
+    out, new, former = tmp_path / "out", tmp_path / "new", tmp_path / "former"
     write(out, {"a": "old"})
     (out / "notes.txt").write_text("first")
-    exchange = __import__("sst_graph.files.output", fromlist=["_exchange"])._exchange
-
-    def late(new: Path, target: Path) -> bool:
-        (target / "late.txt").write_text("late")
-        (target / "saved").write_text("second")
-        os.replace(target / "saved", target / "notes.txt")
-        os.utime(target / "notes.txt", ns=(1 << 62, 1 << 62))
-        return bool(exchange(new, target))
-
-    monkeypatch.setattr("sst_graph.files.output._exchange", late)
-    write(out, {"a": "new"}, overwrite=True)
+    write(new, {"a": "new"})
+    carry_over(out, new)
+    (out / "late.txt").write_text("late")
+    (out / "saved").write_text("second")
+    os.replace(out / "saved", out / "notes.txt")
+    os.utime(out / "notes.txt", ns=(1 << 62, 1 << 62))
+    out.rename(former)
+    new.rename(out)
+    give_back(former, out)
     assert tree(out) == {"a": "new", "late.txt": "late", "notes.txt": "second"}
 
 

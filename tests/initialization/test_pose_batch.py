@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
-from sst_graph.association.edge_matching import MatchConfig, Motion, ScanWithImage, match_silhouettes
+from sst_graph.association.edge_matching import MatchConfig, ScanWithImage, match_silhouettes
 from sst_graph.drive.preparation import Drive, ImageFeatures, ScanFeatures
-from sst_graph.factors import PinholeCamera, RobustKernel
+from sst_graph.factors import CameraTwist, PinholeCamera, RobustKernel
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.graph.building import PRIOR_TRANSLATION_SIGMA_M, GraphConfig, Tracks
@@ -121,7 +121,7 @@ def test_each_pose_has_the_matches_that_it_has_alone(scale_px: float) -> None:
     for i, cTl in enumerate(several):
         matches, seen = 0.0, 0
         for scan, image in zip(drive.scans, drive.images, strict=True):
-            motion = Motion(np.zeros(6), np.zeros(6))
+            motion = CameraTwist(np.zeros(6), np.zeros(6))
             pair = ScanWithImage(scan.boundaries, image.contours, drive.camera, 0.0, motion)
             found = match_silhouettes(pair, cTl, 0.0, {}, kernel(scale_px), MatchConfig())
             r = _distances(found[VEHICLE].alignment, cTl)

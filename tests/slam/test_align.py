@@ -14,10 +14,10 @@ import sst_graph
 from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.drive.preparation import PrepareConfig, ScanFeatures, image_features, scan_features
 from sst_graph.errors import DataError
-from sst_graph.factors import RobustKernel, frame_factor, pose_alignment_factor, residuals
+from sst_graph.factors import Between, RobustKernel, frame_factor, pose_alignment_factor, residuals
 from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.simulator import SimulatedDrive, SimulationConfig
-from sst_graph.slam.align import FrameAlignments
+from sst_graph.slam.align import CameraCalibration, FrameAlignments, FrameMatching, ScanMotion
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
@@ -54,6 +54,14 @@ def l_twist(position: int) -> np.ndarray:
     return np.asarray(gtsam.Pose3.Logmap(a.between(b)) / (stamps[1] - stamps[0]))
 
 
+def motion(position: int) -> ScanMotion:
+    return ScanMotion(l_twist(position))
+
+
+def at_truth(time_offset_s: float = 0.05) -> CameraCalibration:
+    return CameraCalibration(drive().camera, drive().truth.cTl, time_offset_s)
+
+
 def mean_size_px(found: FrameAlignments, cTl: gtsam.Pose3, time_offset_s: float, twist: np.ndarray) -> float:
     sizes = [
         np.abs(residuals(a, cTl, time_offset_s, cTl.AdjointMap() @ twist, 0.0)[0]) for a in found.alignments
@@ -64,26 +72,23 @@ def mean_size_px(found: FrameAlignments, cTl: gtsam.Pose3, time_offset_s: float,
 def test_matches_at_the_truth_lie_on_the_contours() -> None:
     scan, image = frame(2)
     truth = drive().truth
-    found = sst_graph.align_frame(scan, image, drive().camera, truth.cTl, 0.05, l_twist(2), kernel=NARROW)
+    found = sst_graph.align_frame(scan, image, at_truth(), motion(2), FrameMatching(kernel=NARROW))
     assert found.classes == (VEHICLE,) and len(found) > 50
-    at_truth = mean_size_px(found, truth.cTl, 0.05, l_twist(2))
-    assert at_truth < 1.5
+    size_px = mean_size_px(found, truth.cTl, 0.05, l_twist(2))
+    assert size_px < 1.5
     # the same matches under a pose off by 0.5 deg, and without the delay
     off = truth.cTl.retract([0.0, 0.0, np.radians(0.5), 0.0, 0.0, 0.0])
-    assert mean_size_px(found, off, 0.05, l_twist(2)) > 1.5 * at_truth
+    assert mean_size_px(found, off, 0.05, l_twist(2)) > 1.5 * size_px
 
 
 def test_features_spare_the_work_and_change_nothing() -> None:
     scan, image = frame(2)
-    truth, camera = drive().truth, drive().camera
-    direct = sst_graph.align_frame(scan, image, camera, truth.cTl, 0.05, l_twist(2))
+    direct = sst_graph.align_frame(scan, image, at_truth(), motion(2))
     prepared = sst_graph.align_frame(
         scan_features(2, scan, [VEHICLE], PrepareConfig()),
         image_features(2, image, [VEHICLE]),
-        camera,
-        truth.cTl,
-        0.05,
-        l_twist(2),
+        at_truth(),
+        motion(2),
     )
     assert len(direct) == len(prepared) > 0
     for a, b in zip(direct.alignments, prepared.alignments, strict=True):
@@ -96,12 +101,12 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
     scan, image = frame(1)
     later_ns = int(drive().stamps_ns[4])
     image = frame(4)[1]
-    truth, camera = drive().truth, drive().camera
+    truth = drive().truth
     lTs = drive().wTl(later_ns * 1e-9).between(drive().wTl(scan.stamp_ns * 1e-9))
     features = scan_features(1, scan, [VEHICLE], PrepareConfig())
-    arguments = (image, camera, truth.cTl, 0.05, l_twist(4))
-    found = sst_graph.align_frame(features, *arguments, lTs=lTs, from_ns=later_ns)
-    by_hand = sst_graph.align_frame(_moved(features, lTs, later_ns), *arguments)
+    moved = ScanMotion(l_twist(4), lTs=lTs, from_ns=later_ns)
+    found = sst_graph.align_frame(features, image, at_truth(), moved)
+    by_hand = sst_graph.align_frame(_moved(features, lTs, later_ns), image, at_truth(), motion(4))
     assert len(found) == len(by_hand) > 50
     for a, b in zip(found.alignments, by_hand.alignments, strict=True):
         np.testing.assert_allclose(a.pixels, b.pixels, atol=1e-3)
@@ -112,7 +117,8 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
     for key, pose in ((0, gtsam.Pose3()), (1, gtsam.Pose3.Expmap(0.1 * l_twist(4))), (2, lTs)):
         values.insert(key, pose)
     values.insert(3, truth.cTl)
-    on_poses = pose_alignment_factor(found.alignments, 0, 1, 3, 0.05, 0.1, X_scan=2)
+    between = Between(0, 1, 0.1, 1e-9 * (image.stamp_ns - later_ns), X_scan=2)
+    on_poses = pose_alignment_factor(found.alignments, between, 3, 0.05)
     plain = frame_factor(by_hand.alignments, 3, 0.05, truth.cTl.AdjointMap() @ l_twist(4))
     assert on_poses.error(values) == pytest.approx(plain.error(values), rel=1e-3)
 
@@ -120,22 +126,24 @@ def test_a_scan_of_another_time_is_the_same_scan_moved() -> None:
 def test_a_moving_vehicle_is_moved_with_its_velocity() -> None:
     # moved by hand to where it is when the image is taken, it meets the same contours
     scan, image = frame(2)
-    truth, camera, velocity, time_offset_s = drive().truth, drive().camera, np.array([0.8, -1.5, 0.1]), 0.05
+    velocity, time_offset_s = np.array([0.8, -1.5, 0.1]), 0.05
     features = scan_features(2, scan, [VEHICLE], PrepareConfig())
     points, late_s = features.boundaries[VEHICLE], time_offset_s + 1e-9 * (image.stamp_ns - scan.stamp_ns)
     number = int(np.bincount(points.objects).argmax())
-    arguments = (image, camera, truth.cTl, time_offset_s, l_twist(2))
-    found = sst_graph.align_frame(features, *arguments, l_velocities={(VEHICLE, number): velocity})
+    moving = ScanMotion(l_twist(2), l_velocities={(VEHICLE, number): velocity})
+    found = sst_graph.align_frame(features, image, at_truth(), moving)
     shift = np.where(points.objects[:, None] == number, late_s * velocity, 0.0)
     carried = replace(points, lPs=points.lPs + shift, outward=points.outward + shift)
-    by_hand = sst_graph.align_frame(replace(features, boundaries={VEHICLE: carried}), *arguments)
+    by_hand = sst_graph.align_frame(
+        replace(features, boundaries={VEHICLE: carried}), image, at_truth(), motion(2)
+    )
     (a,), (b,) = found.alignments, by_hand.alignments
     np.testing.assert_allclose(a.pixels, b.pixels, atol=1e-6)
     assert a.l_velocities is not None
     own = found.objects[0] == number
     assert 10 < np.count_nonzero(own) < len(own)
     np.testing.assert_array_equal(a.l_velocities, np.where(own[:, None], velocity, 0.0))
-    standing = sst_graph.align_frame(features, *arguments)
+    standing = sst_graph.align_frame(features, image, at_truth(), motion(2))
     assert len(standing) != len(found) or not np.allclose(standing.alignments[0].pixels, a.pixels, atol=0.1)
 
 
@@ -152,10 +160,10 @@ def _moved(features: ScanFeatures, lTs: gtsam.Pose3, stamp_ns: int) -> ScanFeatu
 
 def test_a_side_of_an_object_counts_once() -> None:
     scan, image = frame(2)
-    truth, camera = drive().truth, drive().camera
+    truth = drive().truth
     informations = []
     for config in (MatchConfig(side_sigma_px=0.0), MatchConfig(side_sigma_px=1.5)):
-        found = sst_graph.align_frame(scan, image, camera, truth.cTl, 0.05, l_twist(2), config=config)
+        found = sst_graph.align_frame(scan, image, at_truth(), motion(2), FrameMatching(config=config))
         values = gtsam.Values()
         values.insert(0, truth.cTl)
         factor = frame_factor(found.alignments, 0, 0.05, truth.cTl.AdjointMap() @ l_twist(2))
@@ -166,30 +174,27 @@ def test_a_side_of_an_object_counts_once() -> None:
 def test_a_frame_without_the_class_gives_no_match() -> None:
     scan, image = frame(2)
     bare = replace(scan, classes=np.zeros_like(scan.classes))
-    found = sst_graph.align_frame(bare, image, drive().camera, drive().truth.cTl, 0.05, np.zeros(6))
+    found = sst_graph.align_frame(bare, image, at_truth(), ScanMotion(np.zeros(6)))
     assert len(found) == 0 and found.alignments == ()
 
 
 def test_refuses_half_an_argument() -> None:
-    scan, image = frame(2)
-    arguments = (scan, image, drive().camera, drive().truth.cTl, 0.05)
+    still = np.zeros(6)
     with pytest.raises(DataError, match="both, or none"):
-        sst_graph.align_frame(*arguments, np.zeros(6), lTs=gtsam.Pose3())
-    with pytest.raises(DataError, match="6 finite numbers"):
-        sst_graph.align_frame(*arguments, np.zeros(3))
+        ScanMotion(still, lTs=gtsam.Pose3())
+    with pytest.raises(DataError, match=r"l_twist of ScanMotion.*6 finite numbers"):
+        ScanMotion(np.zeros(3))
+    with pytest.raises(DataError, match=r"l_acceleration of ScanMotion.*6 finite numbers"):
+        ScanMotion(still, np.full(6, np.nan))
     with pytest.raises(DataError, match="stand in a scan of another time"):
-        sst_graph.align_frame(
-            *arguments, np.zeros(6), lTs=gtsam.Pose3(), from_ns=0, l_velocities={(VEHICLE, 1): np.ones(3)}
-        )
+        ScanMotion(still, lTs=gtsam.Pose3(), from_ns=0, l_velocities={(VEHICLE, 1): np.ones(3)})
     with pytest.raises(DataError, match="3 finite numbers"):
-        sst_graph.align_frame(*arguments, np.zeros(6), l_velocities={(VEHICLE, 1): np.ones(2)})
+        ScanMotion(still, l_velocities={(VEHICLE, 1): np.ones(2)})
 
 
 def test_objects_name_the_vehicle_of_each_match() -> None:
     scan, image = frame(2)
-    found = sst_graph.align_frame(
-        scan, image, drive().camera, drive().truth.cTl, drive().config.time_offset_s, l_twist(2)
-    )
+    found = sst_graph.align_frame(scan, image, at_truth(drive().config.time_offset_s), motion(2))
     (objects,), (alignment,) = found.objects, found.alignments
     assert objects.shape == (len(alignment),) and len(np.unique(objects)) > 1
     # matches of one object lie close together, as a vehicle does

@@ -139,12 +139,12 @@ def test_a_term_moves_to_the_poses_of_its_time(street: Street) -> None:
     period_s = 1e-9 * (street.stamps_ns[5] - street.stamps_ns[4])
     matches = term.matched(values, 5.0)
     assert matches.state is TermState.MATCHED and matches.factor is not None and matches.place is not None
-    assert (matches.place.X_a, matches.place.X_b) == (X(4), X(5))
+    assert (matches.place.between.X_a, matches.place.between.X_b) == (X(4), X(5))
     assert matches.left_interval_s(values) == 0.0
     values.update(D, np.array([street.time_offset_s + 2.0 * period_s]))
     assert matches.left_interval_s(values) == pytest.approx(street.time_offset_s + period_s, abs=2e-3)
     again = term.matched(values, 5.0)
-    assert again.place is not None and (again.place.X_a, again.place.X_b) == (X(6), X(7))
+    assert again.place is not None and (again.place.between.X_a, again.place.between.X_b) == (X(6), X(7))
     assert again.left_interval_s(values) == 0.0
 
 
@@ -155,7 +155,7 @@ def test_the_scan_nearest_in_true_time_is_taken(street: Street) -> None:
         values.update(D, np.array([street.time_offset_s + shift]))
         place = term.place(values)
         assert not isinstance(place, TermMatches)
-        assert place.X_scan in {X(k) for k in expected}
+        assert place.between.X_s in {X(k) for k in expected}
 
 
 @pytest.mark.parametrize(

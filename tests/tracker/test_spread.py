@@ -70,7 +70,7 @@ def test_a_drive_that_ends_before_the_start_is_done(street: SimulatedDrive, fram
     for frame in frames[:24]:
         update = slow.add(frame)
     assert not slow.estimate.exists and update.covariance is None
-    last = slow.optimize(update)
+    last = slow.optimize()
     assert last.converged is not None and last.accepted and last.covariance is not None
     assert last.status in ("ok", "unobservable")
     assert sigmas_apart(slow, street.truth.cTl, street.truth.time_offset_s or 0.0) < 5.0

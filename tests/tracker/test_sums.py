@@ -20,7 +20,7 @@ from sst_graph.graph.linear import unit_scale
 from sst_graph.graph.state import EXTRINSIC, State, bias_key, object_bias_key, time_offset_key
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair
 from sst_graph.tracker.sums.running_sums import RunningSums
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.types import SemanticClass
@@ -52,7 +52,8 @@ def matched() -> tuple[RobustCovariance, Point, list[LinearizedPair]]:
     point = Point.unbiased(state.cTl, OFFSET_S, [VEHICLE]).seen(seen)
     named = [{(c, n): track for (k, c, n), track in tracks.items() if k == pair.pair.scan} for pair in pairs]
     linear = [
-        linearize_pair(pair, point, [VEHICLE], own, CONFIG) for pair, own in zip(pairs, named, strict=True)
+        linearize_pair(pair, point, PairColumns([VEHICLE], own))
+        for pair, own in zip(pairs, named, strict=True)
     ]
     return robust, point, linear
 

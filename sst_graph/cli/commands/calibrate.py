@@ -10,11 +10,13 @@ from collections.abc import Sequence
 import gtsam
 
 from sst_graph.batch import CalibrationConfig, calibrate
-from sst_graph.cli.inputs import chosen_classes, open_drives, settings, starting_point
+from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, exit_code, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
 from sst_graph.files import atomic_directory
 from sst_graph.inspect.report import Comparison, summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
@@ -25,19 +27,20 @@ logger = logging.getLogger(__name__)
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate ``args.data``, print the summary of the result, write it."""
-    flags = {
-        "method": args.method,
-        "classes": chosen_classes(args.classes),
-        "time_offset_per_drive": args.time_offset_per_drive,
-        "assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
-    }
-    config = settings(CalibrationConfig(), args, flags)
+    cameras = given_cameras(args)
+    if len(cameras) > 1:
+        return run_rig(args, cameras)
+    args.camera = cameras[0] if cameras else None
+    refuse_rig_options(args)
+    config = calibration_settings(args)
     inputs = {"DATA": None, "--init": args.init, "--config": args.config}
     for path in args.data:
         check_apart({**inputs, "DATA": path}, {"--out": args.out})
     with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
         read_as = options_of(args)
         sources = open_drives(args)
+        if config.method != "motion":
+            check_classes(sources, config.classes, args.classes)
         warn_of_other_pairs(args.init, read_as)
         initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
         result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)

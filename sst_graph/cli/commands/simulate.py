@@ -26,6 +26,6 @@ def run(args: argparse.Namespace) -> int:
     check_apart({"--config": args.config}, {"OUT": args.out})
     with atomic_directory(args.out, args.overwrite, DRIVE) as folder, ProgressBar() as progress:
         drive = simulate(config)
-        fill_drive(drive, folder, progress.stage("simulate"))
+        fill_drive(drive, folder, progress.stage("simulate"), args.stereo)
     mention(f"wrote {args.out}: {len(drive)} frames, true time offset {1e3 * config.time_offset_s:+.1f} ms")
     return 0

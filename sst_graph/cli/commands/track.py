@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 
 from sst_graph.cli.inputs import chosen_classes, settings, starting_point
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
@@ -54,7 +55,8 @@ def _track(
 
     The last line and the result hold the same estimate. With a checkpoint it is that of the tracker in the
     file, whose arrays have the file's memory layout: the result is the same to the last bit whether the run
-    was interrupted and resumed or not.
+    was interrupted and resumed or not. The last line is said after that: resumed where no frame is to come,
+    the tracker says it again.
 
     Returns:
         The tracker, and its last update.
@@ -69,28 +71,31 @@ def _track(
             if saver is not None and (is_last or number % args.checkpoint_every == 0):
                 saver.save(tracker)
             if is_last:
-                tracker, update = _optimized(args, source, tracker, update, saver)
-            say(json.dumps({"frame": frame.index, **update.to_dict()}, allow_nan=False))
+                tracker, update = _optimized(args, source, tracker, saver)
+            _say_line(update)
         if update is not None:
             return tracker, update
         # A save consolidates the tracker: what is saved already is not saved again.
         if saver is not None and not args.checkpoint.exists():
             saver.save(tracker)
-        return _optimized(args, source, tracker, None, saver)
+        tracker, update = _optimized(args, source, tracker, saver)
+        if update.frame is not None:
+            _say_line(update)
+        return tracker, update
+
+
+def _say_line(update: TrackUpdate) -> None:
+    say(json.dumps(update.to_dict(), allow_nan=False))
 
 
 def _optimized(
-    args: argparse.Namespace,
-    source: SweptSource,
-    tracker: Tracker,
-    update: TrackUpdate | None,
-    saver: Saver | None,
+    args: argparse.Namespace, source: SweptSource, tracker: Tracker, saver: Saver | None
 ) -> tuple[Tracker, TrackUpdate]:
     """The tracker that is saved, or the one given where none is, its whole window solved; and its update."""
     if saver is not None:
         saver.finish()
         tracker = Tracker.load(args.checkpoint)
-    last = tracker.optimize(update)
+    last = tracker.optimize()
     if last.status == "ok" and _is_open(source):
         last = dataclasses.replace(last, status="unconfirmed", suspected_change=_OPEN_SWEEP)
     return tracker, last
@@ -120,6 +125,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         "calibration.assumptions.estimate": None if args.estimate is None else args.estimate.split(","),
     }
     config = settings(TrackerConfig(), args, flags)
+    check_classes([source], config.calibration.classes, args.classes)
     if args.init is not None:
         warn_of_other_pairs(args.init, options_of(args))
     if not (args.resume and args.checkpoint.exists()):

@@ -2,6 +2,8 @@
 
 Where present also ``masks/`` (.png, Cityscapes numbers, named as the images), ``labels/`` (.label as in
 SemanticKITTI, named as the clouds; a field ``label`` of the clouds serves as well) and ``extrinsic.yaml``.
+Of several cameras, each has a folder of its name with ``images/``, ``camera.yaml``, ``masks/`` and
+``extrinsic.yaml``.
 """
 
 from __future__ import annotations
@@ -39,7 +41,12 @@ _DEFAULT_CAMERA, _DEFAULT_CLOUD = SourceOptions().camera, SourceOptions().cloud
 
 def is_folder(path: Path) -> bool:
     """Whether a folder holds images and clouds."""
-    return os.path.isdir(path / _IMAGES) and os.path.isdir(path / _CLOUDS)
+    return os.path.isdir(path / _CLOUDS) and (os.path.isdir(path / _IMAGES) or bool(_cameras(path)))
+
+
+def _cameras(path: Path) -> list[str]:
+    """Names of the folders of cameras."""
+    return sorted(entry.name for entry in listed(path, LAYOUT) if os.path.isdir(entry / _IMAGES))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +81,7 @@ class CloudFiles:
             offsets_s = self.timing.offsets_s(points[used])
         elif self.stored_times and (times := cloud.offsets_s(stamp_ns, used)) is not None:
             offsets_s = times[used]
-        rings = cloud.rings()
+        rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
         return Scan(
             stamp_ns=stamp_ns,
@@ -84,6 +91,7 @@ class CloudFiles:
             offsets_s=offsets_s,
             rings=rings_from_order(points) if rings is None else rings[used],
             left_out=len(used) - len(points),
+            intensities=None if intensities is None else intensities[used],
         )
 
     def _labels(
@@ -104,16 +112,17 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         MissingDependencyError: PyYAML is not installed.
     """
     _check_options(path, options)
-    images = stamped_files(path / _IMAGES, PICTURES)
+    own = path if options.camera in (_DEFAULT_CAMERA, _IMAGES) else path / options.camera
+    images = stamped_files(own / _IMAGES, PICTURES)
     clouds = stamped_files(path / _CLOUDS, SUFFIXES)
     for what, files in ((_IMAGES, images), (_CLOUDS, clouds)):
         if files.without_stamp:
             _LOG.warning("%s: %d %s without a stamp left out", printable(path), files.without_stamp, what)
-    model = read_camera(path / _CAMERA)
-    extrinsic = path / _EXTRINSIC
+    model = read_camera(own / _CAMERA)
+    extrinsic = own / _EXTRINSIC
     nominal = read_extrinsic(extrinsic) if os.path.lexists(extrinsic) else None
     size = (model.width, model.height)
-    masks = _beside(images, path / "masks", (".png",))
+    masks = _beside(images, own / "masks", (".png",))
     encoding = mask_encoding(masks, options.label_encoding, size)
     pictures = PictureFiles(size, dict(enumerate(images.paths)), masks, encoding)
     scans = CloudFiles(
@@ -127,7 +136,8 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
         return pictures.image(k, int(images.stamps_ns[k]))
 
     properties = DriveProperties(printable(path.resolve().name), model.intrinsics, nominal)
-    of_scans, of_images = Sensor(clouds.stamps_ns, scans.scan), Sensor(images.stamps_ns, image)
+    of_scans = Sensor(clouds.stamps_ns, scans.scan, _CLOUDS)
+    of_images = Sensor(images.stamps_ns, image, _IMAGES)
     drive = merged(properties, of_scans, of_images, options, path)
     return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
@@ -135,12 +145,16 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
 def _check_options(path: Path, options: SourceOptions) -> None:
     wrong = {
         "sequence": options.sequence is not None,
-        "camera": options.camera not in (_DEFAULT_CAMERA, _IMAGES),
         "cloud": options.cloud not in (_DEFAULT_CLOUD, _CLOUDS),
     }
     for name, is_wrong in wrong.items():
         if is_wrong:
             raise ConfigError(f"{name} {getattr(options, name)!r}: {path} has images and clouds only")
+    cameras = [_IMAGES] * os.path.isdir(path / _IMAGES) + _cameras(path)
+    named = _IMAGES if options.camera == _DEFAULT_CAMERA else options.camera
+    if named not in cameras and cameras:
+        given = "none is named" if options.camera == _DEFAULT_CAMERA else f"none is {options.camera!r}"
+        raise ConfigError(f"{path}: cameras {', '.join(cameras)}: {given} (--camera)")
 
 
 def _timing(clouds: StampedFiles, options: SourceOptions) -> SweepTiming | None:

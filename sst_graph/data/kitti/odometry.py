@@ -32,6 +32,7 @@ from sst_graph.data.kitti.odometry_layout import (
     LAYOUT,
     FrameCounts,
     KittiFiles,
+    check_camera,
     find_files,
     find_sequence,
     image_times_path,
@@ -181,7 +182,7 @@ class KittiSource:
     def scan(self, index: int) -> Scan:
         """Scan of an index that has one; errors as of the frame."""
         path = self.files.scans[index]
-        points = read_points(path)
+        points, intensities = read_points(path)
         # Beams without a return come as NaN from many drivers.
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = point_labels(self.files.labels.get(index), used)
@@ -195,6 +196,7 @@ class KittiSource:
             offsets_s=None if offsets_s is None else offsets_s[used],
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
+            intensities=intensities[used],
         )
 
     def _offsets(
@@ -231,6 +233,7 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
         ConfigError: no such sequence, camera or range of frames.
     """
     folder = find_sequence(path, options.sequence)
+    check_camera(folder, options.camera)
     calibration = read_calibration(folder / "calib.txt")
     nominal = calibration.cTl(options.camera)
     stamps_ns = read_times(folder / "times.txt")

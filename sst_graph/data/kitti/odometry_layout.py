@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -95,6 +96,20 @@ class FrameCounts:
     image_stamps: int | None = None
 
 
+def check_camera(folder: Path, camera: str) -> None:
+    """Refuse a camera that the sequence has no folder of.
+
+    Raises:
+        ConfigError: the cameras there are listed.
+    """
+    if not camera.startswith("image_"):
+        raise ConfigError(f"camera {camera!r}: expected image_N, as in image_2")
+    if not os.path.lexists(folder / camera):
+        there = sorted(name for name in os.listdir(folder) if re.fullmatch(r"image_\d+", name))
+        if there:
+            raise ConfigError(f"camera {camera!r}: {folder} has {', '.join(there)}")
+
+
 def image_times_path(folder: Path, camera: str) -> Path | None:
     """File with the images' own stamps, ``times_2.txt`` of image_2, where there is one."""
     path = folder / f"times_{camera.removeprefix('image_').lstrip('0') or '0'}.txt"
@@ -111,10 +126,7 @@ def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> Ki
     Raises:
         DataError: an empty or missing folder, a scan without its times, more or fewer frames than stamps,
             no scan with labels, no picture with a mask.
-        ConfigError: the camera's name is not of the form image_N.
     """
-    if not camera.startswith("image_"):
-        raise ConfigError(f"camera {camera!r}: expected image_N, as in image_2")
     scans = numbered_files(folder / cloud, (".bin",))
     labels = numbered_files(folder / "labels", (".label",))
     images = numbered_files(folder / camera, _PICTURES)

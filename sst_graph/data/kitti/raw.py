@@ -21,6 +21,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras import CameraModel, Rectification
 from sst_graph.data.arrays import MAX_POINTS, check_metres, read_points
 from sst_graph.data.images import picture_size
 from sst_graph.data.kitti.raw_calib import RawCalibration, raw_camera_number, read_raw_calibration
@@ -35,14 +36,14 @@ from sst_graph.data.kitti.raw_layout import (
 )
 from sst_graph.data.kitti.truth import read_truth
 from sst_graph.data.pictures import PictureFiles, mask_encoding, point_labels
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
-from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import CameraImage, GroundTruth, Scan
+from sst_graph.types import CameraImage, GroundTruth, Scan, Source
 
 TEXT_SCAN = FileKind("a cloud of lines x y z r", 64 * 1024 * 1024)
 
@@ -94,17 +95,19 @@ class RawScans:
             DataError: a file is damaged or holds what it must not.
         """
         path = self.scans[number]
-        points = read_points(path) if path.suffix.lower() == ".bin" else read_text_points(path)
+        read = read_points if path.suffix.lower() == ".bin" else read_text_points
+        points, intensities = read(path)
         used: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=1))
         classes, instances = point_labels(self.labels.get(number), used)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
         left_out = len(used) - len(points)
-        return Scan(stamp_ns, points, classes, instances, offsets_s, rings_from_order(points), left_out)
+        rings = rings_from_order(points)
+        return Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out, intensities[used])
 
 
-def read_text_points(path: Path) -> NDArray[np.float32]:
-    """Points (n, 3) float32 [m] of a cloud in text: x y z r a line.
+def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points (n, 3) float32 [m] and reflectances (n,) of a cloud in text: x y z r a line.
 
     Raises:
         DataError: a missing file, a line with other than four numbers, a coordinate that is no length.
@@ -120,16 +123,17 @@ def read_text_points(path: Path) -> NDArray[np.float32]:
         raise DataError(path, f"no numbers ({str(error).splitlines()[0]})", "lines of x y z r") from None
     if values.size and values.shape[1] != 4:
         raise DataError(path, f"{values.shape[1]} numbers a line", "4: x y z r")
-    points = np.ascontiguousarray(values.reshape(-1, 4)[:, :3])
+    values = values.reshape(-1, 4)
+    points = np.ascontiguousarray(values[:, :3])
     check_metres(points, path)
-    return points
+    return points, np.ascontiguousarray(values[:, 3])
 
 
-def open_raw(path: Path, options: SourceOptions) -> TwoClockSource:
-    """Open a drive of KITTI raw.
+def open_raw(path: Path, options: SourceOptions) -> Source:
+    """Open a drive of KITTI raw; images of a lens that distorts are rectified as they are read.
 
     Raises:
-        DataError: a file or line is missing or damaged, stamps do not rise, the lens distorts.
+        DataError: a file or line is missing or damaged, stamps do not rise.
         ConfigError: no such drive, camera or range of frames.
     """
     drive = find_drive(path, options.sequence)
@@ -137,7 +141,7 @@ def open_raw(path: Path, options: SourceOptions) -> TwoClockSource:
     calibration = read_raw_calibration(calibration_folder(drive))
     files = find_raw_files(drive, number)
     size = picture_size(next(iter(files.pictures.values())))
-    camera, nominal = _camera(calibration, drive, number, size)
+    model, nominal = _camera(calibration, drive, number, size)
     truth = _truth(drive, options.camera, nominal)
     encoding = mask_encoding(files.masks, options.label_encoding, size)
     pictures = PictureFiles(size, files.pictures, files.masks, encoding)
@@ -153,14 +157,18 @@ def open_raw(path: Path, options: SourceOptions) -> TwoClockSource:
         return pictures.image(int(images[k]), int(image_stamps[k]))
 
     is_reference = not (drive / "groundtruth.json").exists()
-    properties = DriveProperties(printable(drive.resolve().name), camera, nominal, truth, is_reference)
-    return merged(properties, Sensor(scan_stamps, scan), Sensor(image_stamps, image), options, drive)
+    name = printable(drive.resolve().name)
+    properties = DriveProperties(name, model.intrinsics, nominal, truth, is_reference)
+    of_scans = Sensor(scan_stamps, scan, "velodyne_points")
+    of_images = Sensor(image_stamps, image, f"image_{number:02d}")
+    source = merged(properties, of_scans, of_images, options, drive)
+    return source if model.is_pinhole else RectifiedSource(source, Rectification.of(model))
 
 
 def _camera(
     calibration: RawCalibration, drive: Path, number: int, size: tuple[int, int]
-) -> tuple[PinholeCamera, gtsam.Pose3]:
-    """Intrinsics and cTl for rectified pictures or for those as recorded, whichever have the size."""
+) -> tuple[CameraModel, gtsam.Pose3]:
+    """Camera and cTl for rectified pictures or for those as recorded, whichever have the size."""
     kinds = [rectified for rectified in (True, False) if calibration.size(number, rectified) == size]
     if not kinds:
         expected = " or ".join("{}x{} px".format(*calibration.size(number, kind)) for kind in (True, False))

@@ -2,7 +2,8 @@
 
 Rectified pictures (``_sync``) follow uv1 ~ P_rect_0N R_rect_00 [R T]_velo lP1 (KITTI devkit), so that
 cTl = [I | K^-1 P_rect_0N[:, 3]] R_rect_00 [R T]_velo with K = P_rect_0N[:, :3]. Pictures as recorded
-(``_extract``) follow K_0N with the distortion D_0N, and cTl = [R_0N T_0N] [R T]_velo.
+(``_extract``) follow K_0N with the distortion D_0N, and cTl = [R_0N T_0N] [R T]_velo; rectifying them
+(:mod:`sst_graph.data.rectified`) keeps cTl.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras import BrownConradyCamera, CameraModel
 from sst_graph.cameras.readers import camera_from_kitti_raw
 from sst_graph.cameras.tables import read_kitti_raw
 from sst_graph.data.kitti.calib import KittiCalibration, pose_from
 from sst_graph.errors import ConfigError, DataError
-from sst_graph.factors.camera import PinholeCamera
 
 FloatArray = NDArray[np.float64]
 
@@ -51,8 +52,8 @@ class RawCalibration:
         width, height = self._line(name, 2)
         return round(width), round(height)
 
-    def rectified(self, camera: int, width: int, height: int) -> tuple[PinholeCamera, gtsam.Pose3]:
-        """Intrinsics of a camera's rectified pictures of width x height [px], and cTl.
+    def rectified(self, camera: int, width: int, height: int) -> tuple[CameraModel, gtsam.Pose3]:
+        """The pinhole of a camera's rectified pictures of width x height [px], and cTl.
 
         Raises:
             DataError: a line is missing, or holds no such matrix.
@@ -63,23 +64,20 @@ class RawCalibration:
         c0Tl = pose_from(np.column_stack([R, np.zeros(3)]), place) * self.c0Tl
         named = f"image_{camera}"
         odometry = KittiCalibration(self.folder / CAM_TO_CAM, {camera: P}, c0Tl)
-        return odometry.camera(named, width, height), odometry.cTl(named)
+        return BrownConradyCamera(odometry.camera(named, width, height)), odometry.cTl(named)
 
-    def as_recorded(self, camera: int) -> tuple[PinholeCamera, gtsam.Pose3]:
-        """Intrinsics of a camera's pictures as recorded, and cTl.
+    def as_recorded(self, camera: int) -> tuple[CameraModel, gtsam.Pose3]:
+        """The camera, with its distortion, of pictures as recorded, and cTl.
 
         Raises:
-            DataError: a line is missing or holds no such matrix, or the lens distorts.
+            DataError: a line is missing or holds no such matrix.
         """
         path = self.folder / CAM_TO_CAM
         model = camera_from_kitti_raw(self.cameras, camera, rectified=False, place=path)
-        if not model.is_pinhole:
-            found = f"plumb_bob distortion {self.cameras[f'D_{camera:02d}'].tolist()}"
-            raise DataError(f"{path} (D_{camera:02d})", found, "rectified pictures (all coefficients 0)")
         R = self._line(f"R_{camera:02d}", 9).reshape(3, 3)
         t = self._line(f"T_{camera:02d}", 3)
         cTc0 = pose_from(np.column_stack([R, t]), f"{path} (R_{camera:02d}, T_{camera:02d})")
-        return model.intrinsics, cTc0 * self.c0Tl
+        return model, cTc0 * self.c0Tl
 
     def _line(self, name: str, count: int) -> FloatArray:
         path = self.folder / CAM_TO_CAM

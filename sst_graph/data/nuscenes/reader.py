@@ -18,18 +18,19 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cameras import CameraModel, Rectification
+from sst_graph.cameras.readers import camera_from_nuscenes
 from sst_graph.classes import classes_of_lidarseg
 from sst_graph.data.arrays import MAX_POINTS, check_metres, listed
-from sst_graph.data.nuscenes.tables import Record, matrix_of, pose_of, records, text_of, whole_of
+from sst_graph.data.nuscenes.tables import Record, pose_of, records, text_of, whole_of
 from sst_graph.data.pictures import PictureFiles
+from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.source import TURNS, Loader, SourceOptions
-from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
+from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
-from sst_graph.factors.camera import PinholeCamera
-from sst_graph.files.checked_values import checked_camera
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass
+from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source
 
 LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
 _LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
@@ -95,6 +96,7 @@ class LidarFiles:
             offsets_s=offsets_s,
             rings=rings.astype(np.uint16),
             left_out=len(used) - len(points),
+            intensities=np.ascontiguousarray(values[used, 3]),
         )
 
     def _classes(self, k: int, used: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -112,7 +114,7 @@ def is_nuscenes(path: Path) -> bool:
     return os.path.isdir(path) and bool(_versions(path))
 
 
-def open_nuscenes(path: Path, options: SourceOptions) -> TwoClockSource:
+def open_nuscenes(path: Path, options: SourceOptions) -> Source:
     """Open a scene.
 
     Raises:
@@ -128,8 +130,8 @@ def open_nuscenes(path: Path, options: SourceOptions) -> TwoClockSource:
     tables = versions[0]
     scene = _scene(tables, options.sequence)
     lidar, camera = _channels(tables, scene, _camera_name(options.camera))
-    pinhole, nominal = _rig(tables, lidar, camera)
-    size = (pinhole.width, pinhole.height)
+    model, nominal = _rig(tables, lidar, camera)
+    size = (model.width, model.height)
     pictures = PictureFiles(size, dict(enumerate(_paths(path, tables, camera))))
     image_stamps = _stamps(tables, camera)
     scans = _lidar_files(path, tables, lidar, options)
@@ -138,9 +140,10 @@ def open_nuscenes(path: Path, options: SourceOptions) -> TwoClockSource:
         return pictures.image(k, int(image_stamps[k]))
 
     name = f"nuscenes/{printable(text_of(scene, 'name', tables))}"
-    properties = DriveProperties(name, pinhole, nominal, GroundTruth(nominal, None), True)
-    of_scans, of_images = Sensor(scans.stamps_ns, scans.scan), Sensor(image_stamps, image)
-    return merged(properties, of_scans, of_images, options, path)
+    properties = DriveProperties(name, model.intrinsics, nominal, GroundTruth(nominal, None), True)
+    of_scans = Sensor(scans.stamps_ns, scans.scan, lidar.name)
+    drive = merged(properties, of_scans, Sensor(image_stamps, image, camera.name), options, path)
+    return drive if model.is_pinhole else RectifiedSource(drive, Rectification.of(model))
 
 
 def _versions(path: Path) -> list[Path]:
@@ -190,7 +193,7 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     data: dict[str, list[Record]] = {_LIDAR: [], camera: []}
     rigs: dict[str, set[str]] = {_LIDAR: set(), camera: set()}
     for record in records(data_path):
-        if record.get("sample_token") not in samples:
+        if text_of(record, "sample_token", data_path) not in samples:
             continue
         token = text_of(record, "calibrated_sensor_token", data_path)
         if token not in calibrations:
@@ -208,16 +211,14 @@ def _channels(tables: Path, scene: Record, camera: str) -> tuple[Channel, Channe
     return found[0], found[1]
 
 
-def _rig(tables: Path, lidar: Channel, camera: Channel) -> tuple[PinholeCamera, gtsam.Pose3]:
-    """Intrinsics, and cTl by both sensors' poses in the ego vehicle."""
+def _rig(tables: Path, lidar: Channel, camera: Channel) -> tuple[CameraModel, gtsam.Pose3]:
+    """The camera, and cTl by both sensors' poses in the ego vehicle."""
     path = tables / "calibrated_sensor.json"
-    K = matrix_of(camera.calibration.get("camera_intrinsic"), (3, 3), f"{path} (camera_intrinsic)")
     width, height = (
         whole_of(camera.data[0], side, tables / "sample_data.json") for side in ("width", "height")
     )
-    pinhole = PinholeCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), width, height)
     eTc, eTl = pose_of(camera.calibration, path), pose_of(lidar.calibration, path)
-    return checked_camera(pinhole, path), eTc.inverse() * eTl
+    return camera_from_nuscenes(camera.calibration, width, height, path), eTc.inverse() * eTl
 
 
 def _stamps(tables: Path, channel: Channel) -> NDArray[np.int64]:
@@ -251,9 +252,10 @@ def _lidar_files(path: Path, tables: Path, lidar: Channel, options: SourceOption
     labels: dict[int, Path] = {}
     lidarseg = tables / "lidarseg.json"
     if lidarseg.exists():
-        position = {r.get("token"): k for k, r in enumerate(lidar.data)}
+        data = tables / "sample_data.json"
+        position = {text_of(r, "token", data): k for k, r in enumerate(lidar.data)}
         for record in records(lidarseg):
-            k = position.get(record.get("sample_data_token"))
+            k = position.get(text_of(record, "sample_data_token", lidarseg))
             if k is not None:
                 labels[k] = _inside(path, text_of(record, "filename", lidarseg), tables)
     timing = None

@@ -8,6 +8,7 @@ unpickled.
 from __future__ import annotations
 
 import io
+import tokenize
 import zipfile
 import zlib
 from pathlib import Path
@@ -23,7 +24,18 @@ from sst_graph.errors import DataError
 _MAX_BYTES = 512 * 1024 * 1024
 """Of one array, unpacked."""
 _MAX_HEADER = 10_000
-_BROKEN = (ValueError, EOFError, OSError, KeyError, TypeError, SyntaxError, zipfile.BadZipFile, zlib.error)
+_COLUMNS = ("x", "y", "z", "intensity")
+_BROKEN = (
+    ValueError,
+    EOFError,
+    OSError,
+    KeyError,
+    TypeError,
+    SyntaxError,
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def read_bin(data: bytes, path: Path) -> Cloud:
@@ -35,7 +47,7 @@ def read_bin(data: bytes, path: Path) -> Cloud:
     if len(data) % 16:
         raise DataError(path, f"{len(data)} bytes", "a multiple of 16 (x y z intensity in float32)")
     values = np.frombuffer(data, "<f4").reshape(-1, 4)
-    return cloud_of(path, {name: values[:, k] for k, name in enumerate("xyz")})
+    return cloud_of(path, {name: values[:, k] for k, name in enumerate(_COLUMNS)})
 
 
 def read_npy(data: bytes, path: Path) -> Cloud:
@@ -107,7 +119,7 @@ def _fields(array: NDArray[Any], path: Path) -> dict[str, NDArray[Any]]:
         return structured_fields(path, array)
     if array.ndim != 2 or array.shape[1] not in (3, 4):
         raise DataError(path, f"an array of shape {array.shape}", "(n, 3) or (n, 4), or records with x, y, z")
-    return {name: array[:, k] for k, name in enumerate("xyz")}
+    return {name: array[:, k] for k, name in enumerate(_COLUMNS[: array.shape[1]])}
 
 
 def _line(error: BaseException) -> str:

@@ -21,6 +21,7 @@ MAX_POINT_BYTES = 1024
 RINGS = ("ring", "rings", "channel", "laser_id")
 TIMES = ("time", "times", "t", "timestamp", "time_stamp", "offset_time")
 LABELS = ("label", "labels")
+INTENSITIES = ("intensity", "reflectivity", "reflectance", "remission", "i")
 
 _ABSOLUTE_S = 1e3
 """Times beyond this [s] are stamps of the LiDAR's clock, not times after the scan's stamp."""
@@ -58,6 +59,11 @@ class Cloud:
         """
         values = self._first(RINGS)
         return None if values is None else self._whole(values, 0xFFFF, "rings").astype(np.uint16)
+
+    def intensities(self) -> NDArray[np.float32] | None:
+        """Strengths of the returns (n,), or None."""
+        values = self._first(INTENSITIES)
+        return None if values is None else values.astype(np.float32)
 
     def labels(self) -> NDArray[np.uint32] | None:
         """SemanticKITTI labels (n,): class in the low, instance in the high 16 bits; or None.
@@ -125,6 +131,9 @@ def cloud_of(path: Path, fields: Mapping[str, NDArray[Any]]) -> Cloud:
         raise DataError(path, f"no field {missing[0]} (fields: {named})", "fields x, y, z [m]")
     used = {name: lower[name] for name in ("x", "y", "z", *RINGS, *TIMES, *LABELS) if name in lower}
     count = len(lower["x"]) if lower["x"].ndim else -1
+    for name in INTENSITIES:
+        if name in lower and lower[name].dtype.kind in "fiu" and lower[name].shape == (count,):
+            used[name] = lower[name]
     for name, values in used.items():
         if values.dtype.kind not in "fiu" or values.shape != (count,):
             found = f"{name} of {values.dtype}, shape {values.shape}"

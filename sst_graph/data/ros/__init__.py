@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from sst_graph.data.ros.source import ROS_LOADER, RosSource
+from sst_graph.data.ros.source import ROS_LOADER
 
-__all__ = ["ROS_LOADER", "RosSource"]
+__all__ = ["ROS_LOADER"]

@@ -93,6 +93,10 @@ class Bag:
             self._reader.open()
             stack.callback(_close, self._reader)
             connections = list(self._reader.connections)
+            # Names and counts of a rosbag2 folder are those of its YAML, of any type.
+            for one in connections:
+                if (type(one.topic), type(one.msgtype), type(one.msgcount)) != (str, str, int):
+                    raise ValueError(f"topic {one.topic!r:.40} of type {one.msgtype!r:.40}")
         except Exception as error:
             stack.close()
             raise _unreadable(self.path, error) from error

@@ -17,6 +17,7 @@ _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"
 TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
 """Fields with the time of a point: of Ouster, Livox, Velodyne, Hesai and RoboSense, Livox's driver 2."""
 RING_FIELDS = ("ring", "channel")
+INTENSITY_FIELDS = ("intensity", "reflectivity")
 
 _ABSOLUTE_S, _ABSOLUTE_NS = 1e6, 1e15
 """Times beyond these are counted from the epoch, in seconds or nanoseconds (Livox's driver 2)."""
@@ -34,6 +35,7 @@ class Cloud:
         offsets_s: (n,) float32 time after the header's stamp [s], or None.
         labels: (n,) uint32 as SemanticKITTI has them, instance in the high 16 bits, or None.
         left_out: number of points left out.
+        intensities: (n,) float32 strength of the return, in the driver's unit, or None.
     """
 
     points: NDArray[np.float32]
@@ -41,6 +43,7 @@ class Cloud:
     offsets_s: NDArray[np.float32] | None
     labels: NDArray[np.uint32] | None
     left_out: int
+    intensities: NDArray[np.float32] | None = None
 
 
 def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels: bool = False) -> Cloud:
@@ -68,6 +71,7 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
         _offsets(table, stamp_ns, place) if times else None,
         _labels(table) if labels else None,
         int(len(used) - used.sum()),
+        _intensities(table),
     )
 
 
@@ -117,6 +121,11 @@ def _rings(table: NDArray[Any]) -> NDArray[np.uint16] | None:
         if name in _names(table) and table[name].dtype.kind in "iu":
             return np.asarray(table[name]).astype(np.uint16)
     return None
+
+
+def _intensities(table: NDArray[Any]) -> NDArray[np.float32] | None:
+    name = next((name for name in INTENSITY_FIELDS if name in _names(table)), None)
+    return None if name is None else np.asarray(table[name]).astype(np.float32)
 
 
 def _offsets(table: NDArray[Any], stamp_ns: int, place: str) -> NDArray[np.float32] | None:

@@ -43,29 +43,46 @@ class Topics:
 def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOptions) -> Topics:
     """The topics that the options name; where they name none, the only one of its type.
 
-    The model of a camera is that beside its images: "/camera/camera_info" for "/camera/image_raw". Of images
-    with a compressed copy the plain ones are taken.
+    The model of a camera is that beside its images: "/camera/camera_info" for "/camera/image_raw"; a topic of
+    masks whose name does not begin with "/" stands there as well. Of images with a compressed copy the plain
+    ones are taken.
 
     Raises:
         DataError: none or several fit; the topics of the bag are listed.
     """
     filled = {name: topic for name, topic in topics.items() if topic.count}
-    mask = None
-    if options.mask_topic is not None:
-        mask = _named(path, filled, options.mask_topic, (IMAGE, COMPRESSED), "--mask-topic")
-    images = {n: t for n, t in filled.items() if mask is None or n != mask.name}
-    image = _one(path, images, options.image_topic, (IMAGE, COMPRESSED), "--image-topic")
+    kinds, named, mask = (IMAGE, COMPRESSED), options.mask_topic, None
+    images = {
+        n: t for n, t in filled.items() if named is None or (n.rpartition("/")[2] != named and n != named)
+    }
+    image = _one(path, images, *_image_name(options, images), kinds)
+    if named is not None:
+        name = named if named.startswith("/") else f"{_namespace(image.name)}/{named}"
+        mask = _named(path, filled, name, kinds, "--mask-topic")
     return Topics(
         image=image,
-        cloud=_one(path, filled, options.cloud_topic, (CLOUD,), "--cloud-topic"),
+        cloud=_one(path, filled, options.cloud_topic, "--cloud-topic", (CLOUD,)),
         info=_info(path, filled, options.info_topic, image),
         mask=mask,
         transforms=tuple(name for name, topic in filled.items() if topic.type in _TRANSFORMS),
     )
 
 
+def _image_name(options: SourceOptions, images: Mapping[str, Topic]) -> tuple[str | None, str]:
+    """Topic of the images that the options name, if any, and the option: of a camera's namespace the only one
+    that is no copy."""
+    if options.image_topic is not None or options.camera == SourceOptions().camera:
+        return options.image_topic, "--image-topic"
+    inside = [n for n, t in images.items() if _namespace(n) == "/" + options.camera.strip("/")]
+    plain = [n for n in inside if images[n].type == IMAGE] or [
+        n for n in inside if images[n].type == COMPRESSED and not n.endswith("/compressedDepth")
+    ]
+    known = options.camera in images or len(plain) != 1
+    return (options.camera if known else plain[0]), "--camera"
+
+
 def _one(
-    path: Path, topics: Mapping[str, Topic], name: str | None, types: tuple[str, ...], option: str
+    path: Path, topics: Mapping[str, Topic], name: str | None, option: str, types: tuple[str, ...]
 ) -> Topic:
     if name is not None:
         return _named(path, topics, name, types, option)
@@ -88,7 +105,7 @@ def _info(path: Path, topics: Mapping[str, Topic], name: str | None, image: Topi
         beside = topics.get(_namespace(image.name) + "/camera_info")
         if beside is not None and beside.type == INFO:
             return beside
-    return _one(path, topics, name, (INFO,), "--info-topic")
+    return _one(path, topics, name, "--info-topic", (INFO,))
 
 
 def _namespace(image: str) -> str:

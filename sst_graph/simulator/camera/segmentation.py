@@ -70,6 +70,8 @@ def _grow(shift: FloatArray, mask: NDArray[np.bool_], growth: float) -> None:
     y0, y1 = max(rows[0] - margin, 0), rows[-1] + margin + 1
     x0, x1 = max(columns[0] - margin, 0), columns[-1] + margin + 1
     crop = mask[y0:y1, x0:x1].astype(np.uint8)
+    if crop.all():  # it fills the picture, and has no border in it
+        return
     outside = cv2.distanceTransform(1 - crop, cv2.DIST_L2, 5)
     distance = cv2.GaussianBlur(outside - cv2.distanceTransform(crop, cv2.DIST_L2, 5), (0, 0), 1.0)
     gradient: NDArray[Any] = np.stack(

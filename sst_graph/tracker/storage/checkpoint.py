@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from sst_graph.tracker.tracker import Tracker
 
 FORMAT = "sst-graph/tracker"
-VERSION = 21
+VERSION = 22
 """Goes up whenever what a tracker holds changes: a checkpoint is for the version that wrote it."""
 
 CHECKPOINT = FileKind("a checkpoint of the tracker", 512 * 1024 * 1024)
@@ -70,6 +70,7 @@ _PACKAGES = (
     "sst_graph.inspect",
     "sst_graph.objects",
     "sst_graph.odometry",
+    "sst_graph.result",
     "sst_graph.odometry.sweep",
     "sst_graph.sweep_timing",
     "sst_graph.tracker",
@@ -288,7 +289,7 @@ def _check_tracker(tracker: Tracker, path: str | Path) -> None:
         checked_camera(tracker.inputs.camera, "camera")
         check_inputs(tracker)
         tracker.initializer.catch_up()
-        current_update(tracker).to_dict()
+        current_update(tracker, tracker.last_update).to_dict()
         consolidate(tracker)
         _again(tracker)
         current_update(tracker).to_dict()

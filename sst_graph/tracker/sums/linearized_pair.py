@@ -16,7 +16,7 @@ from sst_graph.covariance.sums import ScoreSums
 from sst_graph.drive.trajectory import camera_twist
 from sst_graph.factors.alignment import weighted_residuals
 from sst_graph.factors.motion import twist_ad
-from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, GraphConfig, PairMatches
+from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, PairMatches
 from sst_graph.graph.nuisances import columns_of_jacobian
 from sst_graph.graph.state import lower_edge_track
 from sst_graph.objects.tracks import numbers_in, of_each
@@ -67,15 +67,32 @@ class LinearizedPair:
         return self.information if self.static is None else self.static
 
 
-def object_places(
-    pair: PairMatches, classes: Sequence[SemanticClass], tracks: Mapping[tuple[SemanticClass, int], int]
-) -> dict[int, int]:
-    """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
-    return {
-        tracks[c, number]: classes.index(c)
-        for c in pair.tracks
-        for number in numbers_in(pair.matches[c].objects)
-    }
+@dataclass(frozen=True)
+class PairColumns:
+    """What the columns of a linearized pair stand for.
+
+    Attributes:
+        classes: whose mask biases are estimated, in the order of the point's.
+        tracks: number of the track of each (class, object) of the scan.
+        held: assumptions whose parameters are held behind the unknowns.
+    """
+
+    classes: Sequence[SemanticClass]
+    tracks: Mapping[tuple[SemanticClass, int], int]
+    held: Sequence[str] = ()
+
+    def object_places(self, pair: PairMatches) -> dict[int, int]:
+        """Place of its class's bias for each object of a pair, if objects have a bias of their own."""
+        return {
+            self.tracks[c, number]: self.classes.index(c)
+            for c in pair.tracks
+            for number in numbers_in(pair.matches[c].objects)
+        }
+
+    def tracks_of(self, pair: PairMatches, c: SemanticClass) -> IntArray:
+        """(m,) track of the object of each match of a class."""
+        objects = pair.matches[c].objects
+        return of_each(objects, {number: self.tracks[c, number] for number in numbers_in(objects)})
 
 
 def with_share(pair: PairMatches, share: float) -> PairMatches:
@@ -88,39 +105,30 @@ def with_share(pair: PairMatches, share: float) -> PairMatches:
 
 
 def linearize_pair(
-    pair: PairMatches,
-    point: Point,
-    classes: Sequence[SemanticClass],
-    tracks: Mapping[tuple[SemanticClass, int], int],
-    config: GraphConfig,
-    share: float = 1.0,
-    by_object: bool = True,
-    held: Sequence[str] = (),
+    pair: PairMatches, point: Point, columns: PairColumns, share: float = 1.0, by_object: bool = True
 ) -> LinearizedPair:
     """A pair at the point its matches were made at: its silhouettes and its motion.
 
     Args:
-        tracks: number of the track of each (class, object) of the scan.
-        share: factor on the weights of all matches.
+        share: factor by which the weights of all matches have been multiplied (:func:`with_share`).
         by_object: keep the matches object by object, too.
-        held: assumptions whose parameters are held behind the unknowns.
     """
-    places = object_places(pair, classes, tracks)
+    places = columns.object_places(pair)
     point = point.seen(places)
-    J, JV, r, roots = _rows(pair, point, classes, held)
+    J, JV, r, roots = _rows(pair, point, columns)
     # [unknowns, held parameters, twist]: silhouettes, then the odometry's information on the twist.
     A, n, m = np.concatenate([J, JV], axis=1), point.size, J.shape[1]
     H, g = A.T @ A, -A.T @ r
     weight, curvature = float(roots @ roots), float(_curvatures(pair, r, roots).sum())
     motion = np.zeros_like(H)
-    columns = [*range(7), *range(m, m + 6)]
-    motion[np.ix_(columns, columns)] = _motion_information(pair, point)
+    moving = [*range(7), *range(m, m + 6)]
+    motion[np.ix_(moving, moving)] = _motion_information(pair, point)
     information, gain = _without_twist(point, H + motion, g)
     curved = min(max(curvature / weight, _LEAST_CURVATURE), 1.0)
     observed, _ = _without_twist(point, curved * H + motion, g)
     known = np.array([*range(n), *range(m, m + 6)])
     J = J - JV @ gain  # sensitivity of the estimate to a residual, the twist at its optimum
-    track = np.concatenate([_tracks_of(pair, c, tracks) for c in pair.matches])
+    track = np.concatenate([columns.tracks_of(pair, c) for c in pair.matches])
     side = track * SIDES + np.concatenate([m.sides for m in pair.matches.values()])
     own, frame = roots / np.sqrt(share), np.zeros(len(r), np.intp)
     return LinearizedPair(
@@ -162,14 +170,6 @@ def _without_twist(point: Point, H: FloatArray, g: FloatArray) -> tuple[Gaussian
     return gaussian, gain[:, :n]
 
 
-def _tracks_of(
-    pair: PairMatches, c: SemanticClass, tracks: Mapping[tuple[SemanticClass, int], int]
-) -> IntArray:
-    """(m,) track of the object of each match of a class."""
-    objects = pair.matches[c].objects
-    return of_each(objects, {number: tracks[c, number] for number in numbers_in(objects)})
-
-
 def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> FloatArray:
     """(m,) the robust loss's second derivatives, each multiplied by its match's own weight."""
     r, parts, start = unweighted(weighted, root), [], 0
@@ -181,20 +181,21 @@ def _curvatures(pair: PairMatches, weighted: FloatArray, root: FloatArray) -> Fl
 
 
 def _rows(
-    pair: PairMatches, point: Point, classes: Sequence[SemanticClass], held: Sequence[str]
+    pair: PairMatches, point: Point, names: PairColumns
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Weighted rows of all matches by unknowns and held parameters (m, n) and twist (m, 6), residuals and
     root weights (m,)."""
+    classes, held = names.classes, names.held
     blocks, twists, residuals, roots = [], [], [], []
     for c, matches in pair.matches.items():
         alignment, place = matches.alignment, classes.index(c)
         biases: float | FloatArray = float(point.biases_px[place])
         columns = np.full(len(alignment), 7 + place)
         if c in pair.tracks:
-            names, groups = pair.biased[c]
+            tracks, groups = pair.biased[c]
             below = 7 + len(classes) + place
             known = {track: point.core_size + k for k, track in enumerate(point.tracks)}
-            columns = np.array([below if t == lower_edge_track(c) else known[t] for t in names])[groups]
+            columns = np.array([below if t == lower_edge_track(c) else known[t] for t in tracks])[groups]
             values = np.concatenate([point.biases_px, point.parameters, point.object_biases_px])
             biases = values[columns - 7]
         at = point.cTl, point.time_offset_s, pair.motion.c_twist

@@ -19,7 +19,7 @@ from sst_graph.graph.matching import DYNAMIC_REACH_M
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.monitor.adoption import mean_cost
-from sst_graph.tracker.sums.linearized_pair import LinearizedPair, linearize_pair, with_share
+from sst_graph.tracker.sums.linearized_pair import LinearizedPair, PairColumns, linearize_pair, with_share
 from sst_graph.tracker.window.epochs import MatchedPair
 from sst_graph.tracker.window.gaussian import Point
 from sst_graph.tracker.window.window import Window
@@ -192,8 +192,8 @@ class WindowMatcher:
         by_object: bool,
         held: Sequence[str] = (),
     ) -> LinearizedPair:
-        tracks = self.window.tracks[number]
-        return linearize_pair(pair, point, self.classes, tracks, self.graph, share, by_object, held)
+        columns = PairColumns(self.classes, self.window.tracks[number], held)
+        return linearize_pair(pair, point, columns, share, by_object)
 
     def _tracks(self, part: Drive, numbers: list[int]) -> Tracks:
         """Twists over the window's motions, made once a scan, and objects where they have biases."""

@@ -183,7 +183,7 @@ def test_options_of_other_formats(
     tmp_path: Path, kitti_drive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = made(tmp_path, fill)
-    assert "--image-shift 1: means nothing for" in refused(capsys, path, "--image-shift", "1")
+    assert "--sequence 1: means nothing for" in refused(capsys, path, "--sequence", "1")
     assert "--mask-topic /m: means nothing for" in refused(capsys, kitti_drive, "--mask-topic", "/m")
     assert "the drive has frames 0:4" in refused(capsys, path, "--frames", "3:9")
 

@@ -200,24 +200,33 @@ def test_intrinsics_of_raw_and_rectified_images() -> None:
     R = gtsam.Rot3.Ypr(0.01, -0.02, 0.005)
     info = MAKE.info(CAMERA, p=P.ravel(), r=R.matrix().ravel())
     raw = image_geometry(info, "/cam/image_raw", (640, 360), "here")
-    assert raw.camera == CAMERA and raw.cRo.equals(gtsam.Rot3(), 1e-12)
+    assert raw.model == BrownConradyCamera(CAMERA) and raw.cRo.equals(gtsam.Rot3(), 1e-12)
     rectified = image_geometry(info, "/cam/image_rect_color", (640, 360), "here")
-    assert rectified.camera == PinholeCamera(650.0, 651.0, 300.0, 170.0, 640, 360)
+    assert rectified.model == BrownConradyCamera(PinholeCamera(650.0, 651.0, 300.0, 170.0, 640, 360))
     assert rectified.cRo.equals(R, 1e-9)
     ros1 = Messages(ros1=True).info(CAMERA)
-    assert image_geometry(ros1, "/cam/image_raw", (640, 360), "here").camera == CAMERA
+    assert image_geometry(ros1, "/cam/image_raw", (640, 360), "here").model.intrinsics == CAMERA
 
 
 def test_cameras_that_cannot_be_used() -> None:
     distorted = MAKE.info(CAMERA, d=np.array([-0.3, 0.1, 0.0, 0.0, 0.0]))
-    lens = image_geometry(distorted, "/cam/image_raw", (640, 360), "here").lens
+    lens = image_geometry(distorted, "/cam/image_raw", (640, 360), "here").model
     assert lens == BrownConradyCamera(CAMERA, (-0.3, 0.1, 0.0, 0.0, 0.0))
     rectified = image_geometry(distorted, "/cam/image_rect", (640, 360), "here")
-    assert rectified.camera == CAMERA and rectified.lens is None
+    assert rectified.model == BrownConradyCamera(CAMERA)
+    for uncalibrated in (MAKE.info(CAMERA, d=np.zeros(0), width=0, height=0), MAKE.info(CAMERA)):
+        found = image_geometry(uncalibrated, "/cam/image_raw", (640, 360), "here").model
+        assert found == BrownConradyCamera(CAMERA)
     with pytest.raises(DataError, match="640x360 px, expected 320x180 px"):
         image_geometry(MAKE.info(CAMERA), "/cam/image_raw", (320, 180), "here")
-    with pytest.raises(DataError, match="K without a focal length"):
+    with pytest.raises(DataError, match="K = 0, an uncalibrated camera"):
         image_geometry(MAKE.info(CAMERA, k=np.zeros(9)), "/cam/image_raw", (640, 360), "here")
+    sheared = np.array([1.0, 0.5, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+    for R in (sheared, np.full(9, np.inf)):
+        with pytest.raises(DataError, match="here: R"):
+            image_geometry(MAKE.info(CAMERA, r=R), "/cam/image_rect", (640, 360), "here")
+    with pytest.raises(DataError, match="P = 0, an uncalibrated camera"):
+        image_geometry(MAKE.info(CAMERA, p=np.zeros(12)), "/cam/image_rect", (640, 360), "here")
     with pytest.raises(DataError, match="binning"):
         image_geometry(MAKE.info(CAMERA, binning_x=2), "/cam/image_raw", (640, 360), "here")
 

@@ -9,6 +9,7 @@ from factor_bench import COVARIANCE, NAMES, NEAR, POSE, TWIST, B, Bench, D, E, V
 
 from sst_graph.factors import (
     Between,
+    DirectionSigmas,
     FactorError,
     GroupedBias,
     Vector,
@@ -20,6 +21,7 @@ from sst_graph.factors import (
     mean_velocity_factor,
     pose_alignment_factor,
     silhouette_factor,
+    stacked,
     time_offset_drift,
     time_offset_prior,
     twist_jerk_factor,
@@ -27,6 +29,8 @@ from sst_graph.factors import (
     velocity_direction_factor,
     velocity_factor,
 )
+
+NEXT = Between(X[0], X[1], 0.1, 0.02)
 
 
 @pytest.fixture
@@ -176,15 +180,18 @@ def test_a_twist_must_be_a_vector(bench):
     "make",
     [
         lambda key: velocity_factor(key, TWIST, COVARIANCE),
-        lambda key: velocity_direction_factor(key, TWIST[:3], TWIST[3:], 5.0, 0.01, 0.01, 0.1),
+        lambda key: velocity_direction_factor(
+            key, TWIST[:3], TWIST[3:], 5.0, DirectionSigmas(0.01, 0.01, 0.1)
+        ),
         lambda key: mean_velocity_factor(V[1], key, TWIST, COVARIANCE),
         lambda key: twist_smoothness_factor(V[1], key, 0.1, 1.0, 1.0),
-        lambda key: twist_jerk_factor(V[1], V[2], key, 0.1, 0.1, 1.0, 1.0),
+        lambda key: twist_jerk_factor(V[1], V[2], key, (0.1, 0.1), 1.0, 1.0),
         lambda key: beta_regularizer(key, POSE, 1.0, 1.0),
         lambda key: time_offset_prior(key, 0.0, 0.1),
         lambda key: time_offset_drift(V[1], key, 1.0, 0.1),
         lambda key: extrinsic_drift(V[1], key, 1.0, 0.1, 0.1),
         lambda key: Between(V[1], key, 0.1, 0.0),
+        lambda key: Between(key, V[1], 0.1, 0.0),
         lambda key: custom_factor(
             gtsam.noiseModel.Unit.Create(1), [key], lambda x, *, jacobians: (np.zeros(1), None), [1], 1
         ),
@@ -198,19 +205,18 @@ def test_every_key_is_checked(make):
 
 
 def test_keys_of_poses_are_checked(bench):
-    arguments = dict(cTl=E, time_offset_s=D, seconds=0.1)
     for wrong in (None, 0.5, "X", POSE):
         for poses in ((wrong, X[1]), (X[0], wrong)):
-            with pytest.raises(FactorError, match=r"X_. of pose_alignment_factor: found .*, expected a key"):
-                pose_alignment_factor([bench.points], *poses, **arguments)
+            with pytest.raises(FactorError, match=r"X_. of Between: found .*, expected a key"):
+                Between(*poses, 0.1, 0.0)
         if wrong is not None:
-            with pytest.raises(FactorError, match="X_scan of pose_alignment_factor"):
-                pose_alignment_factor([bench.points], X[0], X[1], X_scan=wrong, **arguments)
+            with pytest.raises(FactorError, match="X_scan of Between"):
+                Between(X[0], X[1], 0.1, 0.0, X_scan=wrong)
     for seconds in (None, "1", -1.0, float("nan"), True):
         with pytest.raises(FactorError, match="seconds"):
-            pose_alignment_factor([bench.points], X[0], X[1], E, D, seconds)
-    with pytest.raises(FactorError, match="bTl of pose_alignment_factor: found an array"):
-        pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1, bTl=np.eye(4))
+            Between(X[0], X[1], seconds, 0.0)
+    with pytest.raises(FactorError, match="bTl of Between: found an array"):
+        Between(X[0], X[1], 0.1, 0.0, bTl=np.eye(4))
     with pytest.raises(FactorError, match="alignments of frame_factor: found a Pose3"):
         frame_factor([POSE], E)
     with pytest.raises(FactorError, match="c_twist of frame_factor: found a Pose3"):
@@ -225,7 +231,7 @@ def test_biases_may_share_a_key_but_nothing_else(bench):
     with pytest.raises(FactorError, match="D0 for time_offset_s and bias"):
         frame_factor([bench.contour], E, D, V[0], D)
     with pytest.raises(FactorError, match="X1 for X_b and bias 1"):
-        pose_alignment_factor([bench.contour], X[0], X[1], E, D, 0.1, biases_px=X[1])
+        pose_alignment_factor([bench.contour], NEXT, E, D, X[1])
 
 
 # --- custom_factor: any variable that gtsam.Values holds
@@ -335,8 +341,8 @@ def test_what_is_no_noise_is_refused():
 
 def test_a_noise_scales_a_whole_image(bench):
     values = bench.values()
-    plain = pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1)
-    arguments = ([bench.points], X[0], X[1], E, D, 0.1)
+    arguments = ([bench.points], NEXT, E, D)
+    plain = pose_alignment_factor(*arguments)
     wider = pose_alignment_factor(*arguments, noise=gtsam.noiseModel.Isotropic.Sigma(1, 3.0))
     assert wider.error(values) == pytest.approx(plain.error(values) / 9.0)
     information = [f.linearize(values).information() for f in (plain, wider)]
@@ -346,13 +352,15 @@ def test_a_noise_scales_a_whole_image(bench):
 @pytest.mark.parametrize("condensed", [True, False])
 def test_a_robust_noise_weighs_an_image_by_its_distance(bench, condensed):
     values = bench.values()
-    arguments = ([bench.points], X[0], X[1], E, D, 0.1)
-    plain = pose_alignment_factor(*arguments, condensed=condensed)
+    arguments = ([bench.points], NEXT, E, D)
+    plain = pose_alignment_factor(*arguments)
+    plain = plain if condensed else stacked(plain)
     distance, k = np.sqrt(2.0 * plain.error(values)), 2.0
     huber = gtsam.noiseModel.Robust.Create(
         gtsam.noiseModel.mEstimator.Huber.Create(k), gtsam.noiseModel.Unit.Create(1)
     )
-    robust = pose_alignment_factor(*arguments, noise=huber, condensed=condensed)
+    robust = pose_alignment_factor(*arguments, noise=huber)
+    robust = robust if condensed else stacked(robust)
     assert distance > 2 * k
     assert robust.error(values) == pytest.approx(k * (distance - 0.5 * k))
     information = [f.linearize(values).information() for f in (plain, robust)]
@@ -362,4 +370,4 @@ def test_a_robust_noise_weighs_an_image_by_its_distance(bench, condensed):
 @pytest.mark.parametrize("noise", [1.0, np.eye(1), gtsam.noiseModel.Unit.Create(2), "unit"])
 def test_what_is_no_noise_of_an_image_is_refused(bench, noise):
     with pytest.raises(FactorError, match=r"noise of pose_alignment_factor: found .*dimension"):
-        pose_alignment_factor([bench.points], X[0], X[1], E, D, 0.1, noise=noise)
+        pose_alignment_factor([bench.points], NEXT, E, D, noise=noise)

@@ -1,0 +1,32 @@
+"""``sst-graph segment``: labels by networks, ahead of a calibration."""
+
+from __future__ import annotations
+
+import argparse
+
+from sst_graph.cli.labels import image_segmenter, scan_segmenter, store_to_fill
+from sst_graph.cli.messages import mention
+from sst_graph.cli.outputs import check_apart
+from sst_graph.cli.progress import ProgressBar
+from sst_graph.cli.reading import open_drive
+from sst_graph.errors import ConfigError
+from sst_graph.segmentation import LabelledSource, Labelling, segment_drive
+
+
+def run(args: argparse.Namespace) -> int:
+    """Label ``args.data``; what is stored already is not made again."""
+    if args.image_model is None and args.lidar_model is None:
+        raise ConfigError("segment: found neither --image-model nor --lidar-model, expected one or both")
+    check_apart(
+        {"DATA": args.data, "--image-model": args.image_model, "--lidar-model": args.lidar_model},
+        {"--out": args.out},
+    )
+    store = store_to_fill(args.out)
+    images, scans = image_segmenter(args.image_model), scan_segmenter(args.lidar_model)
+    args.image_model = args.lidar_model = None  # of the drive as the data have it
+    source = open_drive(args, args.data)
+    drive = LabelledSource(source, Labelling.of(store, images, scans, stored=False))
+    with ProgressBar() as progress:
+        counts = segment_drive(drive, progress.stage("labels"))
+    mention(f"{drive.name}: {counts['made']} labels made, {counts['found']} found, in {store.folder}")
+    return 0

@@ -1,0 +1,198 @@
+"""``sst-graph calibrate`` of several cameras on one LiDAR."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from sst_graph.batch import CalibrationConfig
+from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
+from sst_graph.cli.messages import complain, mention
+from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, write_calibration
+from sst_graph.cli.progress import ProgressBar
+from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.errors import ConfigError
+from sst_graph.files import atomic_directory
+from sst_graph.inspect.report import summary
+from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
+from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
+from sst_graph.rig.known_files import read_known_poses
+from sst_graph.rig.result import RIG_NAME, folder_names
+from sst_graph.types import Source
+
+
+def given_cameras(args: argparse.Namespace) -> list[str]:
+    """Names after ``--camera``; what is a path there where DATA is not given is DATA.
+
+    Raises:
+        ConfigError: a camera is named twice, or DATA is missing.
+    """
+    names: list[str] = list(args.camera or ())
+    while not args.data and names and os.path.exists(names[-1]):
+        paths = []
+        while names and os.path.exists(names[-1]):
+            paths.insert(0, Path(names.pop()))
+        args.data = paths
+    if not args.data:
+        raise ConfigError("the following arguments are required: DATA (see 'sst-graph calibrate --help')")
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"--camera {twice[0]}: found twice, expected each camera once")
+    return names
+
+
+def refuse_rig_options(args: argparse.Namespace) -> None:
+    """Refuse what only several cameras have.
+
+    Raises:
+        ConfigError: such an option is given.
+    """
+    for option, value in (
+        ("--rig", args.rig),
+        ("--rig-sigma", args.rig_sigma),
+        ("--one-trigger", args.one_trigger),
+    ):
+        if value:
+            raise ConfigError(f"{option}: means something for several cameras only (--camera A B)")
+
+
+def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
+    """Calibrate the cameras of ``args.data`` together, print the summaries, write a folder for each."""
+    config = calibration_settings(args)
+    rig_file = None if args.rig in (None, "dataset") else args.rig
+    inputs = {"DATA": None, "--init": args.init, "--config": args.config, "--rig": rig_file}
+    for path in args.data:
+        check_apart({**inputs, "DATA": path}, {"--out": args.out})
+    rotation_deg, translation_m = _sigmas(args)
+    with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
+        # 1. The drives of each camera, their starts, and what is known of the rig.
+        of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
+        read_as = {name: options_of(own) for name, own in of_camera.items()}
+        sources = {name: open_drives(own) for name, own in of_camera.items()}
+        initial, offsets_s = _starts(args.init, sources, read_as)
+        known = KnownRig(
+            _known_poses(args.rig, sources, rotation_deg, translation_m), one_trigger=args.one_trigger
+        )
+        # 2. Calibrate.
+        rig = _calibrated(sources, initial, offsets_s, config, known)
+        results = {
+            name: dataclasses.replace(result, read_as=read_as[name]) for name, result in rig.cameras.items()
+        }
+        rig = dataclasses.replace(rig, cameras=results)
+        # 3. The numbers first: what follows may find the disk full.
+        written = []
+        against = {name: comparison(result, sources[name]) for name, result in results.items()}
+        for name, result in results.items():
+            mention(f"{'camera':<15} {name}\n{summary(result, against[name])}\n")
+        mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))
+        for name, own_folder in folder_names(results).items():
+            (folder / own_folder).mkdir()
+            names = write_calibration(folder / own_folder, results[name], sources[name], against[name])
+            written += [f"{own_folder}/{file}" for file in names]
+        (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
+    mention(f"{'wrote':<15} {args.out}: {RIG_NAME}, {', '.join(written)}")
+    return _exit_code(rig)
+
+
+def _calibrated(
+    sources: Mapping[str, Sequence[Source]],
+    initial: Mapping[str, gtsam.Pose3 | None],
+    offsets_s: Mapping[str, float],
+    config: CalibrationConfig,
+    known: KnownRig,
+) -> RigResult:
+    with ProgressBar() as progress:
+        return calibrate_rig(
+            sources, initial, config, known, initial_time_offsets_s=offsets_s, progress=progress
+        )
+
+
+def _starts(
+    choice: str, sources: Mapping[str, Sequence[Source]], read_as: Mapping[str, Mapping[str, Any]]
+) -> tuple[dict[str, gtsam.Pose3 | None], dict[str, float]]:
+    """cTl and time offset [s] of each camera that ``--init`` asks for; a rig's result has those of each."""
+    path = Path(choice)
+    if choice not in ("dataset", "none") and (path.is_dir() or path.name == RIG_NAME):
+        rig = read_rig(path)
+        results = {name: rig[name] for name in sources}
+        return (
+            {name: result.T_camera_lidar for name, result in results.items()},
+            {name: result.time_offset_s for name, result in results.items()},
+        )
+    initial, offsets_s = {}, {}
+    for name, own in sources.items():
+        warn_of_other_pairs(choice, read_as[name])
+        initial[name], offsets_s[name] = starting_point(choice, own[0], name)
+    return initial, offsets_s
+
+
+def _known_poses(
+    choice: str | None, sources: Mapping[str, Sequence[Source]], rotation_deg: float, translation_m: float
+) -> tuple[KnownPose, ...]:
+    """The poses between cameras that ``--rig`` asks for."""
+    if choice is None:
+        return ()
+    if choice == "dataset":
+        nominal = {name: own[0].nominal for name, own in sources.items()}
+        return poses_by_nominal(nominal, rotation_deg, translation_m)
+    return read_known_poses(Path(choice), list(sources), rotation_deg, translation_m)
+
+
+def _sigmas(args: argparse.Namespace) -> tuple[float, float]:
+    """Deviations of the known poses [deg], [m].
+
+    Raises:
+        ConfigError: not two numbers above 0, or no known poses.
+    """
+    if args.rig_sigma is None:
+        return ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M
+    if args.rig is None:
+        raise ConfigError("--rig-sigma: expected with --rig")
+    try:
+        degrees, centimetres = (float(word) for word in args.rig_sigma.split(","))
+    except ValueError:
+        degrees = centimetres = float("nan")
+    if not (1e-6 <= degrees <= 180.0 and 1e-4 <= centimetres <= 1e4):
+        raise ConfigError(f"--rig-sigma {args.rig_sigma!r}: expected DEG,CM, as in 0.03,0.2")
+    return degrees, 0.01 * centimetres
+
+
+def rig_lines(rig: RigResult) -> list[tuple[str, str]]:
+    """The rig in a few lines: status, poses between cameras with sigmas, what contradicts what."""
+    rows = [("rig", f"{rig.status}, {len(rig.cameras)} cameras")]
+    rows += [
+        ("" if k else "camera poses", _pose_line(p)) for k, p in enumerate(rig.marginal().relative_poses())
+    ]
+    rows += [("reason", reason) for reason in rig.reasons]
+    return rows
+
+
+def _pose_line(pose: RelativePose) -> str:
+    sigma = np.sqrt(np.diag(pose.covariance))
+    x, y, z = 100.0 * pose.T_camera_reference.translation()
+    angle = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(pose.T_camera_reference.rotation())))
+    degrees, centimetres = np.degrees(sigma[:3]).max(), 100.0 * sigma[3:].max()
+    return (
+        f"{pose.reference} in {pose.camera}: {angle:.2f} deg, {x:+.1f} {y:+.1f} {z:+.1f} cm "
+        f"(sigma at most {degrees:.3f} deg, {centimetres:.2f} cm), time offset "
+        f"{1e3 * pose.time_offset_s:+.2f} ms ± {1e3 * pose.time_offset_sigma_s:.2f} ms"
+    )
+
+
+def _exit_code(rig: RigResult) -> int:
+    """3 where a camera is not ok; one line on stderr says which, and the first reason."""
+    if rig.status == "ok":
+        return 0
+    bad = {name: result for name, result in rig.cameras.items() if result.status != "ok"}
+    for name, result in bad.items():
+        first, *others = result.reasons or ("the result carries no reason",)
+        more = f" ({len(others)} more in the summary and in report.md)" if others else ""
+        complain(f"{name}: {result.status}: {first}{more}")
+    return 3

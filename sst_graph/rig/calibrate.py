@@ -1,0 +1,402 @@
+"""Calibration of several cameras on one LiDAR: ``calibrate_rig``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.calibrate import finished, prepare_drives, solve_problem
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.batch.sources import as_sources
+from sst_graph.config import to_dict
+from sst_graph.covariance.observability import open_directions
+from sst_graph.drive.further_camera import with_camera
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.errors import ConfigError
+from sst_graph.graph.outer_loop import KERNELS_PX
+from sst_graph.result import CalibrationResult, Status
+from sst_graph.rig.adjustment import (
+    ComparedPose,
+    ComparedTrigger,
+    adjusted,
+    compare_poses,
+    compare_trigger,
+)
+from sst_graph.rig.influences import UNKNOWNS, CameraInfluences
+from sst_graph.rig.joint_covariance import JointCovariance, joint_covariance
+from sst_graph.rig.known import KnownRig
+from sst_graph.rig.marginal import RigMarginal
+from sst_graph.rig.result import RigResult, worst
+from sst_graph.types import Source
+
+FloatArray = NDArray[np.float64]
+
+CameraSources = Source | Sequence[Source]
+
+
+def calibrate_rig(
+    cameras: Mapping[str, CameraSources],
+    initial: Mapping[str, gtsam.Pose3 | None] | None = None,
+    config: CalibrationConfig | None = None,
+    known: KnownRig | None = None,
+    *,
+    initial_time_offsets_s: Mapping[str, float] | None = None,
+    progress: Progress | None = None,
+) -> RigResult:
+    """Extrinsics and time offsets of several cameras on one LiDAR, with their joint covariance.
+
+    Args:
+        cameras: by name, the drives of each camera: sources of the same scans (:func:`sst_graph.open_source`
+            with another ``camera``), several in the same order. The LiDAR is read from those of the first.
+        initial: rough guess of each cTl; a camera that is missing, or None, has none.
+        config: settings of method joint, for all cameras.
+        known: poses of cameras in one another, and a common trigger.
+        initial_time_offsets_s: rough guess of each time offset; 0 for a camera that is missing [s].
+        progress: called with (stage, steps done, steps in all).
+
+    Raises:
+        DataError: the frames cannot be used, or two cameras have different scans.
+        ConfigError: the settings contradict each other or the data.
+    """
+    config, known = config or CalibrationConfig(), known or KnownRig()
+    sources = {name: as_sources(own) for name, own in cameras.items()}
+    _check(sources, config)
+    known.check(list(sources))
+    drives = prepare_rig(sources, config, progress)
+    initial, offsets_s = initial or {}, initial_time_offsets_s or {}
+    guesses = {name: Guess(initial.get(name), offsets_s.get(name, 0.0)) for name in drives}
+    return calibrate_rig_prepared(drives, guesses, config, known, progress)
+
+
+def prepare_rig(
+    sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
+) -> dict[str, list[Drive]]:
+    """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
+    (first, own), *others = sources.items()
+    drives = {first: prepare_drives(own, config, progress)}
+    images = replace(config.prepare, use_visual_odometry=any(drive.image_pairs for drive in drives[first]))
+    for name, theirs in others:
+        drives[name] = [
+            with_camera(drive, source, config.classes, images, progress)
+            for drive, source in zip(drives[first], theirs, strict=True)
+        ]
+    return drives
+
+
+def calibrate_rig_prepared(
+    drives: Mapping[str, Sequence[Drive]],
+    guesses: Mapping[str, Guess],
+    config: CalibrationConfig,
+    known: KnownRig,
+    progress: Progress | None = None,
+) -> RigResult:
+    """:func:`calibrate_rig` of drives from :func:`prepare_rig`, with the same settings.
+
+    Args:
+        guesses: of every camera.
+    """
+    # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
+    problems = _problems(drives, guesses, config, progress)
+    cameras = {name: _solved(problem) for name, problem in problems.items()}
+    # 2. Their joint covariance, by the errors that they have in common.
+    rig = _Rig(cameras, known)
+    # 3. A camera far from where the others and the known poses put it is solved again from there.
+    again = {name: _solved(problems[name], start) for name, start in rig.other_starts().items()}
+    cameras = {name: _better(rig, name, own, again.get(name)) for name, own in cameras.items()}
+    rig = _Rig(cameras, known)
+    # 4. What is known of the rig, where the estimates do not contradict it.
+    after = adjusted(rig.marginal, rig.agreed)
+    return rig.result(after, config)
+
+
+def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:
+    if not sources:
+        raise ConfigError("cameras: found none, expected one or more")
+    if config.method != "joint":
+        raise ConfigError(f"several cameras need method joint, found {config.method}")
+    if config.time_offset_per_drive:
+        raise ConfigError("several cameras have one time offset each: leave out time_offset_per_drive")
+    counts = {name: len(own) for name, own in sources.items()}
+    if len(set(counts.values())) > 1:
+        raise ConfigError(f"cameras with different numbers of drives: {counts}")
+
+
+def _problems(
+    drives: Mapping[str, Sequence[Drive]],
+    guesses: Mapping[str, Guess],
+    config: CalibrationConfig,
+    progress: Progress | None,
+) -> dict[str, CalibrationProblem]:
+    """The problem of each camera; twists and objects are tracked once, for their scans are the same."""
+    (first, own), *_ = drives.items()
+    shared = CalibrationProblem.of(own, guesses[first], config)
+    return {
+        name: replace(shared, drives=theirs, guess=guesses[name], progress=_named(progress, name))
+        for name, theirs in drives.items()
+    }
+
+
+def _named(progress: Progress | None, camera: str) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda stage, done, total: progress(f"{camera}: {stage}", done, total)
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """One camera by itself.
+
+    Attributes:
+        problem: its drives and guess.
+        result: of its own images.
+        estimate: the same with its matches; None where there is none.
+    """
+
+    problem: CalibrationProblem
+    result: CalibrationResult
+    estimate: MethodEstimate | None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether its own estimate may inform other cameras."""
+        return self.estimate is not None and self.result.status != "not_converged"
+
+    @cached_property
+    def influences(self) -> CameraInfluences | None:
+        """How errors move the estimate; None where it informs no other camera."""
+        outcome = self.estimate.solved if self.estimate is not None and self.trusted else None
+        return None if outcome is None else CameraInfluences.of(outcome)
+
+    @property
+    def clusters(self) -> float:
+        """Effective number of sides of objects behind its covariance."""
+        outcome = None if self.estimate is None else self.estimate.solved
+        if outcome is None:
+            return 1.0
+        table = outcome.estimate.robust.table
+        weights = np.bincount(table.sides, table.root_weights**2)
+        return float(weights.sum() ** 2 / max(float(weights @ weights), 1e-12))
+
+
+_UNKNOWN_SIGMAS = np.array([1.0] * 3 + [2.0] * 3 + [1.0])
+"""(7,) deviations of a camera of which nothing is known [rad, m, s], as of a result without an estimate."""
+
+
+def _solved(problem: CalibrationProblem, start: Guess | None = None) -> _Camera:
+    """A camera's own estimate, searched around its guess, or close around another start."""
+    own = problem
+    if start is not None:
+        search = replace(
+            problem.config.search, rotation_deg=_NEAR_DEG, translation_m=_NEAR_M, time_offset_s=_NEAR_S
+        )
+        own = replace(problem, guess=start, config=replace(problem.config, search=search))
+    result, estimate = finished(lambda: solve_problem(own), own.drives, own.guess, own.config)
+    if start is not None:
+        config = {**result.config, "search": to_dict(problem.config.search)}
+        guess = problem.guess
+        result = replace(result, initial=guess.cTl, initial_time_offset_s=guess.time_offset_s, config=config)
+    return _Camera(problem, result, estimate)
+
+
+_NEAR_DEG, _NEAR_M, _NEAR_S = 1.0, 0.1, 0.05
+"""Half widths of the search around where other cameras and a known pose put a camera."""
+_REACH_PX, _REACH_AT_M = KERNELS_PX[-1], 10.0
+"""An estimate so far from there, as the image of a point at this distance moves, is solved again from there:
+the matches of the last kernel are then those of other contours."""
+
+
+@dataclass(frozen=True)
+class _Rig:
+    """All cameras by themselves, and what is known of the rig."""
+
+    cameras: Mapping[str, _Camera]
+    known: KnownRig
+
+    @cached_property
+    def joint(self) -> JointCovariance:
+        covariances = [self._covariance(name) for name in self.cameras]
+        return joint_covariance(covariances, [camera.influences for camera in self.cameras.values()])
+
+    def _covariance(self, name: str) -> FloatArray:
+        """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""
+        camera, poses = self.cameras[name], self.known.poses
+        linked = self.known.one_trigger or any(name in (p.camera, p.reference) for p in poses)
+        return np.diag(_UNKNOWN_SIGMAS**2) if linked and not camera.trusted else camera.result.covariance
+
+    @cached_property
+    def marginal(self) -> RigMarginal:
+        """The cameras' own estimates."""
+        results = [camera.result for camera in self.cameras.values()]
+        return RigMarginal(
+            tuple(self.cameras),
+            tuple(result.T_camera_lidar for result in results),
+            tuple(result.time_offset_s for result in results),
+            self.joint.matrix,
+        )
+
+    @cached_property
+    def poses(self) -> tuple[ComparedPose, ...]:
+        return compare_poses(self.marginal, self.known, self._clusters)
+
+    @cached_property
+    def trigger(self) -> ComparedTrigger | None:
+        return compare_trigger(self.marginal, self.known, self._clusters)
+
+    @property
+    def _clusters(self) -> list[float]:
+        return [camera.clusters for camera in self.cameras.values()]
+
+    @property
+    def agreed(self) -> KnownRig:
+        """What is known and not contradicted."""
+        poses = tuple(pose.known for pose in self.poses if not pose.contradicted)
+        return KnownRig(poses, self.trigger is not None and not self.trigger.contradicted)
+
+    def other_starts(self) -> dict[str, Guess]:
+        """Where the better known camera of a known pose puts the other one, for those far from there."""
+        starts = {}
+        for compared in self.poses:
+            pose = compared.known
+            names = (pose.camera, pose.reference)
+            better, weaker = sorted(names, key=lambda name: _size(self._covariance(name)))
+            if not self.cameras[better].trusted or weaker in starts:
+                continue
+            cTb = pose.T_camera_reference
+            step = cTb if weaker == pose.camera else cTb.inverse()
+            start = step * self.cameras[better].result.T_camera_lidar
+            own = self.cameras[weaker].result
+            if not self.cameras[weaker].trusted or _pixels(own, start) > _REACH_PX:
+                clock = self.cameras[better] if self.known.one_trigger else self.cameras[weaker]
+                starts[weaker] = Guess(start, clock.result.time_offset_s)
+        return starts
+
+    def with_camera(self, name: str, camera: _Camera) -> _Rig:
+        return _Rig({**self.cameras, name: camera}, self.known)
+
+    def disagreement(self, name: str) -> float:
+        """Sum of chi-squared of the known poses of a camera."""
+        return sum(
+            pose.difference.chi2 for pose in self.poses if name in (pose.known.camera, pose.known.reference)
+        )
+
+    def result(self, after: RigMarginal, config: CalibrationConfig) -> RigResult:
+        """The result, with the cameras' estimates after the adjustment."""
+        of_trigger = [self.trigger.sentence] if self.trigger is not None and self.trigger.contradicted else []
+        of_poses = [pose for pose in self.poses if pose.contradicted]
+        wrong = {
+            name: [p.sentence for p in of_poses if name in (p.known.camera, p.known.reference)] + of_trigger
+            for name in self.cameras
+        }
+        static = self._static_covariances()
+        results = {
+            name: _camera_result(camera, name, after, static[name], wrong[name], config)
+            for name, camera in self.cameras.items()
+        }
+        return RigResult(
+            results,
+            after.covariance,
+            worst([result.status for result in results.values()]),
+            (*(pose.sentence for pose in of_poses), *of_trigger),
+            self.known,
+            self._diagnostics(),
+        )
+
+    def _static_covariances(self) -> dict[str, FloatArray]:
+        """(7, 7) of each camera by static objects alone, and what is known of the rig."""
+        cameras, n = self.cameras.values(), UNKNOWNS * len(self.cameras)
+        whole = np.zeros((n, n))
+        for i, camera in enumerate(cameras):
+            at = slice(UNKNOWNS * i, UNKNOWNS * (i + 1))
+            known = camera.estimate.by_static_objects if camera.estimate and camera.trusted else None
+            whole[at, at] = self.joint.matrix[at, at] if known is None else known
+        after = adjusted(replace(self.marginal, covariance=whole), self.agreed)
+        return {name: after.of_camera(name) for name in self.cameras}
+
+    def _diagnostics(self) -> dict[str, Any]:
+        found: dict[str, Any] = {
+            "correlations": dict(self.joint.correlations),
+            "sides_in_common": self.joint.common,
+            "known_poses": [
+                {
+                    "camera": pose.known.camera,
+                    "reference": pose.known.reference,
+                    "chi2_of_6": pose.difference.chi2,
+                    "p_value": pose.difference.p_value,
+                    "used": not pose.contradicted,
+                }
+                for pose in self.poses
+            ],
+        }
+        if self.trigger is not None:
+            found["one_trigger"] = {
+                "chi2": self.trigger.difference.chi2,
+                "degrees_of_freedom": len(self.trigger.difference.step),
+                "p_value": self.trigger.difference.p_value,
+                "used": not self.trigger.contradicted,
+            }
+        return found
+
+
+def _better(rig: _Rig, name: str, own: _Camera, again: _Camera | None) -> _Camera:
+    """The estimate of a camera that goes better with the known poses; its own where none does."""
+    if again is None or not again.trusted:
+        return own
+    if not own.trusted:
+        return again
+    return again if rig.with_camera(name, again).disagreement(name) < rig.disagreement(name) else own
+
+
+def _size(covariance: FloatArray) -> float:
+    """Mean variance of an extrinsic, as the image of a point moves [rad^2]."""
+    return float(np.trace(covariance[:3, :3]) + np.trace(covariance[3:6, 3:6]) / _REACH_AT_M**2)
+
+
+def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
+    """How far the image of a point moves between a result and another extrinsic, at most [px]."""
+    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(cTl))
+    angle = float(np.linalg.norm(step[:3]) + np.linalg.norm(step[3:]) / _REACH_AT_M)
+    return angle * result.camera.fx
+
+
+def _camera_result(
+    camera: _Camera,
+    name: str,
+    after: RigMarginal,
+    static: FloatArray,
+    wrong: Sequence[str],
+    config: CalibrationConfig,
+) -> CalibrationResult:
+    """A camera's result after the adjustment, with the sentences that make it wrong."""
+    at, own = after.names.index(name), camera.result
+    cTl, covariance = after.extrinsics[at], after.of_camera(name)
+    weak = open_directions(covariance, static, cTl, config.observability)
+    not_converged = bool(wrong) or own.status == "not_converged"
+    status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
+    gone = {f"{direction.sentence}: {direction.advice}" for direction in own.weak_directions}
+    kept = tuple(reason for reason in own.reasons if reason not in gone)
+    sentences = tuple(f"{direction.sentence}: {direction.advice}" for direction in weak)
+    alone = {
+        "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),
+        "time_offset_s": own.time_offset_s,
+        "covariance": own.covariance.tolist(),
+        "status": own.status,
+    }
+    return replace(
+        own,
+        T_camera_lidar=cTl,
+        time_offset_s=after.time_offsets_s[at],
+        covariance=covariance,
+        status=status,
+        camera_name=name,
+        reasons=(*wrong, *kept, *sentences),
+        weak_directions=weak,
+        diagnostics={**own.diagnostics, "by_own_images": alone},
+    )

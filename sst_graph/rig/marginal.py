@@ -1,0 +1,138 @@
+"""The estimates of all cameras of a rig as one Gaussian: a factor in gtsam, and the poses between cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import ConfigError
+from sst_graph.graph.linear import information_inverse
+from sst_graph.graph.state import time_offset_key
+from sst_graph.rig.influences import UNKNOWNS
+from sst_graph.types import ByValue
+
+FloatArray = NDArray[np.float64]
+
+
+def rig_keys(number: int) -> tuple[int, int]:
+    """Default keys of camera ``number``: of its extrinsic (Pose3) and its time offset (``Vector(1)``)."""
+    return int(gtsam.symbol("E", number)), time_offset_key(number)
+
+
+@dataclass(frozen=True)
+class RelativePose:
+    """The pose of one camera in another, as estimated.
+
+    Attributes:
+        camera, reference: names; p_camera = T_camera_reference . p_reference.
+        T_camera_reference: the pose.
+        covariance: (6, 6) of it [rot rad, trans m], right perturbation, so along the reference's axes.
+        time_offset_s: the camera's time offset less the reference's [s].
+        time_offset_sigma_s: its deviation [s].
+    """
+
+    camera: str
+    reference: str
+    T_camera_reference: gtsam.Pose3
+    covariance: FloatArray
+    time_offset_s: float
+    time_offset_sigma_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class RigMarginal(ByValue):
+    """A Gaussian over the extrinsics and time offsets of n cameras.
+
+    Attributes:
+        names: of the cameras.
+        extrinsics: cTl of each.
+        time_offsets_s: of each [s].
+        covariance: (7 n, 7 n), camera by camera [rot rad, trans m, offset s], right perturbations.
+    """
+
+    names: tuple[str, ...]
+    extrinsics: tuple[gtsam.Pose3, ...]
+    time_offsets_s: tuple[float, ...]
+    covariance: FloatArray
+
+    def keys(self) -> dict[str, tuple[int, int]]:
+        """Default keys of extrinsic and time offset by the camera's name: (E0, D0), (E1, D1), ..."""
+        return {name: rig_keys(number) for number, name in enumerate(self.names)}
+
+    def point(self, keys: Mapping[str, tuple[int, int]] | None = None) -> gtsam.Values:
+        """The estimate as values."""
+        values, keys = gtsam.Values(), self.keys() if keys is None else keys
+        for name, cTl, time_offset_s in zip(self.names, self.extrinsics, self.time_offsets_s, strict=True):
+            E, D = keys[name]
+            values.insert(E, cTl)
+            values.insert(D, np.array([time_offset_s]))
+        return values
+
+    def factor(self, keys: Mapping[str, tuple[int, int]] | None = None) -> gtsam.LinearContainerFactor:
+        """The Gaussian as one factor on the extrinsics and time offsets of all cameras.
+
+        Args:
+            keys: of extrinsic and time offset, by the camera's name; by default :meth:`keys`.
+        """
+        keys = self.keys() if keys is None else keys
+        information = information_inverse(self.covariance)
+        variables: list[tuple[int, slice]] = []
+        for i, name in enumerate(self.names):
+            E, D = keys[name]
+            at = UNKNOWNS * i
+            variables += [(E, slice(at, at + 6)), (D, slice(at + 6, at + 7))]
+        # gtsam's Python takes at most three keys at a time; the sum of such pieces is one factor.
+        pieces = gtsam.GaussianFactorGraph()
+        for key, a in variables:
+            own = information[a, a]
+            pieces.add(gtsam.HessianFactor(key, own, np.zeros(len(own)), 0.0))
+        for (key, a), (other, b) in combinations(variables, 2):
+            m, n = a.stop - a.start, b.stop - b.start
+            nothing = np.zeros((m, m)), np.zeros(m), np.zeros((n, n)), np.zeros(n)
+            pieces.add(
+                gtsam.HessianFactor(
+                    key, other, nothing[0], information[a, b], nothing[1], nothing[2], nothing[3], 0.0
+                )
+            )
+        return gtsam.LinearContainerFactor(gtsam.HessianFactor(pieces), self.point(keys))
+
+    def of_camera(self, name: str) -> FloatArray:
+        """(7, 7) covariance of one camera."""
+        own = self._columns(name)
+        return self.covariance[np.ix_(own, own)]
+
+    def relative_pose(self, camera: str, reference: str) -> RelativePose:
+        """The pose of one camera in another, and the difference of their time offsets."""
+        c, b = self._columns(camera), self._columns(reference)
+        i, j = self.names.index(camera), self.names.index(reference)
+        cTl, bTl = self.extrinsics[i], self.extrinsics[j]
+        pair = self.covariance[np.ix_([*c, *b], [*c, *b])]
+        Ad = np.asarray(bTl.AdjointMap())
+        J = np.zeros((7, 14))
+        J[:6, :6], J[:6, 7:13] = Ad, -Ad
+        J[6, 6], J[6, 13] = 1.0, -1.0
+        covariance = J @ pair @ J.T
+        return RelativePose(
+            camera,
+            reference,
+            cTl * bTl.inverse(),
+            0.5 * (covariance[:6, :6] + covariance[:6, :6].T),
+            self.time_offsets_s[i] - self.time_offsets_s[j],
+            float(np.sqrt(max(covariance[6, 6], 0.0))),
+        )
+
+    def relative_poses(self) -> tuple[RelativePose, ...]:
+        """The pose of every camera but the first in the one before it, as Kalibr's chain has it."""
+        pairs: Sequence[tuple[str, str]] = list(zip(self.names[1:], self.names[:-1], strict=True))
+        return tuple(self.relative_pose(camera, reference) for camera, reference in pairs)
+
+    def _columns(self, name: str) -> list[int]:
+        if name not in self.names:
+            raise ConfigError(f"camera {name!r}: expected one of {', '.join(self.names)}")
+        at = UNKNOWNS * self.names.index(name)
+        return list(range(at, at + UNKNOWNS))

@@ -1,0 +1,247 @@
+"""The result of a rig's calibration and its file, ``rig.json``.
+
+The file's contract: ``{"format": "sst-graph/rig", "version": 1, "cameras": [{"name", "folder", "status"}],
+"covariance": 7n x 7n, "status", "reasons", "camera_poses", "known", "diagnostics"}``; strict JSON. The
+calibration of each camera is the ``calibration.json`` in its folder beside it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.files.checked_values import check_covariance, check_finite
+from sst_graph.files.json_table import JsonTable, json_table
+from sst_graph.files.reading import FileKind, parse_json, read_text
+from sst_graph.files.strict_json import strict_json
+from sst_graph.result import CalibrationResult, Status, read_result
+from sst_graph.rig.known import KnownPose, KnownRig
+from sst_graph.rig.marginal import RelativePose, RigMarginal
+
+FloatArray = NDArray[np.float64]
+
+FORMAT = "sst-graph/rig"
+VERSION = 1
+RIG = FileKind("a rig.json", 16 * 1024 * 1024)
+RIG_NAME, CALIBRATION_NAME = "rig.json", "calibration.json"
+
+_MOST_CAMERAS = 64
+_AGREE = 1e-9
+"""Relative difference between a camera's covariance in its own file and in the rig's."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigResult:
+    """The calibrations of several cameras on one LiDAR, and how their errors go together.
+
+    Two results are equal if their files are.
+
+    Attributes:
+        cameras: the calibration of each camera, by name.
+        covariance: (7 n, 7 n), camera by camera in that order, each [rot xyz rad, trans xyz m, offset s] with
+            right perturbations; the blocks of single cameras are those of their calibrations.
+        status: the worst of the cameras'.
+        reasons: what is wrong with the rig as a whole, such as a known pose that contradicts the estimates.
+        known: what was known beforehand.
+        diagnostics: JSON-able numbers.
+    """
+
+    cameras: Mapping[str, CalibrationResult]
+    covariance: FloatArray
+    status: Status
+    reasons: tuple[str, ...] = ()
+    known: KnownRig = field(default_factory=KnownRig)
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = 7 * len(self.cameras)
+        if self.status not in get_args(Status):
+            raise DataError("status", f"{self.status!r:.60}", "one of " + ", ".join(get_args(Status)))
+        check_finite("covariance", self.covariance, (n, n))
+        check_covariance("covariance", self.covariance, min_sigma=0.0)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, RigResult):
+            return NotImplemented
+        return self.to_json() == other.to_json() and dict(self.cameras) == dict(other.cameras)
+
+    def __hash__(self) -> int:
+        return hash(self.to_json())
+
+    def __getitem__(self, name: str) -> CalibrationResult:
+        """The calibration of one camera.
+
+        Raises:
+            ConfigError: no such camera.
+        """
+        if name not in self.cameras:
+            raise ConfigError(f"camera {name!r}: expected one of {', '.join(self.cameras)}")
+        return self.cameras[name]
+
+    def marginal(self) -> RigMarginal:
+        """All extrinsics and time offsets as one Gaussian: a factor for a graph of your own."""
+        results = self.cameras.values()
+        return RigMarginal(
+            tuple(self.cameras),
+            tuple(result.T_camera_lidar for result in results),
+            tuple(result.time_offset_s for result in results),
+            self.covariance,
+        )
+
+    def relative_pose(self, camera: str, reference: str) -> RelativePose:
+        """The pose of one camera in another, with its covariance.
+
+        Raises:
+            ConfigError: no such camera.
+        """
+        return self.marginal().relative_pose(camera, reference)
+
+    def to_json(self) -> str:
+        """The text of ``rig.json``."""
+        return (
+            strict_json(
+                {
+                    "format": FORMAT,
+                    "version": VERSION,
+                    "cameras": [
+                        {"name": name, "folder": folder, "status": result.status}
+                        for (name, result), folder in zip(
+                            self.cameras.items(), folder_names(self.cameras).values(), strict=True
+                        )
+                    ],
+                    "covariance": self.covariance,
+                    "status": self.status,
+                    "reasons": self.reasons,
+                    "camera_poses": [_pose_document(p) for p in self.marginal().relative_poses()],
+                    "known": _known_document(self.known),
+                    "diagnostics": self.diagnostics,
+                }
+            )
+            + "\n"
+        )
+
+    @staticmethod
+    def from_json(
+        text: str, cameras: Mapping[str, CalibrationResult], place: str | Path = RIG_NAME
+    ) -> RigResult:
+        """The result in the text of a ``rig.json``, with its cameras' calibrations.
+
+        Raises:
+            DataError: no such text, or calibrations of other cameras.
+        """
+        table = json_table(parse_json(text, place, RIG.name), place, FORMAT, VERSION)
+        names = _names(table)
+        if sorted(names) != sorted(cameras):
+            raise DataError(place, f"cameras {', '.join(names)}", f"those given: {', '.join(cameras)}")
+        covariance = table.matrix("covariance", (7 * len(names),) * 2)
+        check_covariance(f"{place}: covariance", covariance)
+        for i, name in enumerate(names):
+            block = covariance[7 * i : 7 * i + 7, 7 * i : 7 * i + 7]
+            own = cameras[name].covariance
+            scale = np.sqrt(np.outer(np.diag(own), np.diag(own)))
+            if (np.abs(block - own) > _AGREE * scale).any():
+                raise DataError(place, f"another covariance of {name} than its calibration has", "the same")
+        return RigResult(
+            {name: cameras[name] for name in names},
+            covariance,
+            cast(Status, table.text("status")),
+            table.sentences("reasons"),
+            _known(table.table("known")),
+            table.mapping("diagnostics"),
+        )
+
+
+def read_rig(path: str | Path) -> RigResult:
+    """The result in a folder that ``sst-graph calibrate`` wrote for several cameras, or in its ``rig.json``.
+
+    Raises:
+        DataError: a file is missing, unreadable, or of another result.
+    """
+    path = Path(path)
+    file = path / RIG_NAME if path.is_dir() else path
+    text = read_text(file, RIG)
+    names = _names(json_table(parse_json(text, file, RIG.name), file, FORMAT, VERSION))
+    folders = folder_names(names)
+    cameras = {name: read_result(file.parent / folders[name] / CALIBRATION_NAME) for name in names}
+    return RigResult.from_json(text, cameras, file)
+
+
+def folder_names(cameras: Mapping[str, Any] | tuple[str, ...]) -> dict[str, str]:
+    """Name of each camera's folder: its own without what a folder's name cannot hold; different ones."""
+    found: dict[str, str] = {}
+    for name in cameras:
+        plain = re.sub(r"[^A-Za-z0-9_.-]+", "_", name).strip("_.") or "camera"
+        free, number = plain, 2
+        while free in found.values():
+            free, number = f"{plain}_{number}", number + 1
+        found[name] = free
+    return found
+
+
+def worst(statuses: list[Status]) -> Status:
+    """The worst of some statuses."""
+    order: tuple[Status, ...] = ("not_converged", "unobservable", "ok")
+    return min(statuses, key=order.index)
+
+
+def _names(table: JsonTable) -> tuple[str, ...]:
+    names = tuple(camera.text("name") for camera in table.tables("cameras"))
+    if not 1 <= len(names) <= _MOST_CAMERAS or len(set(names)) < len(names):
+        raise DataError(
+            f"{table.place}: cameras", f"{len(names)} names", f"1 to {_MOST_CAMERAS}, each of them once"
+        )
+    return names
+
+
+def _pose_document(pose: RelativePose) -> dict[str, Any]:
+    return {
+        "camera": pose.camera,
+        "reference": pose.reference,
+        "T_camera_reference": pose.T_camera_reference.matrix(),
+        "covariance": pose.covariance,
+        "time_offset_s": pose.time_offset_s,
+        "time_offset_sigma_s": pose.time_offset_sigma_s,
+    }
+
+
+def _known_document(known: KnownRig) -> dict[str, Any]:
+    return {
+        "one_trigger": known.one_trigger,
+        "poses": [
+            {
+                "camera": pose.camera,
+                "reference": pose.reference,
+                "T_camera_reference": pose.T_camera_reference.matrix(),
+                "rotation_sigma_deg": pose.rotation_sigma_deg,
+                "translation_sigma_m": pose.translation_sigma_m,
+            }
+            for pose in known.poses
+        ],
+    }
+
+
+def _known(table: JsonTable) -> KnownRig:
+    trigger = table.value("one_trigger")
+    if not isinstance(trigger, bool):
+        raise DataError(f"{table.place}: one_trigger", f"{trigger!r:.60}", "true or false")
+    try:
+        poses = tuple(
+            KnownPose(
+                pose.text("camera"),
+                pose.text("reference"),
+                pose.pose("T_camera_reference"),
+                pose.number("rotation_sigma_deg"),
+                pose.number("translation_sigma_m"),
+            )
+            for pose in table.tables("poses")
+        )
+    except ConfigError as error:
+        raise DataError(table.place, str(error), "poses of cameras in others") from None
+    return KnownRig(poses, trigger)

@@ -1,0 +1,146 @@
+"""An ONNX network that onnxruntime runs: loaded, its inputs described, its outputs checked."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError, MissingDependencyError
+from sst_graph.files.reading import FileKind, read_file
+
+NETWORK = FileKind("an ONNX network", 2**31)
+"""Larger networks keep their weights in files of their own, for protobuf ends there."""
+_DTYPES = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+}
+
+
+class OnnxNetwork:
+    """A network with one input.
+
+    Attributes:
+        path: of its file.
+        digest: SHA-256 of the file, and of files of weights beside it that begin with its name.
+        shape: of the input; None for dimensions that may vary.
+        dtype: of the input.
+        outputs: names of the outputs, in order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Loads the network.
+
+        Raises:
+            DataError: no such file, no network that loads, or other than one input of numbers.
+            MissingDependencyError: onnxruntime is not installed.
+        """
+        runtime = _runtime(path)
+        self.path, self.digest = path, _digest(path)
+        options = runtime.SessionOptions()
+        options.log_severity_level = 4  # what it has to say comes as an exception, too
+        threads = os.environ.get("OMP_NUM_THREADS", "")
+        options.intra_op_num_threads = int(threads) if threads.isdecimal() else 0
+        try:
+            self._session = runtime.InferenceSession(
+                str(path), options, providers=runtime.get_available_providers()
+            )
+        except Exception as error:  # its exceptions share no other base
+            raise DataError(path, f"no network that loads ({_line(error)})", NETWORK.name) from None
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1:
+            named = ", ".join(one.name for one in inputs)
+            raise DataError(path, f"{len(inputs)} inputs ({named})", "one, the picture or the range image")
+        self._input = inputs[0].name
+        if inputs[0].type not in _DTYPES:
+            raise DataError(path, f"an input of {inputs[0].type}", f"one of {', '.join(_DTYPES)}")
+        self.dtype: Any = _DTYPES[inputs[0].type]
+        self.shape = tuple(
+            size if isinstance(size, int) and size > 0 else None for size in inputs[0].shape or ()
+        )
+        self.outputs = tuple(one.name for one in self._session.get_outputs())
+
+    def check_input(self, expected: tuple[int | None, ...], layout: str) -> None:
+        """Require an input of a shape, where both know it.
+
+        Args:
+            layout: the shape in words, for errors.
+
+        Raises:
+            DataError: another number of dimensions, or another size.
+        """
+        sizes = zip(self.shape, expected, strict=False)
+        if len(self.shape) != len(expected) or any(
+            a != b for a, b in sizes if a is not None and b is not None
+        ):
+            raise DataError(self.path, f"an input of {_shown(self.shape)}", f"{_shown(expected)}, {layout}")
+
+    def run(self, values: NDArray[Any], place: str) -> dict[str, NDArray[Any]]:
+        """Outputs by name.
+
+        Args:
+            values: the input, of any type of numbers.
+            place: of the picture or scan, for errors.
+
+        Raises:
+            DataError: the network does not take it or fails, or an output is not finite.
+        """
+        if self.dtype == np.uint8:
+            values = np.clip(np.rint(values), 0, 255)
+        try:
+            found = self._session.run(None, {self._input: np.ascontiguousarray(values, self.dtype)})
+        except Exception as error:
+            raise DataError(self.path, f"a failure on {place} ({_line(error)})", "labels") from None
+        outputs = dict(zip(self.outputs, (np.asarray(one) for one in found), strict=True))
+        for name, array in outputs.items():
+            if array.dtype.kind == "f" and not np.isfinite(array).all():
+                raise DataError(self.path, f"NaN or inf in its output {name} on {place}", "finite numbers")
+        return outputs
+
+    def output(self, outputs: Mapping[str, NDArray[Any]], name: str | None) -> NDArray[Any]:
+        """The output of a name, or the first.
+
+        Raises:
+            DataError: there is none of this name.
+        """
+        wanted = self.outputs[0] if name is None else name
+        if wanted not in outputs:
+            raise DataError(self.path, f"outputs {', '.join(self.outputs)}", f"one called {wanted}")
+        return outputs[wanted]
+
+
+def _runtime(path: Path) -> Any:
+    try:
+        import onnxruntime
+    except ImportError:
+        raise MissingDependencyError(
+            f"{path}: networks need onnxruntime, which is not installed: pip install 'sst-graph[onnx]'"
+        ) from None
+    return onnxruntime
+
+
+def _digest(path: Path) -> str:
+    digest = hashlib.sha256(read_file(path, NETWORK))
+    for beside in sorted(path.parent.glob(f"{_escaped(path.name)}?*")):
+        if beside.is_file():
+            digest.update(beside.name.encode() + read_file(beside, FileKind("weights", 2**36)))
+    return digest.hexdigest()
+
+
+def _escaped(name: str) -> str:
+    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
+
+
+def _shown(shape: tuple[int | None, ...]) -> str:
+    return "x".join("any" if size is None else str(size) for size in shape) or "no dimensions"
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
