@@ -10,16 +10,17 @@ import gtsam
 
 from sst_graph.batch.assumption_tests import examine_assumptions
 from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
     joint_diagnostics,
     joint_reasons,
     label_agreement,
     unknown_motion_remarks,
 )
+from sst_graph.batch.method_choice import with_method_for, with_method_of
 from sst_graph.batch.method_estimate import (
     Guess,
     MethodEstimate,
@@ -68,8 +69,8 @@ def calibrate(
         DataError: the frames cannot be used.
         ConfigError: the settings contradict each other or the data.
     """
-    config = config or CalibrationConfig()
     sources = as_sources(frames)
+    config = with_method_for(config or CalibrationConfig(), sources)
     _check(sources, config)
     began = time.perf_counter()
     drives = prepare_drives(sources, config, progress)
@@ -86,7 +87,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
-    prepare = config.prepare
+    config, prepare = with_method_for(config, sources), config.prepare
     if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
         prepare = replace(prepare, use_visual_odometry=False)
     if config.method not in _NEED_DEPTH:
@@ -112,7 +113,7 @@ def calibrate_prepared(
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
-    config = config or CalibrationConfig()
+    config = with_method_of(config or CalibrationConfig(), drives)
     guess = Guess(initial, initial_time_offset_s)
     method = _METHODS[config.method]
     return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
@@ -200,7 +201,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
-_METHODS: dict[Method, _Method] = {
+_METHODS: dict[Method, _Method] = {  # auto is one of these once the data are known
     "joint": joint_method,
     "paper": paper_method,
     "static": static_method,

@@ -10,9 +10,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.covariance import edges_covariance
+from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.edges_covariance import edges_covariance
-from sst_graph.batch.edges_reasons import EdgeContrast, edge_contrast, edges_reasons
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
