@@ -10,6 +10,7 @@ import gtsam
 
 from sst_graph.batch.assumption_tests import examine_assumptions
 from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
@@ -20,7 +21,6 @@ from sst_graph.batch.joint_report import (
     label_agreement,
     unknown_motion_remarks,
 )
-from sst_graph.batch.method_choice import with_method_for, with_method_of
 from sst_graph.batch.method_estimate import (
     Guess,
     MethodEstimate,

@@ -1,9 +1,9 @@
 """Covariance of an estimate by edges: that of the matches, and what parts of the data disagree by.
 
-Edges err together, where the matches do not show it: all top edges are seen a little low, all edges on one side
-of the street face away from the sun. So the matches are split in two, in several ways, and the estimate is
-linearized without each half in turn. Half of the difference between two halves is what the whole may be wrong
-by; its square, summed over the ways, is added to the cluster-robust covariance.
+Edges err together, where the matches do not show it: all top edges are seen a little low, all edges on one
+side of the street face away from the sun. So the matches are split in two, in several ways, and the estimate
+is linearized without each half in turn. Half of the difference between two halves is what the whole may be
+wrong by; its square, summed over the ways, is added to the cluster-robust covariance.
 """
 
 from __future__ import annotations
@@ -24,9 +24,10 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 FLOOR = np.array([*np.radians([0.11] * 3), 0.025, 0.025, 0.025, 0.004])
-"""(7,) sigmas that are added [rad, m, s]. The halves share what all edges have in common, and a soft match follows
-the pose a little, so that their differences come out too small: on three simulated streets and two real drives
-the errors were three to ten times the spread. These are about the root mean squares of those errors."""
+"""(7,) sigmas that are added [rad, m, s]. The halves share what all edges have in common, and a soft match
+follows the pose a little, so that their differences come out too small: on three simulated streets and two
+real drives the errors were three to ten times the spread. These are about the root mean squares of those
+errors."""
 
 
 def edges_covariance(estimate: JointEstimate) -> tuple[FloatArray, dict[str, Any]]:

@@ -31,7 +31,8 @@ MIN_CONTRAST = 5.0
 MIN_OVER_OTHER = 1.08
 """Least ratio of the estimate's score to that of the best other optimum."""
 MAX_MOTION_CHI2 = 33.0
-"""Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two contradict."""
+"""Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two
+contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
 MAX_AWAY_M = 0.35
@@ -97,7 +98,8 @@ def edges_reasons(
     if contrast.other > 0.0 and contrast.score < MIN_OVER_OTHER * contrast.other:
         reasons.append(
             "another pose agrees with the pictures almost as well "
-            f"(score {contrast.score:.0f} against {contrast.other:.0f}): give a closer guess or a richer drive"
+            f"(score {contrast.score:.0f} against {contrast.other:.0f}): "
+            "give a closer guess or a richer drive"
         )
     if motion is not None:
         step = difference(motion.state, solution.state)[[0, 1, 2, 6]]
