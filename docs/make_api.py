@@ -30,6 +30,13 @@ SECTIONS: dict[str, list[str]] = {
         "sst_graph.CalibrationResult",
         "sst_graph.inspect_result",
     ],
+    "Several cameras": [
+        "sst_graph.calibrate_rig",
+        "sst_graph.KnownRig",
+        "sst_graph.KnownPose",
+        "sst_graph.RigResult",
+        "sst_graph.read_rig",
+    ],
     "Frame by frame": ["sst_graph.Tracker", "sst_graph.TrackerConfig", "sst_graph.TrackUpdate"],
     "In a graph of your own": [
         "sst_graph.AlignmentTerm",

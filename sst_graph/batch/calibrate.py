@@ -16,6 +16,7 @@ from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
 from sst_graph.batch.joint_report import (
+    fit_of,
     joint_diagnostics,
     joint_reasons,
     label_agreement,
@@ -37,7 +38,7 @@ from sst_graph.batch.sources import as_sources
 from sst_graph.batch.total_covariance import total_covariance
 from sst_graph.covariance.considered import BUDGET
 from sst_graph.drive.geometric_labels import GeometricallyLabelled
-from sst_graph.drive.preparation import Drive, Progress, prepare_drive
+from sst_graph.drive.preparation import Drive, PrepareConfig, Progress, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.odometry.sweep import with_sweep
 from sst_graph.result import CalibrationResult
@@ -87,11 +88,8 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
-    config, prepare = with_method_for(config, sources), config.prepare
-    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
-        prepare = replace(prepare, use_visual_odometry=False)
-    if config.method not in _NEED_DEPTH:
-        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    config = with_method_for(config, sources)
+    prepare = preparation_of(config)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     classes = config.classes
@@ -102,6 +100,16 @@ def prepare_drives(
         prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
         for source in (with_sweep(source, config.decide_sweep) for source in sources)
     ]
+
+
+def preparation_of(config: CalibrationConfig) -> PrepareConfig:
+    """What the method needs of every frame."""
+    prepare = config.prepare
+    if config.method not in _NEED_IMAGE_TRACKS and not may_use_motion(config):
+        prepare = replace(prepare, use_visual_odometry=False)
+    if config.method not in _NEED_DEPTH:
+        prepare = replace(prepare, track_interval_s=_TRACK_INTERVAL_S)
+    return prepare
 
 
 def calibrate_prepared(
@@ -131,8 +139,7 @@ def finished(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    if config.method not in _NO_LABELS:
-        result = with_causes(result, drives, guess, config)
+    result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -166,7 +173,7 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     start = problem.start()
     # 2. Outlines over all frames, from the best start and from others that are nearly as good.
     solutions = problem.solve_from(start)
-    agreement = label_agreement(problem, solutions[0])
+    start_solution, agreement = solutions[0], label_agreement(problem, solutions[0])
     # 3. Lower edges of the objects, where both sensors' labels agree about them.
     lower = problem.with_lower_edges(solutions)
     problem, solutions = problem.with_noise(lower.joint.graph), lower.solutions
@@ -179,7 +186,9 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
     assumptions = examine_assumptions(problem, motion.estimate)
     # 7. Total covariance: with unmeasured motion and undecided sweeps, which no match shows.
     total = total_covariance(problem, motion.estimate, assumptions.considered)
-    # 8. The estimate, and why it may be wrong.
+    # 8. How it fits the labels, point by point.
+    fit = fit_of(problem, (start_solution, lower.solutions[0], motion.estimate.solution), total.covariance)
+    # 9. The estimate, and why it may be wrong.
     solution, unknowns = motion.estimate.solution, total.unknowns
     wrong = joint_reasons(problem, solution, solutions, unknowns, agreement)
     return MethodEstimate(
@@ -197,11 +206,12 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | {"motion": motion.diagnostics, "assumptions": assumptions.report(), BUDGET: total.budget}
         | joint_diagnostics(problem, motion.estimate, lower),
         JointOutcome(problem, motion.estimate, assumptions.considered),
+        fit,
     )
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
-_METHODS: dict[Method, _Method] = {  # auto is one of these once the data are known
+_METHODS: dict[Method, _Method] = {
     "joint": joint_method,
     "paper": paper_method,
     "static": static_method,
@@ -214,7 +224,5 @@ _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 _TRACK_INTERVAL_S = 0.07
 """Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
 known as well after 33 ms as after 100 ms, the rate of turn is not."""
-_NO_LABELS = ("edges",)
-"""Methods whose data nobody labelled, so that labels do not tell what is wrong."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

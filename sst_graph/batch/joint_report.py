@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,14 @@ from sst_graph.batch.assumption_tests import estimated_report
 from sst_graph.batch.lower_edges import WithLowerEdges
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
+from sst_graph.fit import Fit
 from sst_graph.graph.outer_loop import JointSolution, agreement, concentration, explained, poor_fit
 from sst_graph.hand_eye.solution import difference
 from sst_graph.initialization.selection import ALTERNATIVE_RATIO, REACH
 from sst_graph.inspect.frame_gains import frame_gains
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 from sst_graph.inspect.frame_information import to_document
+from sst_graph.quality.fit_of_solution import FitOfDrives
 
 FloatArray = NDArray[np.float64]
 
@@ -86,6 +89,25 @@ def joint_diagnostics(
         "estimated": estimated_report(estimate.robust, solution.state),
         FRAME_INFORMATION: to_document(frame_gains(*frozen, drives, estimate.robust)),
     }
+
+
+def fit_of(
+    problem: CalibrationProblem, solutions: Sequence[JointSolution], covariance: FloatArray
+) -> Fit | None:
+    """How the last of the solutions, each of which led to the next, fits the labels.
+
+    Args:
+        covariance: (7, 7) of the result.
+    """
+    last, guess = solutions[-1], problem.guess
+    clocks = len(last.state.time_offsets_s)
+    start = None
+    if guess.cTl is not None:
+        start = replace(last.state, cTl=guess.cTl, time_offsets_s=(guess.time_offset_s,) * clocks)
+    different = {id(solution): solution for solution in solutions}.values()
+    iterations = [each for solution in different for each in solution.iterations]
+    drives = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
+    return drives.fit(last, np.sqrt(np.diag(covariance)), start, iterations)
 
 
 def _moving(solution: JointSolution) -> Iterator[str]:

@@ -24,6 +24,7 @@ from sst_graph.covariance.observability import (
 )
 from sst_graph.drive.preparation import Drive
 from sst_graph.drive.stamp_intervals import jumps_of
+from sst_graph.fit import QUALITY, Fit
 from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.odometry.sweep import SWEEP_KEY
@@ -75,6 +76,7 @@ class MethodEstimate:
         by_drive: how well each of them is known.
         diagnostics: JSON-able numbers about the run.
         solved: the problem of the joint graph with its matches; None of methods without such a graph.
+        fit: how the estimate fits its data, of methods that measure it.
     """
 
     cTl: gtsam.Pose3
@@ -88,6 +90,7 @@ class MethodEstimate:
     by_drive: tuple[DriveCovariance, ...] = ()
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     solved: JointOutcome | None = None
+    fit: Fit | None = None
 
 
 def result_of(
@@ -114,9 +117,14 @@ def result_of(
         config=to_dict(config),
         initial=guess.cTl,
         initial_time_offset_s=guess.time_offset_s,
-        diagnostics={**estimate.diagnostics, **sweeps_of(drives)},
+        diagnostics={**estimate.diagnostics, **_quality(estimate.fit), **sweeps_of(drives)},
         versions=_versions(),
+        fit=estimate.fit,
     )
+
+
+def _quality(fit: Fit | None) -> dict[str, Any]:
+    return {} if fit is None else {QUALITY: fit.quality.to_dict()}
 
 
 def _weak_directions(

@@ -171,6 +171,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         metavar="DIR",
         help="folder to write (default %(default)s)",
     )
+    calibrate.add_argument(
+        "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
+    )
     calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
     return calibrate
 
@@ -387,8 +390,8 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument(
         "name",
         metavar="NAME",
-        help="accuracy, assumptions, consistency, drives, motion, paper-table, slam or windows; any other "
-        "name prints what each of them shows; drives and windows need real drives: "
+        help="accuracy, assumptions, consistency, drives, motion, paper-table, rigs, slam or windows; any "
+        "other name prints what each of them shows; drives and windows need real drives: "
         "--set 'data=[\"DATA\"]'",
     )
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")

@@ -9,18 +9,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sst_graph.cli.messages import complain
-from sst_graph.cli.pictures import overlay, png, telling_positions
+from sst_graph.cli.pictures import drawn_frames, overlay, png, telling_positions
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
+from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, markdown_report
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep_of
+from sst_graph.report import ReportInputs, report_html
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
 
 RESULT_NAME = "calibration.json"
+REPORT_NAME = "report.html"
 
 CALIBRATION = OutputKind("calibration")
 RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
@@ -51,9 +54,17 @@ def comparison(result: CalibrationResult, sources: Sequence[Source]) -> Comparis
 
 
 def write_calibration(
-    folder: Path, result: CalibrationResult, sources: Sequence[Source], against: Comparison | None
+    folder: Path,
+    result: CalibrationResult,
+    sources: Sequence[Source],
+    against: Comparison | None,
+    with_report: bool = True,
 ) -> list[str]:
-    """Write the result's files into ``folder`` (which exists) and return their names."""
+    """Write the result's files into ``folder`` (which exists) and return their names.
+
+    Args:
+        with_report: write the page with pictures and charts, too.
+    """
     pictures = []
     for source in sources:
         drive = RecentReader(with_sweep_of(source, result.diagnostics))
@@ -64,18 +75,24 @@ def write_calibration(
             pictures.append(name)
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     (folder / "report.md").write_text(markdown_report(result, against, pictures), encoding="utf-8")
-    return [RESULT_NAME, "report.md", *pictures]
+    if not with_report:
+        return [RESULT_NAME, "report.md", *pictures]
+    read = [with_sweep_of(source, result.diagnostics) for source in sources]
+    frames = [] if result.fit else drawn_frames(read, result, PICTURES)
+    page = report_html(ReportInputs(result, read, against, frames))
+    (folder / REPORT_NAME).write_text(page, encoding="utf-8")
+    return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 
 
 def exit_code(result: CalibrationResult) -> int:
     """Exit code of a result; one line on stderr says why it is not to be trusted: the first reason.
 
-    The summary and the report hold all of them.
+    The summary has a line for each, the report all of it.
     """
     if result.status == "ok":
         return 0
-    first, *others = result.reasons or ("the result carries no reason",)
-    more = f" ({len(others)} more in the summary and in report.md)" if others else ""
+    first, *others = short_reasons(result) or ("the result carries no reason",)
+    more = f" ({len(others)} more in the summary; in full in the report)" if others else ""
     complain(f"{result.status}: {first}{more}")
     return 3
 

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError
+from sst_graph.fit import MatchedFrame
 from sst_graph.odometry.lidar import lidar_odometry
+from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.result import CalibrationResult
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
 from sst_graph.viz import Placement, draw_overlay, stacked
@@ -57,6 +59,25 @@ def overlay(
         return after
     start = own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
     return stacked(draw_overlay(*start), after)
+
+
+def drawn_frames(sources: Sequence[Source], result: CalibrationResult, count: int) -> list[DrawnFrame]:
+    """Frames for the report of a result without a fit, over all drives: each with the image closest in
+    time."""
+    found = []
+    for source in sources:
+        drive = RecentReader(source)
+        for position in telling_positions(drive, result, max(1, count // len(sources))):
+            frame, _ = _at_true_time(drive, position, _offset_of(result, source))
+            if frame.scan is None or frame.image is None or not frame.image.has_picture:
+                continue
+            c_twist = camera_twist(drive, position, result.T_camera_lidar)
+            base_tau_s = (frame.image.stamp_ns - frame.scan.stamp_ns) * 1e-9
+            twist = np.zeros(6) if c_twist is None else c_twist
+            names = source.name, frame.index, frame.index
+            pair = MatchedFrame(*names, base_tau_s, twist, np.zeros(6))
+            found.append(DrawnFrame(pair, frame.scan, frame.image, source.camera))
+    return found
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:

@@ -36,7 +36,7 @@ def given_cameras(args: argparse.Namespace) -> list[str]:
     """
     names: list[str] = list(args.camera or ())
     while not args.data and names and os.path.exists(names[-1]):
-        paths = []
+        paths: list[Path] = []
         while names and os.path.exists(names[-1]):
             paths.insert(0, Path(names.pop()))
         args.data = paths

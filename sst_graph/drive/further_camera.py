@@ -70,7 +70,11 @@ def _images(
 ) -> tuple[list[ImageFeatures], list[ImagePair], LeftOut, InputStatistics]:
     """Features of all images, tracks between them where the settings need them, and what was found."""
     positions = image_positions(source)
-    collector, left_out, store = StatisticsCollector(len(positions)), LeftOut(), ArrayStore()
+    collector, left_out, store = (
+        StatisticsCollector(len(positions)),
+        LeftOut(),
+        ArrayStore(config.in_memory_bytes),
+    )
     tracker, images, pairs = FeatureTracker(), [], []
     for done, position in enumerate(positions):
         image, index = image_at(source, position), number_at(source, position)
@@ -82,7 +86,7 @@ def _images(
         frame = Frame(index, None, image)
         left_out.add(frame)
         collector.add(frame)
-        if config.use_visual_odometry:
+        if config.use_visual_odometry and tracker.seconds_to(image) >= config.track_interval_s:
             tracks = tracker.add(image)
             if tracks is not None:
                 pairs.append(ImagePair(tracks, relative_pose(tracks, source.camera)))

@@ -15,6 +15,7 @@ from sst_graph.experiments import (
     drives,
     motion,
     paper_table,
+    rigs,
     slam,
     windows,
 )
@@ -65,6 +66,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
         paper_table.PaperTableConfig(),
         paper_table.run,
+    ),
+    "rigs": Experiment(
+        "several cameras on one LiDAR: errors, joint NEES, and what a known pose between cameras adds",
+        rigs.RigTableConfig(),
+        rigs.run,
     ),
     "slam": Experiment(
         "SLAM and calibration in one graph against either alone, on simulated streets",

@@ -8,16 +8,18 @@ and in the length of a number, and hold finite numbers and unique keys only.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
 import stat
 import tomllib
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from sst_graph.errors import DataError
 
@@ -60,22 +62,39 @@ def read_file(path: str | Path, kind: FileKind) -> bytes:
     Raises:
         DataError: missing, unreadable, no regular file, or larger. Nothing blocks: a FIFO is not waited for.
     """
+    with _opened(path, kind) as stream:
+        data = stream.read(kind.max_bytes + 1)
+    if len(data) > kind.max_bytes:
+        raise _too_large(path, len(data), kind)
+    return data
+
+
+def digest_of_file(path: str | Path, kind: FileKind) -> bytes:
+    """SHA-256 of the contents of a regular file of at most ``kind.max_bytes``, read in parts.
+
+    Raises:
+        DataError: as :func:`read_file`.
+    """
+    with _opened(path, kind) as stream:
+        return hashlib.file_digest(stream, "sha256").digest()
+
+
+@contextmanager
+def _opened(path: str | Path, kind: FileKind) -> Iterator[BinaryIO]:
+    """A regular file of at most ``kind.max_bytes``, open to be read; errors, also of reading it, are ours."""
     try:
         _require_regular(os.stat(path), path, kind)
         # O_NONBLOCK: what was replaced by a FIFO since must not block either
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         with open(descriptor, "rb") as stream:
             _require_regular(os.fstat(descriptor), path, kind)
-            data = stream.read(kind.max_bytes + 1)
+            yield stream
     except FileNotFoundError:
         raise DataError(path, "no such file", kind.name) from None
     except OSError as error:
         raise DataError(path, f"an unreadable file ({error.strerror or error})", kind.name) from None
     except ValueError as error:  # a NUL or a lone surrogate in the name
         raise DataError(path, f"no name of a file ({error})", kind.name) from None
-    if len(data) > kind.max_bytes:
-        raise _too_large(path, len(data), kind)
-    return data
 
 
 def read_text(path: str | Path, kind: FileKind) -> str:

@@ -84,6 +84,15 @@ class NormalEquations:
         followed = self.g_twists + self.H_mixed @ x
         return x, -(inverse @ followed[:, :, None])[:, :, 0]
 
+    def step_along(self, unknown: int, length: float) -> tuple[FloatArray, FloatArray]:
+        """(n,) and (f, 6): the step that moves one unknown so far and lets all others follow."""
+        inverse, H, g = self._reduced(0.0)
+        x, rest = np.zeros(len(g)), np.arange(len(g)) != unknown
+        x[unknown] = length
+        x[rest] = -np.linalg.solve(H[np.ix_(rest, rest)], g[rest] + H[rest, unknown] * length)
+        followed = self.g_twists + self.H_mixed @ x
+        return x, -(inverse @ followed[:, :, None])[:, :, 0]
+
     def covariance(self) -> FloatArray:
         """(n, n) of all unknowns but the twists."""
         return information_inverse(self._reduced(0.0)[1])

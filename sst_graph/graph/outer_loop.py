@@ -21,9 +21,10 @@ from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.factors import residuals
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.fit import OuterIteration
 from sst_graph.graph.building import GraphConfig, PairMatches, Tracks, joint_graph
 from sst_graph.graph.convergence import OSCILLATION_SIGMAS, STEP_SIGMAS, step_share
-from sst_graph.graph.frozen_problem import FrozenProblem
+from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem
 from sst_graph.graph.matching import DriveMatches, edges_of, match_all
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
@@ -113,6 +114,8 @@ class JointSolution:
         outer_iterations: outer iterations done.
         converged: the last step was short compared with the sigmas of the frozen problem.
         matched_at: the state that the matches were made at.
+        frozen, optimum: the last frozen problem and its optimum.
+        iterations: how the estimate was reached.
     """
 
     state: State
@@ -123,6 +126,9 @@ class JointSolution:
     outer_iterations: int
     converged: bool
     matched_at: State
+    frozen: FrozenProblem
+    optimum: FrozenPoint
+    iterations: tuple[OuterIteration, ...]
 
 
 def solve_joint(
@@ -155,6 +161,7 @@ def solve_joint_steps(
     config, state, converged, outer = problem.config, start, False, 0
     centre = start if problem.centre is None else problem.centre
     edges = edges_of(problem.drives, problem.tracks, config.graph)
+    iterations = []
     for outer in range(config.max_outer):
         # 1. Matches at the current estimate, under a kernel that narrows.
         scale = kernels_px[min(outer, len(kernels_px) - 1)]
@@ -168,6 +175,8 @@ def solve_joint_steps(
         at_last = outer + 1 - len(kernels_px)
         share = step_share(at_last)
         state = state.towards(frozen.state_at(optimum), share)
+        count = sum(map(len, matches))
+        iterations.append(OuterIteration(scale, count, state.cTl, state.time_offsets_s[0]))
         if progress is not None:
             progress("joint", outer + 1, config.max_outer)
         yield pairs
@@ -184,7 +193,19 @@ def solve_joint_steps(
         graph.add(problem.prior)
     _LOG.info("joint: %d outer iterations, %d pairs", outer + 1, pairs)
     values = frozen.values_at(optimum)
-    return JointSolution(state, matches, found, graph, values, outer + 1, converged, frozen.state)
+    return JointSolution(
+        state,
+        matches,
+        found,
+        graph,
+        values,
+        outer + 1,
+        converged,
+        frozen.state,
+        frozen,
+        optimum,
+        tuple(iterations),
+    )
 
 
 def solve_all(

@@ -8,7 +8,10 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from sst_graph.fit import FitQuality
 from sst_graph.inspect.budget_text import budget_lines, estimated_lines
+from sst_graph.inspect.reasons import short_reasons
+from sst_graph.inspect.verdict import quality_line, verdict
 from sst_graph.metrics import (
     CalibrationErrors,
     euler_angles_deg,
@@ -55,7 +58,9 @@ def summary(result: CalibrationResult, comparison: Comparison | None = None) -> 
     if comparison is not None:
         rows.append((f"against {comparison.name}", ""))
         rows += [("", line) for line in error_lines(comparison.errors)]
-    rows += [("reason", reason) for reason in result.reasons]
+    quality = FitQuality.from_diagnostics(result.diagnostics)
+    rows += [("fit", quality_line(quality))] if quality else []
+    rows += [("reason", reason) for reason in short_reasons(result)]
     for weak in result.weak_directions:
         if not any(weak.sentence in reason for reason in result.reasons):
             rows += [("weak", weak.sentence), ("", weak.advice)]
@@ -83,6 +88,7 @@ def markdown_report(result: CalibrationResult, comparison: Comparison | None, pi
     """A short Markdown page; ``pictures`` are file names beside it."""
     blocks = [
         "# Calibration",
+        verdict(result),
         f"Status: **{result.status}**{': ' * bool(result.reasons)}{'; '.join(result.reasons)}",
         _table(
             ("", "value", "sigma"),

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.batch.calibrate import finished, prepare_drives, solve_problem
+from sst_graph.batch.calibrate import finished, preparation_of, prepare_drives, solve_problem
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.problem import CalibrationProblem
@@ -66,7 +66,7 @@ def calibrate_rig(
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
     """
-    config, known = config or CalibrationConfig(), known or KnownRig()
+    config, known = _by_labels(config or CalibrationConfig()), known or KnownRig()
     sources = {name: as_sources(own) for name, own in cameras.items()}
     _check(sources, config)
     known.check(list(sources))
@@ -80,12 +80,12 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
+    config = _by_labels(config)
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
-    images = replace(config.prepare, use_visual_odometry=any(drive.image_pairs for drive in drives[first]))
     for name, theirs in others:
         drives[name] = [
-            with_camera(drive, source, config.classes, images, progress)
+            with_camera(drive, source, config.classes, preparation_of(config), progress)
             for drive, source in zip(drives[first], theirs, strict=True)
         ]
     return drives
@@ -103,6 +103,7 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
+    config = _by_labels(config)
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -115,6 +116,11 @@ def calibrate_rig_prepared(
     # 4. What is known of the rig, where the estimates do not contradict it.
     after = adjusted(rig.marginal, rig.agreed)
     return rig.result(after, config)
+
+
+def _by_labels(config: CalibrationConfig) -> CalibrationConfig:
+    """The settings with method joint for auto: several cameras are calibrated by labels only."""
+    return replace(config, method="joint") if config.method == "auto" else config
 
 
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:
@@ -366,6 +372,12 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
     return angle * result.camera.fx
 
 
+_FROM_OTHERS = (
+    "its own images give no estimate: pose and time offset follow from the other cameras and what is known of
+    " "the rig"
+)
+
+
 def _camera_result(
     camera: _Camera,
     name: str,
@@ -382,6 +394,8 @@ def _camera_result(
     status: Status = "not_converged" if not_converged else "unobservable" if weak else "ok"
     gone = {f"{direction.sentence}: {direction.advice}" for direction in own.weak_directions}
     kept = tuple(reason for reason in own.reasons if reason not in gone)
+    if not own.frames_used and status == "ok":
+        kept = (_FROM_OTHERS, *kept)
     sentences = tuple(f"{direction.sentence}: {direction.advice}" for direction in weak)
     alone = {
         "T_camera_lidar": own.T_camera_lidar.matrix().tolist(),

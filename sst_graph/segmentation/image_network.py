@@ -67,14 +67,17 @@ class OnnxImageSegmenter:
             MissingDependencyError: onnxruntime is not installed.
         """
         self._network = OnnxNetwork(model.network)
-        shape = self._network.shape
         size = model.input.height, model.input.width
         if model.input.layout == "nchw":
-            self._network.check_input((1, 3, *size), "1 x 3 channels x height x width (layout: nchw)")
-            height, width = shape[2:]
+            layout = "1 x 3 channels x height x width (layout: nchw)"
+            _, channels, height, width = self._network.check_input((1, 3, *size), layout)
+            other = width
         else:
-            self._network.check_input((1, *size, 3), "1 x height x width x 3 channels (layout: nhwc)")
-            height, width = shape[1:3]
+            layout = "1 x height x width x 3 channels (layout: nhwc)"
+            _, height, width, channels = self._network.check_input((1, *size, 3), layout)
+            other = height
+        if channels is None and other == 3:
+            raise DataError(model.network, "its 3 channels elsewhere", layout)
         changes = {"width": size[1] or width, "height": size[0] or height}
         self._input = PictureInput(**{**vars(model.input), **changes})
         self.model = model

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, MissingDependencyError
-from sst_graph.files.reading import FileKind, read_file
+from sst_graph.files.reading import FileKind, digest_of_file
 
 NETWORK = FileKind("an ONNX network", 2**31)
 """Larger networks keep their weights in files of their own, for protobuf ends there."""
+_WEIGHTS = FileKind("weights of an ONNX network", 2**36)
 _DTYPES = {
     "tensor(float)": np.float32,
     "tensor(float16)": np.float16,
@@ -67,8 +68,8 @@ class OnnxNetwork:
         )
         self.outputs = tuple(one.name for one in self._session.get_outputs())
 
-    def check_input(self, expected: tuple[int | None, ...], layout: str) -> None:
-        """Require an input of a shape, where both know it.
+    def check_input(self, expected: tuple[int | None, ...], layout: str) -> tuple[int | None, ...]:
+        """The shape of the input, if it is the expected one where both know it.
 
         Args:
             layout: the shape in words, for errors.
@@ -81,6 +82,7 @@ class OnnxNetwork:
             a != b for a, b in sizes if a is not None and b is not None
         ):
             raise DataError(self.path, f"an input of {_shown(self.shape)}", f"{_shown(expected)}, {layout}")
+        return self.shape
 
     def run(self, values: NDArray[Any], place: str) -> dict[str, NDArray[Any]]:
         """Outputs by name.
@@ -127,10 +129,10 @@ def _runtime(path: Path) -> Any:
 
 
 def _digest(path: Path) -> str:
-    digest = hashlib.sha256(read_file(path, NETWORK))
+    digest = hashlib.sha256(digest_of_file(path, NETWORK))
     for beside in sorted(path.parent.glob(f"{_escaped(path.name)}?*")):
         if beside.is_file():
-            digest.update(beside.name.encode() + read_file(beside, FileKind("weights", 2**36)))
+            digest.update(beside.name.encode() + digest_of_file(beside, _WEIGHTS))
     return digest.hexdigest()
 
 

@@ -10,13 +10,13 @@ import pytest
 
 from sst_graph.association.edge_matching import (
     MatchConfig,
-    Motion,
     ScanWithImage,
     SilhouetteMatches,
     match_silhouettes,
     of_matched_objects,
 )
 from sst_graph.factors import PinholeCamera, RobustKernel, residuals
+from sst_graph.factors.motion import CameraTwist
 from sst_graph.features.lidar_edges import Boundaries, Edge
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.types import SemanticClass
@@ -25,7 +25,7 @@ VEHICLE = SemanticClass.VEHICLE
 CAMERA = PinholeCamera(300.0, 300.0, 160.3, 119.6, 320, 240)
 DEPTH, RADIUS_PX = 10.0, 60.2
 CTL = gtsam.Pose3(gtsam.Rot3.Ypr(0.2, -0.1, 0.3), np.array([0.3, -0.2, 0.1]))
-STILL = Motion(np.zeros(6), np.zeros(6))
+STILL = CameraTwist(np.zeros(6), np.zeros(6))
 KERNEL = RobustKernel("geman_mcclure", 5.0)
 
 
@@ -60,7 +60,7 @@ def match(
     cTl: gtsam.Pose3 = CTL,
     time_offset_s: float = 0.0,
     base_tau_s: float = 0.0,
-    motion: Motion = STILL,
+    motion: CameraTwist = STILL,
     bias_px: float = 0.0,
     config: MatchConfig | None = None,
 ) -> SilhouetteMatches:
@@ -91,7 +91,7 @@ def test_a_shift_shows_with_its_sign() -> None:
 
 def test_points_move_to_the_images_instant() -> None:
     # The camera moves right at 2 m/s; seen 0.1 s later the points are 6 px to the left of the disc.
-    motion = Motion(np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]), np.zeros(6))
+    motion = CameraTwist(np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]), np.zeros(6))
     for time_offset_s, base_tau_s, delays_s in ((0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.15, 0.0, 0.05)):
         points = replace(ring(), offsets_s=np.full(90, delays_s))
         found = match(points, time_offset_s=time_offset_s, base_tau_s=base_tau_s, motion=motion)

@@ -94,9 +94,8 @@ BAD = [
     (unlink("calib.txt"), r"calib\.txt: found no such file"),
     (unlink("times.txt"), r"times\.txt: found no such file"),
     (remove("velodyne"), r"velodyne: found no folder"),
-    (remove("labels"), r"labels: found no folder"),
     (remove("image_2"), r"image_2: found no folder"),
-    (remove("semantic_2"), r"semantic_2: found no folder"),
+    (emptied("labels"), r"labels: found no file that is named by its number"),
     (emptied("velodyne"), r"velodyne: found no file that is named by its number"),
     (emptied("image_2"), r"image_2: found no file that is named"),
     (text("times.txt", "0\n0.1\n0.2\n0.3\n"), r"times\.txt: found 4 stamps, expected 5, as there are frames"),
@@ -339,3 +338,14 @@ def test_missing_pictures_are_no_repeated_picture() -> None:
     masks = [np.full((6, 8), c, np.uint8) for c in (0, 1, 1)]
     a, b, c = (image_statistics(k, CameraImage(k, mask, NO_PICTURE)) for k, mask in enumerate(masks))
     assert a.picture_digest != b.picture_digest == c.picture_digest and not a.profiles
+
+
+def test_a_drive_without_any_labels_is_read(kitti_drive: Path) -> None:
+    shutil.rmtree(kitti_drive / "labels")
+    shutil.rmtree(kitti_drive / "semantic_2")
+    frame = open_source(kitti_drive)[0]
+    assert frame.scan is not None
+    assert frame.image is not None
+    assert not frame.scan.has_labels
+    assert not frame.image.has_mask
+    assert frame.image.has_picture

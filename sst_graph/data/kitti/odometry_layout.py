@@ -12,7 +12,10 @@ from pathlib import Path
 from sst_graph.data.arrays import listed, numbered_files
 from sst_graph.errors import ConfigError, DataError
 
-LAYOUT = "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, labels, image_2, semantic_2"
+LAYOUT = (
+    "KITTI odometry: PATH/sequences/NN with calib.txt, times.txt, velodyne, image_2; labels, "
+    "semantic_2 where there are any"
+)
 
 _PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -119,18 +122,18 @@ def image_times_path(folder: Path, camera: str) -> Path | None:
 def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> KittiFiles:
     """Files of a sequence, checked against each other and against the number of stamps.
 
-    A number that has neither a scan nor labels is a gap, and so is one with neither image nor mask. What
-    has lost its partner is left to :meth:`KittiFiles.missing`. Labels may go on after the last scan of
-    another ``cloud`` than "velodyne".
+    The folders of labels and of masks may be missing. A number that has neither a scan nor labels is a gap,
+    and so is one with neither image nor mask. What has lost its partner is left to
+    :meth:`KittiFiles.missing`. Labels may go on after the last scan of another ``cloud`` than "velodyne".
 
     Raises:
-        DataError: an empty or missing folder, a scan without its times, more or fewer frames than stamps,
-            no scan with labels, no picture with a mask.
+        DataError: an empty folder, no folder of scans or images, a scan without its times, more or fewer
+            frames than stamps, labels of no scan, masks of no picture.
     """
     scans = numbered_files(folder / cloud, (".bin",))
-    labels = numbered_files(folder / "labels", (".label",))
+    labels = _optional(folder / "labels", (".label",))
     images = numbered_files(folder / camera, _PICTURES)
-    masks = numbered_files(folder / camera.replace("image", "semantic"), (".png",))
+    masks = _optional(folder / camera.replace("image", "semantic"), (".png",))
     if counts.image_stamps is None:
         _check_stamps(folder / "times.txt", counts.stamps, {**scans, **images, **masks}, "frames")
     else:
@@ -139,8 +142,10 @@ def find_files(folder: Path, camera: str, cloud: str, counts: FrameCounts) -> Ki
         _check_stamps(times, counts.image_stamps, {**images, **masks}, "images")
     if cloud != "velodyne":
         labels = {k: path for k, path in labels.items() if k <= max(scans)}
-    _check_some_partner(scans, labels, folder / "labels")
-    _check_some_partner(images, masks, folder / camera.replace("image", "semantic"))
+    if labels:
+        _check_some_partner(scans, labels, folder / "labels")
+    if masks:
+        _check_some_partner(images, masks, folder / camera.replace("image", "semantic"))
     return KittiFiles(
         scans=scans,
         labels=labels,

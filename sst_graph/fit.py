@@ -1,0 +1,182 @@
+"""How a calibration fits its data, point by point: what a report draws.
+
+It stays in memory beside the result (:attr:`sst_graph.result.CalibrationResult.fit`); of it, only
+:class:`FitQuality` is written to calibration.json. Its size is bounded (:data:`MOST_POINTS`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+CLOSE_PX = 1.5
+"""A boundary point closer to its contour than this counts as close [px].
+
+Errors of good masks are about 1 px, and 0.3 deg are 3.8 px with KITTI's camera: at 1.5 px most points are
+close under the right calibration, and few under one that is 0.3 deg off."""
+
+MOST_POINTS = 30_000
+"""Most boundary points that are kept; with more, every second, third, ... is."""
+
+QUALITY = "fit_quality"
+"""Entry of a result's diagnostics."""
+
+
+@dataclass(frozen=True)
+class FitQuality:
+    """Shares of the boundary points that lie within :data:`CLOSE_PX` of their contour.
+
+    Attributes:
+        points: boundary points in view that have a contour of their class nearby.
+        share: of them, under the calibration.
+        share_at_start: under the calibration that the estimation started from; None without one.
+        attainable: what a perfect calibration would give with labels like these.
+    """
+
+    points: int
+    share: float
+    share_at_start: float | None
+    attainable: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """As an entry of the diagnostics."""
+        return {"within_px": CLOSE_PX, **asdict(self)}
+
+    @classmethod
+    def from_diagnostics(cls, diagnostics: Mapping[str, Any]) -> FitQuality | None:
+        """That of a result's diagnostics; None where there is none, or none that can be read."""
+        entry = diagnostics.get(QUALITY)
+        if not isinstance(entry, Mapping):
+            return None
+        points, start = entry.get("points"), entry.get("share_at_start")
+        share, attainable = entry.get("share"), entry.get("attainable")
+        if not isinstance(points, int) or isinstance(points, bool) or not 0 < points < 10**12:
+            return None
+        if not (_is_share(share) and _is_share(attainable) and (start is None or _is_share(start))):
+            return None
+        return cls(points, share, start, attainable)
+
+
+def _is_share(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value <= 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedFrame:
+    """A scan, its image, and the motion between them.
+
+    Attributes:
+        drive: name of the drive.
+        scan, image: index of the frame that each comes from.
+        base_tau_s: stamp of the image minus that of the scan [s].
+        c_twist, c_acceleration: (6,) of the camera at the image [rad/s, m/s], and its rate of change.
+    """
+
+    drive: str
+    scan: int
+    image: int
+    base_tau_s: float
+    c_twist: FloatArray
+    c_acceleration: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class PointResiduals:
+    """Boundary points, their contours and their residuals under the calibration.
+
+    Attributes:
+        frames: (n,) position of each point's frame in :attr:`Fit.frames`.
+        classes: (n,) of :class:`~sst_graph.types.SemanticClass`.
+        tracks: (n,) number of the object; the same in all frames of a drive, and in no other drive.
+        sides: (n,) 0 left, 1 right, 2 top, 3 bottom of the object.
+        lPs: (n, 3) in the LiDAR frame [m].
+        base_taus_s: (n,) stamp of the image minus the time of the point [s].
+        l_velocities: (n, 3) velocity over ground of the object, LiDAR frame [m/s].
+        pixels, normals: (n, 2) nearest point of the contour [px], and its outward unit normal.
+        residuals_px: (n,) signed distance to the contour, the mask bias of the class taken off [px].
+        sigmas_px: (n,) its standard deviation by mask and beam step [px].
+        weights: (n,) robust weight, 0 to 1.
+        J: (n, 7) derivative of the residual by extrinsic and time offset [px/rad, px/m, px/s].
+    """
+
+    frames: IntArray
+    classes: NDArray[np.uint8]
+    tracks: IntArray
+    sides: IntArray
+    lPs: FloatArray
+    base_taus_s: FloatArray
+    l_velocities: FloatArray
+    pixels: FloatArray
+    normals: FloatArray
+    residuals_px: FloatArray
+    sigmas_px: FloatArray
+    weights: FloatArray
+    J: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def take(self, index: IntArray | NDArray[np.bool_] | slice) -> PointResiduals:
+        """Some of the points, by position."""
+        return PointResiduals(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+@dataclass(frozen=True)
+class OuterIteration:
+    """One outer iteration of the solution.
+
+    Attributes:
+        kernel_px: scale of the robust kernel [px].
+        matches: number of matches.
+        cTl: extrinsic after it.
+        time_offset_s: (first) time offset after it [s].
+    """
+
+    kernel_px: float
+    matches: int
+    cTl: gtsam.Pose3
+    time_offset_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """Profile likelihood along one unknown: the frozen matches' cost, all other unknowns optimised again.
+
+    Attributes:
+        unknown: its number in the order of the covariance.
+        steps: (k,) from the estimate, rising, 0 among them [rad, m or s].
+        costs: (k,) beyond the least of them.
+        sigma: standard deviation by the curvature of this cost alone.
+    """
+
+    unknown: int
+    steps: FloatArray
+    costs: FloatArray
+    sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How a calibration fits its data.
+
+    Attributes:
+        frames: that have points.
+        points: with their residuals; a sample where there are more than :data:`MOST_POINTS`.
+        quality: shares of all points.
+        iterations: how the estimate was reached.
+        profiles: along each of the seven unknowns.
+    """
+
+    frames: tuple[MatchedFrame, ...]
+    points: PointResiduals
+    quality: FitQuality
+    iterations: tuple[OuterIteration, ...] = ()
+    profiles: tuple[Profile, ...] = ()

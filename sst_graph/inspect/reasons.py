@@ -1,0 +1,42 @@
+"""Reasons of a result in one short line each: what is wrong, and what to do about it.
+
+A reason is a sentence of clauses, "what: figures: remedy". A terminal shows the first and the last one; the
+report shows all.
+"""
+
+from __future__ import annotations
+
+import re
+
+from sst_graph.result import CalibrationResult
+
+MOST_LETTERS = 160
+"""Letters of a short reason: two lines of a terminal."""
+_PARENTHESES = re.compile(r" ?\([^()]*\)")
+_BREAK = re.compile(r":\s+")
+
+
+def short_reasons(result: CalibrationResult) -> tuple[str, ...]:
+    """Each reason of a result as one short line, the most important first."""
+    return tuple(dict.fromkeys(map(short_reason, result.reasons)))
+
+
+def short_reason(reason: str) -> str:
+    """What is wrong and what to do, without figures in parentheses and what stands between."""
+    clauses = [clause.strip() for clause in _BREAK.split(_PARENTHESES.sub("", reason.strip().rstrip(".")))]
+    name = clauses.pop(0) + ": " if len(clauses) > 1 and " " not in clauses[0] else ""
+    what, *rest = clauses
+    what = what.split(";")[0].strip()
+    if not rest:
+        return _cut(name + what, MOST_LETTERS)
+    remedy = rest[-1].split(";")[-1].strip()
+    room = max(MOST_LETTERS - len(remedy) - 2, MOST_LETTERS // 2)
+    what = _cut(name + what, room)
+    return f"{what}: {_cut(remedy, MOST_LETTERS - len(what) - 2)}"
+
+
+def _cut(text: str, most: int) -> str:
+    """The text, ended at a word where it is longer."""
+    if len(text) <= most:
+        return text
+    return text[: most - 1].rsplit(" ", 1)[0].rstrip(",;: ") + "…"

@@ -1,0 +1,133 @@
+"""How good a result is, in one sentence: what a person who uses it needs to know."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.fit import CLOSE_PX, FitQuality
+from sst_graph.inspect.reasons import short_reasons
+from sst_graph.result import CalibrationResult
+
+FloatArray = NDArray[np.float64]
+
+REACHES_M = (10.0, 30.0, 60.0)
+"""Depths for which the error in the picture is given [m]."""
+_PLACES = 3
+"""Places across and down the picture, its borders among them, at which the error is evaluated."""
+DRIVING_MPS = 10.0
+"""Speed, straight ahead, for which the error is given besides that at rest [m/s]."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """How far the cloud may sit from the picture: one standard deviation, worst direction, worst place in the
+    picture.
+
+    Attributes:
+        depth_m: depth of the point [m].
+        pixels: in the picture [px].
+        cm: across the line of sight [cm].
+        driving_pixels: in the picture at :data:`DRIVING_MPS`, where the time offset counts too [px].
+    """
+
+    depth_m: float
+    pixels: float
+    cm: float
+    driving_pixels: float
+
+
+def misfits(result: CalibrationResult) -> tuple[Misfit, ...]:
+    """At each of :data:`REACHES_M`, by the result's covariance."""
+    return tuple(_misfit(result, depth_m) for depth_m in REACHES_M)
+
+
+def largest_sigmas(result: CalibrationResult) -> tuple[float, float, float]:
+    """Rotation [deg], translation [cm] and time offset [ms]: one sigma of the worst axis of each."""
+    covariance = result.covariance
+    rotation, translation = (float(np.linalg.eigvalsh(covariance[a : a + 3, a : a + 3])[-1]) for a in (0, 3))
+    return float(np.degrees(np.sqrt(rotation))), 100.0 * np.sqrt(translation), 1e3 * covariance[6, 6] ** 0.5
+
+
+def verdict(result: CalibrationResult) -> str:
+    """The result in one or two sentences, without terms of the trade.
+
+    Standard deviations of the worst axis; a result that is not ok begins with what is wrong.
+    """
+    if result.status == "not_converged":
+        first = next(iter(short_reasons(result)), "the estimate contradicts the data")
+        return f"Do not use this calibration: {first}."
+    if result.status == "unobservable":
+        first = next(iter(short_reasons(result)), "the data leave a direction open")
+        return f"Not finished: {first}. Of the rest: {_known(result)}"
+    return f"Good to {_known(result)}"
+
+
+def quality_line(quality: FitQuality) -> str:
+    """Shares of close points, as a line for a terminal."""
+    start = (
+        "" if quality.share_at_start is None else f" (at the start {100.0 * quality.share_at_start:.0f} %)"
+    )
+    return (
+        f"{100.0 * quality.share:.0f} % of {quality.points} boundary points within {CLOSE_PX:g} px of the "
+        f"contour{start}; labels like these allow {100.0 * quality.attainable:.0f} %"
+    )
+
+
+def _known(result: CalibrationResult) -> str:
+    degrees, cm, ms = largest_sigmas(result)
+    middle = misfits(result)[1]
+    return (
+        f"{_figure(degrees)}° and {_figure(cm)} cm: at {middle.depth_m:.0f} m the cloud sits within "
+        f"{_figure(middle.pixels)} pixels of the picture. The time offset is known to {_figure(ms)} ms."
+    )
+
+
+def _misfit(result: CalibrationResult, depth_m: float) -> Misfit:
+    forward = result.T_camera_lidar.rotation().unrotate(np.array([0.0, 0.0, DRIVING_MPS]))
+    with_offset = np.vstack([np.eye(6), np.zeros(6)])  # at rest
+    driving = np.eye(6, 7)
+    driving[3:, 6] = -forward
+    found = []
+    for cP in _places(result.camera, depth_m):
+        cP_H_cTl = _cP_H_cTl(result.T_camera_lidar, cP)
+        J = result.camera.uv_H_cP(cP[None])[0] @ cP_H_cTl
+        across = np.eye(3) - np.outer(cP, cP) / float(cP @ cP)
+        rest = with_offset.T @ result.covariance @ with_offset
+        moving = driving @ result.covariance @ driving.T
+        found.append((_worst(J, rest), 100.0 * _worst(across @ cP_H_cTl, rest), _worst(J, moving)))
+    pixels, cm, driving_pixels = np.max(found, axis=0).tolist()
+    return Misfit(depth_m, pixels, cm, driving_pixels)
+
+
+def _places(camera: PinholeCamera, depth_m: float) -> list[FloatArray]:
+    """Points (3,) at a depth that are seen all over the picture [m]."""
+    us, vs = (np.linspace(0.0, size - 1.0, _PLACES) for size in (camera.width, camera.height))
+    return [
+        depth_m * np.array([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, 1.0])
+        for u in us
+        for v in vs
+    ]
+
+
+def _cP_H_cTl(cTl: gtsam.Pose3, cP: FloatArray) -> FloatArray:
+    """(3, 6) derivative of cP = cTl . lP by the extrinsic."""
+    x, y, z = cTl.transformTo(cP)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(cTl.rotation().matrix() @ np.hstack([-cross, np.eye(3)]))
+
+
+def _worst(J: FloatArray, covariance: FloatArray) -> float:
+    """Largest standard deviation of J x in any direction."""
+    return float(np.sqrt(max(0.0, np.linalg.eigvalsh(J @ covariance @ J.T)[-1])))
+
+
+def _figure(value: float) -> str:
+    """Two significant digits of small numbers, whole numbers above ten."""
+    if value == 0.0 or value >= 10.0:
+        return f"{value:.0f}"
+    return f"{value:.{max(0, 1 - int(np.floor(np.log10(value))))}f}"

@@ -1,0 +1,241 @@
+"""Close-ups of single objects: points, contour, and how far the calibration's uncertainty moves them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.factors import residuals
+from sst_graph.factors.matches import Alignment
+from sst_graph.features.mask_contour import ContourMap
+from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
+from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
+from sst_graph.report.html import jpeg, text
+from sst_graph.report.overlay import Placements, project_points
+from sst_graph.result import CalibrationResult
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+COUNT = 10
+"""Close-ups of a report."""
+_WORST = 3
+"""How many of them are those whose labels disagree most."""
+_LEAST_POINTS = 12
+"""Fewest boundary points of an object that is shown."""
+_MOST_ZOOM = 8
+_WIDTH, _HEIGHT = 480, 360
+"""Size of a close-up [px of the page]."""
+_MARGIN_PX = 8.0
+"""Picture around the object [px]."""
+_SIDE_NAMES = ("left", "right", "top", "bottom")
+
+
+@dataclass(frozen=True)
+class Detection:
+    """An object in one frame.
+
+    Attributes:
+        points: positions of its boundary points.
+        share: of the information that the whole drive gives, on average over the unknowns.
+        worst: whether it is shown because it disagrees.
+    """
+
+    points: IntArray
+    share: float
+    worst: bool = False
+
+
+def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[Detection]:
+    """Objects that determine most, then those that disagree most, each in one frame.
+
+    Args:
+        covariance: (7, 7) of the result.
+    """
+    leverages = _leverages(points, covariance)
+    total = max(float(leverages.sum()), 1e-12)
+    best: dict[int, Detection] = {}
+    for own in _by_detection(points):
+        found = Detection(own, float(leverages[own].sum()) / total)
+        track = int(points.tracks[own[0]])
+        if len(own) >= _LEAST_POINTS and (track not in best or found.share > best[track].share):
+            best[track] = found
+    ranked = sorted(best.values(), key=lambda one: -one.share)
+    strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
+
+    def misfit(one: Detection) -> float:
+        return -float(np.median(np.abs(points.residuals_px[one.points])))
+
+    return [*strong, *(Detection(one.points, one.share, True) for one in sorted(others, key=misfit)[:_WORST])]
+
+
+def close_ups(
+    fit: Fit, result: CalibrationResult, placements: Callable[[str], Placements], reader: DriveReader
+) -> list[str]:
+    """Figures of the telling objects; frames that cannot be read are left out.
+
+    Args:
+        placements: where the cloud of a drive is drawn, by its name.
+    """
+    found = []
+    for detection in telling_detections(fit.points, result.covariance):
+        points = fit.points.take(detection.points)
+        drawn = reader.frame(fit.frames[int(points.frames[0])])
+        if drawn is not None:
+            found.append(_close_up(drawn, points, detection, placements(drawn.frame.drive), result))
+    return found
+
+
+def _by_detection(points: PointResiduals) -> list[IntArray]:
+    order = np.lexsort((points.tracks, points.frames))
+    frames, tracks = points.frames[order], points.tracks[order]
+    new = (np.diff(frames, prepend=-1) != 0) | (np.diff(tracks, prepend=-1) != 0)
+    return np.split(order, np.flatnonzero(new)[1:])
+
+
+def _leverages(points: PointResiduals, covariance: FloatArray) -> FloatArray:
+    """(n,) part of each point in the information, in units of the result's."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(points.weights * ((points.J @ root) ** 2).sum(axis=1) / points.sigmas_px**2)
+
+
+def _close_up(
+    drawn: DrawnFrame,
+    points: PointResiduals,
+    detection: Detection,
+    placements: Placements,
+    result: CalibrationResult,
+) -> str:
+    uvs, _ = project_points(drawn, points, placements.after)
+    moves = _two_sigma_moves(drawn, points, placements, result)
+    crop = _Crop.around(uvs, drawn.image.pixels)
+    picture, zoom = crop.enlarged(drawn.image.pixels), crop.zoom
+    class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
+    r = points.residuals_px
+    size = float(np.median(np.abs(r)))
+    reach = float(np.median(np.linalg.norm(moves, axis=1)))
+    range_m = float(np.median(np.linalg.norm(points.lPs, axis=1)))
+    title = f"{class_name} at {range_m:.0f} m, {'disagrees most' if detection.worst else 'determines most'}"
+    sides = ", ".join(
+        f"{_SIDE_NAMES[side]} {np.mean(r[points.sides == side]):+.1f} px" for side in np.unique(points.sides)
+    )
+    caption = (
+        f"{size:.1f} px from the contour (median of {len(r)} points; {sides}), "
+        f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration moves "
+        f"it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:g} times enlarged; "
+        f"{100.0 * detection.share:.1f} % of the information."
+    )
+    width, height = picture.shape[1], picture.shape[0]
+    marks = [
+        f'<path class="contour" d="{_contour_path(drawn, SemanticClass(int(points.classes[0])), crop)}"/>'
+    ]
+    for (u, v), (du, dv), (x, y), value in zip(
+        crop.places(uvs), zoom * moves, crop.places(points.pixels), r, strict=True
+    ):
+        colour = "good" if abs(value) < CLOSE_PX else "bad"
+        marks.append(f'<path class="spread" d="M{u - du:.1f} {v - dv:.1f}L{u + du:.1f} {v + dv:.1f}"/>')
+        marks.append(f'<path class="residual" d="M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}"/>')
+        marks.append(
+            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3"><title>{value:+.1f}
+        px</title></circle>' )
+    return (
+        f'<figure><h3>{text(title)}</h3><svg class="closeup" viewBox="0 0 {width} {height}" role="img" '
+        f'aria-label="{text(title)}"><image width="{width}" height="{height}" href="{jpeg(picture)}"/>'
+        + "".join(marks)
+        + f"</svg><figcaption>{text(caption)}</figcaption></figure>"
+    )
+
+
+def _two_sigma_moves(
+    drawn: DrawnFrame, points: PointResiduals, placements: Placements, result: CalibrationResult
+) -> FloatArray:
+    """(n, 2) how two sigma of the calibration move each point, in the direction that moves the object
+    most."""
+    cTl, time_offset_s = placements.after
+    alignment = Alignment(
+        drawn.camera,
+        points.lPs,
+        points.base_taus_s,
+        points.pixels,
+        np.ones(()),
+        c_acceleration=drawn.frame.c_acceleration,
+        l_velocities=points.l_velocities,
+    )
+    _, J = residuals(alignment, cTl, time_offset_s, drawn.frame.c_twist)
+    A = np.stack([J[: len(points), :7], J[len(points) :, :7]], axis=1)
+    values, vectors = np.linalg.eigh(result.covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    reaches = A.reshape(-1, 7) @ root
+    _, directions = np.linalg.eigh(reaches.T @ reaches)
+    return np.asarray(2.0 * A @ (root @ directions[:, -1]))
+
+
+@dataclass(frozen=True)
+class _Crop:
+    """A part of a picture, enlarged.
+
+    Attributes:
+        left, top, right, bottom: columns and rows, the last ones not included.
+        zoom: enlargement.
+    """
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+    zoom: float
+
+    @classmethod
+    def around(cls, uvs: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
+        """Points (n, 2) with what is around them, in the shape of a close-up."""
+        rows, columns = pixels.shape[:2]
+        low, high = np.nanmin(uvs, axis=0) - _MARGIN_PX, np.nanmax(uvs, axis=0) + _MARGIN_PX
+        width, height = np.maximum(high - low, [_WIDTH / _MOST_ZOOM, _HEIGHT / _MOST_ZOOM])
+        width = max(width, height * _WIDTH / _HEIGHT)
+        size = np.array([width, width * _HEIGHT / _WIDTH])
+        first = np.floor(0.5 * (low + high) - 0.5 * size).astype(int)
+        last = np.ceil(0.5 * (low + high) + 0.5 * size).astype(int)
+        left, top = np.clip(first, 0, [columns - 2, rows - 2]).tolist()
+        right, bottom = np.clip(last, [left + 2, top + 2], [columns, rows]).tolist()
+        zoom = min(float(_MOST_ZOOM), _WIDTH / (right - left))
+        return cls(left, top, right, bottom, round(zoom, 2))
+
+    def enlarged(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        part = pixels[self.top : self.bottom, self.left : self.right]
+        size = round(self.zoom * part.shape[1]), round(self.zoom * part.shape[0])
+        way = cv2.INTER_CUBIC if self.zoom > 1.0 else cv2.INTER_AREA
+        return np.asarray(cv2.resize(part, size, interpolation=way), np.uint8)
+
+    def places(self, uvs: FloatArray) -> FloatArray:
+        """(n, 2) where pixels lie in the close-up."""
+        return np.asarray(self.zoom * (uvs + 0.5 - [self.left, self.top]))
+
+
+def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop) -> str:
+    """The contour within the crop, below a pixel, as the path of an SVG."""
+    contour = ContourMap.of(drawn.image.mask, semantic_class, drawn.image.pixels, valid=drawn.image.valid)
+    if contour is None:
+        return ""
+    rows, columns = contour.distance.shape
+    top, left = max(0, crop.top - contour.top), max(0, crop.left - contour.left)
+    bottom, right = min(rows, crop.bottom - contour.top), min(columns, crop.right - contour.left)
+    if bottom <= top or right <= left:
+        return ""
+    times = 4
+    part = contour.distance[top:bottom, left:right]
+    fine = cv2.resize(part, None, fx=times, fy=times, interpolation=cv2.INTER_LINEAR)
+    outlines, _ = cv2.findContours((fine < 0.0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_TC89_L1)
+    return "".join(
+        _path((outline[:, 0] + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop)
+        for outline in outlines
+    )
+
+
+def _path(uvs: FloatArray, crop: _Crop) -> str:
+    return "M" + "L".join(f"{u:.1f} {v:.1f}" for u, v in crop.places(uvs)) + "Z"

@@ -1,0 +1,77 @@
+"""A scan and an image that are drawn together: where points land under a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.data.frame_parts import RecentReader
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.motion import move_points
+from sst_graph.fit import MatchedFrame
+from sst_graph.types import CameraImage, Scan, Source
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class DrawnFrame:
+    """A scan, an image and the motion between them.
+
+    Attributes:
+        frame: what they are.
+        scan, image: themselves.
+        camera: of the image.
+    """
+
+    frame: MatchedFrame
+    scan: Scan
+    image: CameraImage
+    camera: PinholeCamera
+
+    def projected(self, cTl: gtsam.Pose3, time_offset_s: float) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) pixels of the scan's points, NaN behind the camera, and their depths (n,) [px], [m]."""
+        columns = np.ascontiguousarray(self.scan.points.T, dtype=np.float64)
+        taus = np.full(columns.shape[1], time_offset_s + self.frame.base_tau_s)
+        if self.scan.offsets_s is not None:
+            taus -= self.scan.offsets_s
+        motion = self.frame.c_twist, self.frame.c_acceleration
+        tau: FloatArray | float = float(taus[0]) if len(taus) and (taus == taus[0]).all() else taus
+        if isinstance(tau, np.ndarray):
+            motion = (
+                np.repeat(motion[0][:, None], len(taus), 1),
+                np.repeat(motion[1][:, None], len(taus), 1),
+            )
+        cPs = np.asarray(move_points(cTl, columns, tau, *motion).cPs).T
+        return self.camera.project(cPs), cPs[:, 2]
+
+
+class DriveReader:
+    """Scans and images of several drives, by the drive's name and the frame's number."""
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        self._drives = {source.name: RecentReader(source) for source in sources}
+        self._positions: dict[str, dict[int, int]] = {}
+
+    def frame(self, frame: MatchedFrame) -> DrawnFrame | None:
+        """Scan and image of a frame; None where one is not there, or without a picture."""
+        scan, image = self._at(frame.drive, frame.scan), self._at(frame.drive, frame.image)
+        if scan is None or image is None:
+            return None
+        drive = self._drives[frame.drive]
+        points, picture = drive.scan(scan), drive.image(image)
+        if points is None or picture is None or not picture.has_picture:
+            return None
+        return DrawnFrame(frame, points, picture, drive.source.camera)
+
+    def _at(self, name: str, number: int) -> int | None:
+        if name not in self._drives:
+            return None
+        if name not in self._positions:
+            drive = self._drives[name]
+            self._positions[name] = {drive.number(k): k for k in range(len(drive))}
+        return self._positions[name].get(number)

@@ -1,0 +1,84 @@
+"""Pieces of HTML. What comes from data goes through :func:`text`."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+_JPEG_QUALITY = 82
+
+
+def text(words: str) -> str:
+    """Words as text of a page, or of an attribute in double quotes."""
+    return html.escape(words.encode("utf-8", "backslashreplace").decode("utf-8"), quote=True)
+
+
+def section(name: str, title: str, *blocks: str) -> str:
+    """A part of the page under a heading; empty where it has no block."""
+    body = "\n".join(block for block in blocks if block)
+    return f'<section id="{name}">\n<h2>{text(title)}</h2>\n{body}\n</section>' if body else ""
+
+
+def paragraph(words: str, kind: str = "") -> str:
+    return f'<p class="{kind}">{text(words)}</p>' if kind else f"<p>{text(words)}</p>"
+
+
+def bullets(lines: Iterable[str]) -> str:
+    items = "".join(f"<li>{text(line)}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else ""
+
+
+def figure(content: str, title: str, caption: str) -> str:
+    """A chart or picture with its title above and, below, what to look for."""
+    return (
+        f"<figure><h3>{text(title)}</h3>{content}<figcaption>{text(caption)}</figcaption></figure>"
+        if content
+        else ""
+    )
+
+
+def grid(figures: Sequence[str]) -> str:
+    """Figures beside each other where there is room."""
+    shown = [one for one in figures if one]
+    return '<div class="grid">' + "\n".join(shown) + "</div>" if shown else ""
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+    """A table; the first cell of a row is its name."""
+    top = "".join(f'<th scope="col">{text(cell)}</th>' for cell in head)
+    body = "".join(
+        f'<tr><th scope="row">{text(first)}</th>'
+        + "".join(f"<td>{text(cell)}</td>" for cell in cells)
+        + "</tr>"
+        for first, *cells in rows
+    )
+    return (
+        f'<div class="scroll"><table class="{kind}"><thead><tr>{top}</tr></thead>'
+        f"<tbody>{body}</tbody></table></div>"
+    )
+
+
+def details(title: str, *blocks: str) -> str:
+    """Blocks that are shown on a click."""
+    body = "\n".join(block for block in blocks if block)
+    return f"<details><summary>{text(title)}</summary>{body}</details>" if body else ""
+
+
+def preformatted(words: str) -> str:
+    return f'<div class="scroll"><pre>{text(words)}</pre></div>'
+
+
+def jpeg(picture: NDArray[np.uint8]) -> str:
+    """A picture (h, w, 3) BGR as a data URI."""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    return "data:image/jpeg;base64," + base64.b64encode(bytes(data)).decode("ascii")
+
+
+def packed(array: NDArray[np.generic]) -> str:
+    """The bytes of an array, little-endian, in base64."""
+    return base64.b64encode(array.astype(array.dtype.newbyteorder("<")).tobytes()).decode("ascii")

@@ -1,0 +1,169 @@
+"""The same picture before and after, as data that the page's script draws."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.factors.motion import move_points
+from sst_graph.features.mask_contour import ContourMap
+from sst_graph.fit import PointResiduals
+from sst_graph.report.drawn_frame import DrawnFrame
+from sst_graph.report.html import jpeg, packed, text
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+
+_MOST_WIDTH = 1600
+"""Wider pictures are made smaller [px]."""
+_MOST_POINTS = 14_000
+"""Points of the scan that are drawn: with more, every second, third, ... is."""
+_HIDDEN = 65535
+"""Column and row of a point that is not in the picture."""
+_NO_RESIDUAL = -128
+_RESIDUAL_STEPS = 8.0
+"""Residuals are stored in steps of 1/8 px, up to 15.9 px."""
+_NAMES = {c: c.name.lower().replace("_", " ") for c in SemanticClass}
+
+
+@dataclass(frozen=True)
+class Placements:
+    """Where the cloud is drawn: before and after.
+
+    Attributes:
+        before: extrinsic and time offset [s] at the start; None without a start.
+        after: of the result.
+    """
+
+    before: tuple[gtsam.Pose3, float] | None
+    after: tuple[gtsam.Pose3, float]
+
+
+def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | None) -> str:
+    """A picture with the cloud of one frame, for the page's script.
+
+    Args:
+        points: the frame's boundary points, where residuals are known.
+    """
+    picture, scale = _fitted(drawn.image.pixels)
+    columns = _cloud(drawn, placements)
+    if points is not None and len(points):
+        columns = [
+            np.concatenate(pair) for pair in zip(columns, _boundary(drawn, placements, points), strict=True)
+        ]
+    before, after, depths, classes, before_px, after_px = columns
+    size = picture.shape[1], picture.shape[0]
+    data = {
+        "width": size[0],
+        "height": size[1],
+        "before": None if placements.before is None else _pixels(before, scale, size),
+        "after": _pixels(after, scale, size),
+        "depth": packed(np.clip(100.0 * depths, 0, 65534).astype(np.uint16)),
+        "class": packed(classes.astype(np.uint8)),
+        "residualBefore": packed(_steps(before_px)),
+        "residual": packed(_steps(after_px)),
+        "contours": _contours(drawn, classes_of(points), scale),
+        "classes": {
+            str(int(c)): _NAMES[c] for c in sorted(SemanticClass(int(c)) for c in np.unique(classes))
+        },
+    }
+    frame = drawn.frame
+    alt = f"Image {frame.image} of {frame.drive} with the LiDAR's points of scan {frame.scan} drawn over it"
+    return (
+        f'<div class="overlay"><canvas width="{size[0]}" height="{size[1]}" role="img"
+        aria-label="{text(alt)}">' f'</canvas><img hidden alt="" src="{jpeg(picture)}">'
+        f'<script type="application/json">{_in_script(data)}</script>'
+        f"<noscript>{text(alt)}: this picture needs JavaScript.</noscript></div>"
+    )
+
+
+def classes_of(points: PointResiduals | None) -> list[SemanticClass]:
+    """Classes that are matched; vehicles where no point says."""
+    if points is None or not len(points):
+        return [SemanticClass.VEHICLE]
+    return [SemanticClass(int(c)) for c in np.unique(points.classes)]
+
+
+def project_points(
+    drawn: DrawnFrame, points: PointResiduals, placement: tuple[gtsam.Pose3, float]
+) -> tuple[FloatArray, FloatArray]:
+    """(n, 2) pixels of boundary points of the frame, NaN behind the camera, and their depths (n,) [px],
+    [m]."""
+    cTl, time_offset_s = placement
+    n, frame = len(points), drawn.frame
+    twist, acceleration = (np.repeat(each[:, None], n, 1) for each in (frame.c_twist, frame.c_acceleration))
+    taus = time_offset_s + points.base_taus_s
+    columns = np.ascontiguousarray((points.lPs + taus[:, None] * points.l_velocities).T)
+    cPs = np.asarray(move_points(cTl, columns, taus, twist, acceleration).cPs).T
+    return drawn.camera.project(cPs), cPs[:, 2]
+
+
+_Columns = Sequence[NDArray[np.float64]]
+
+
+def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
+    """Pixels before and after, depths, classes and (no) residuals of points that are in one of the
+    pictures."""
+    after, depths = drawn.projected(*placements.after)
+    before = after if placements.before is None else drawn.projected(*placements.before)[0]
+    seen = np.flatnonzero(drawn.camera.in_image(after) | drawn.camera.in_image(before))
+    seen = seen[:: max(1, -(-len(seen) // _MOST_POINTS))]
+    seen = seen[np.argsort(-depths[seen])]
+    none = np.full(len(seen), np.nan)
+    return [before[seen], after[seen], depths[seen], drawn.scan.classes[seen].astype(np.float64), none, none]
+
+
+def _boundary(drawn: DrawnFrame, placements: Placements, points: PointResiduals) -> list[FloatArray]:
+    after, depths = project_points(drawn, points, placements.after)
+    before = after if placements.before is None else project_points(drawn, points, placements.before)[0]
+    # The contour stays, so the residual changes by the pixel's step across it.
+    change = ((before - after) * points.normals).sum(axis=1)
+    before_px = points.residuals_px + np.where(np.isfinite(change), change, np.inf)
+    return [before, after, depths, points.classes.astype(np.float64), before_px, points.residuals_px]
+
+
+def _fitted(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
+    scale = min(1.0, _MOST_WIDTH / pixels.shape[1])
+    if scale == 1.0:
+        return pixels, 1.0
+    size = round(scale * pixels.shape[1]), round(scale * pixels.shape[0])
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8), scale
+
+
+def _pixels(uvs: FloatArray, scale: float, size: tuple[int, int]) -> str:
+    """Columns, then rows, as fractions of the picture's size in 16 bit."""
+    places = (scale * (uvs + 0.5)) / size
+    outside = ~((places >= 0.0) & (places <= 1.0)).all(axis=1)
+    stored = np.where(outside[:, None], _HIDDEN, np.round(np.nan_to_num(places) * 65534.0).clip(0, 65535))
+    return packed(stored.astype(np.uint16).T.copy())
+
+
+def _steps(residuals_px: FloatArray) -> NDArray[np.int8]:
+    steps = np.clip(np.round(_RESIDUAL_STEPS * np.nan_to_num(residuals_px, posinf=1e3)), -127, 127)
+    return np.where(np.isnan(residuals_px), _NO_RESIDUAL, steps).astype(np.int8)
+
+
+def _contours(drawn: DrawnFrame, classes: Sequence[SemanticClass], scale: float) -> list[list[int]]:
+    """Outlines of the classes, column and row in turn [px of the drawn picture]."""
+    found = []
+    for c in classes:
+        contour = ContourMap.of(drawn.image.mask, c, drawn.image.pixels, valid=drawn.image.valid)
+        if contour is None:
+            continue
+        inside = (contour.distance < 0.0).astype(np.uint8)
+        outlines, _ = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_TC89_L1)
+        for outline in outlines:
+            places = scale * (outline[:, 0] + [contour.left + 0.5, contour.top + 0.5])
+            found.append(np.round(places).astype(int).reshape(-1).tolist())
+    return found
+
+
+def _in_script(data: object) -> str:
+    """JSON that cannot end the script it stands in."""
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,0 +1,280 @@
+"""The report's page, part by part: verdict, what to record next, pictures, residuals, likelihood,
+background."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from sst_graph.assumptions import ASSUMPTIONS
+from sst_graph.fit import CLOSE_PX, Fit, FitQuality, MatchedFrame
+from sst_graph.inspect.budget_text import budget_lines
+from sst_graph.inspect.inspection import Inspection, inspect_result
+from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
+from sst_graph.inspect.reasons import short_reason
+from sst_graph.inspect.report import Comparison, error_lines, summary
+from sst_graph.inspect.verdict import DRIVING_MPS, misfits, quality_line, verdict
+from sst_graph.report.close_ups import close_ups
+from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
+from sst_graph.report.html import (
+    bullets,
+    details,
+    grid,
+    paragraph,
+    preformatted,
+    section,
+    table,
+    text,
+)
+from sst_graph.report.overlay import Placements, overlay
+from sst_graph.report.residual_charts import residual_charts
+from sst_graph.report.uncertainty_charts import (
+    convergence_chart,
+    correlation_table,
+    ellipse_charts,
+    profile_charts,
+)
+from sst_graph.result import CalibrationResult
+from sst_graph.types import Source
+
+PICTURES = 3
+"""Pictures with the cloud, over all drives."""
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """What a report is made of.
+
+    Attributes:
+        result: with its fit, where the method measures it.
+        sources: the drives, read as for the calibration.
+        comparison: errors against what is known to be true, or None.
+        frames: to be drawn where the result has no fit.
+    """
+
+    result: CalibrationResult
+    sources: Sequence[Source]
+    comparison: Comparison | None = None
+    frames: Sequence[DrawnFrame] = ()
+
+
+def report_html(inputs: ReportInputs) -> str:
+    """The page: nothing in it is loaded from elsewhere.
+
+    Raises:
+        DataError: the drives cannot be read again.
+    """
+    result, reader = inputs.result, DriveReader(inputs.sources)
+    inspection = inspect_result(result)
+    body = [
+        _verdict(inputs),
+        _next(inspection),
+        _pictures(inputs, reader),
+        _close_ups(inputs, reader),
+        _residuals(result),
+        _likelihood(inspection),
+        _background(inputs, inspection),
+    ]
+    drives = ", ".join(sorted({frame.drive for frame in result.frames_used}))
+    title = f"Calibration of {result.camera_name}" + (f" from {drives}" if drives else "")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon"
+        href="data:,">\n'
+        f"<title>{text(title)}</title>\n<style>\n{_file('page.css')}</style>\n</head>\n<body>\n"
+        f"<h1>{text(title)}</h1>\n<main>\n" + "\n".join(body) + "\n</main>\n"
+    f"<script>\n{_file('page.js')}</script>\n</body>\n</html>\n" )
+
+
+def _file(name: str) -> str:
+    return files("sst_graph.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _verdict(inputs: ReportInputs) -> str:
+    result = inputs.result
+    quality = FitQuality.from_diagnostics(result.diagnostics)
+    rows = [
+        (
+            f"{one.depth_m:.0f} m",
+            f"{one.pixels:.2g} px",
+            f"{one.cm:.2g} cm",
+            f"{one.driving_pixels:.2g} px",
+        )
+        for one in misfits(result)
+    ]
+    head = (
+        "depth",
+        "in the picture",
+        "across the line of sight",
+        f"in the picture, driving at {DRIVING_MPS:g} m/s",
+    )
+    return section(
+        "verdict",
+        "Verdict",
+        f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
+        paragraph(
+            "All figures are one standard deviation, of the worst axis or direction and at the worst place in
+            the " "picture. About 19 times in 20 the error is below twice as much.",
+            "note",
+        ),
+        paragraph(quality_line(quality)[0].upper() + quality_line(quality)[1:] + "." if quality else ""),
+        table(head, rows, "numbers"),
+        bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
+        paragraph(f"These are the errors against {inputs.comparison.name}.", "note")
+        if inputs.comparison
+        else "",
+    )
+
+
+def _next(inspection: Inspection) -> str:
+    result = inspection.result
+    weak = [f"{one.sentence}: {one.advice}." for one in result.weak_directions]
+    nothing = f"No direction is past its limit. The weakest: {inspection.weakest.sentence}."
+    short = [short_reason(reason) + "." for reason in result.reasons]
+    advice = [] if inspection.plan is None else advice_sentences(inspection, inspection.plan)
+    return section(
+        "next",
+        "What is weak, and what to record next",
+        bullets(short) if short else paragraph(nothing),
+        details("The reasons in full", bullets([*result.reasons, *weak])) if result.reasons else "",
+        paragraph("What to record next, by the information that the frames of this record gave:")
+        if advice
+        else "",
+        bullets(one[0].upper() + one[1:] + "." for one in advice),
+    )
+
+
+def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
+    result, fit = inputs.result, inputs.result.fit
+    drawn = [*inputs.frames] if fit is None else _drawn(fit, reader)
+    pictures = []
+    for one in drawn:
+        points = None if fit is None else fit.points.take(_points_of(fit, one.frame))
+        pictures.append(overlay(one, _placements(result, one.frame.drive), points))
+    hint = (
+        "Drag in the picture or move the slider: left of the line the cloud as the start would place it, right
+        of it " "as the result does. Edges of vehicles, poles and kerbs must meet their picture. Coloured by
+        residual, only " "boundary points are shown: green ones lie within "
+        f"{CLOSE_PX:g} px of the contour of the labels (yellow)."
+    )
+    return section("pictures", "Before and after", paragraph(hint), *pictures) if pictures else ""
+
+
+def _drawn(fit: Fit, reader: DriveReader) -> list[DrawnFrame]:
+    """Frames spread over the drives, each with the most boundary points of its part."""
+    counts = np.bincount(fit.points.frames, minlength=len(fit.frames))
+    parts = np.array_split(np.arange(len(fit.frames)), min(PICTURES, len(fit.frames)))
+    found = (reader.frame(fit.frames[int(part[counts[part].argmax()])]) for part in parts)
+    return [one for one in found if one is not None]
+
+
+def _points_of(fit: Fit, frame: MatchedFrame) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return np.asarray(fit.points.frames == fit.frames.index(frame))
+
+
+def _placements(result: CalibrationResult, drive: str) -> Placements:
+    own = {one.drive: one.time_offset_s for one in result.drive_offsets}
+    after = result.T_camera_lidar, own.get(drive, result.time_offset_s)
+    before = None if result.initial is None else (result.initial, result.initial_time_offset_s)
+    return Placements(before, after)
+
+
+def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
+    fit = inputs.result.fit
+    if fit is None:
+        return ""
+    figures = close_ups(fit, inputs.result, lambda drive: _placements(inputs.result, drive), reader)
+    hint = (
+        "The objects that determine the calibration most, then those whose labels disagree with it most.
+        Yellow: " "contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the
+        object end, green " f"within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its
+        contour. Blue bars: how far " "±2 sigma of the calibration would move the point. Most points should
+    lie on the yellow line." )
+    return section("objects", "Ten telling objects", paragraph(hint), grid(figures)) if figures else ""
+
+
+def _residuals(result: CalibrationResult) -> str:
+    fit = result.fit
+    if fit is None:
+        return ""
+    return section(
+        "residuals",
+        "Residuals",
+        grid([*residual_charts(fit, result.camera), convergence_chart(fit.iterations, result)]),
+    )
+
+
+def _likelihood(inspection: Inspection) -> str:
+    result = inspection.result
+    fit = result.fit
+    if fit is None or not fit.profiles:
+        return ""
+    hint = (
+        "Profile likelihood: one unknown is moved by some sigmas, all others are optimised again on the
+        matches of " "the result. The dashed curve is the Gaussian of the result's sigma. The profile is
+        widened as a whole to the " "result's sigma, for errors of neighbouring matches are correlated. A
+        profile that leans or has a shoulder is " "a sigma that holds to one side only."
+    )
+    return section("likelihood", "Likelihood", paragraph(hint), grid(profile_charts(fit.profiles, result)))
+
+
+def _background(inputs: ReportInputs, inspection: Inspection) -> str:
+    result = inputs.result
+    sentences = [correlation_sentence(pair) for pair in inspection.strong[:MOST_SENTENCES]]
+    versions = [(name, number) for name, number in result.versions.items()]
+    return section(
+        "background",
+        "Numbers and background",
+        preformatted(summary(result, inputs.comparison)),
+        _assumptions(result),
+        "<h3>Where the sigmas come from</h3>" + preformatted("\n".join(budget_lines(result)))
+        if budget_lines(result)
+        else "",
+        "<h3>Correlations (about and along the LiDAR's axes)</h3>",
+        correlation_table(result),
+        bullets(sentences),
+        grid(ellipse_charts(result, inspection.strong)),
+        details("Settings", preformatted(json.dumps(_plain(result.config), indent=1))),
+        details("How the drives were read", preformatted(json.dumps(_plain(result.read_as), indent=1)))
+        if result.read_as
+        else "",
+        details("Versions", table(("package", "version"), versions)) if versions else "",
+    )
+
+
+def _assumptions(result: CalibrationResult) -> str:
+    """A row an assumption: what the data say of its parameter, and the verdict."""
+    stored = result.diagnostics.get("assumptions")
+    rows = [
+        _assumption_row(name, entry)
+        for name, entry in (stored.items() if isinstance(stored, Mapping) else ())
+        if name in ASSUMPTIONS and isinstance(entry, Mapping)
+    ]
+    if not rows:
+        return ""
+    return "<h3>Assumptions</h3>" + table(("assumption", "by the data", "considered", "verdict"), rows)
+
+
+def _assumption_row(name: str, entry: Mapping[str, Any]) -> tuple[str, str, str, str]:
+    unit = ASSUMPTIONS[name].unit
+    estimate, spread, considered = (entry.get(key) for key in ("estimate", "estimate_sigma", "sigma"))
+    tested = isinstance(estimate, int | float) and isinstance(spread, int | float)
+    found = ASSUMPTIONS[name].figure(float(estimate), float(spread)) if tested else "not tested"  # type: ignore[arg-type]
+    part = f"±{considered:.2g} {unit}".rstrip() if isinstance(considered, int | float) else ""
+    if entry.get("contradicted"):
+        return name, found, part, f"contradicted: {ASSUMPTIONS[name].remedy}"
+    return name, found, part, "holds" if tested else "its effect is in the sigmas"
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return value if value is None or isinstance(value, str | int | float | bool) else str(value)

@@ -1,0 +1,209 @@
+"""Charts of the residuals: by frame, by object, over the picture, over range and azimuth."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.fit import CLOSE_PX, Fit, PointResiduals
+from sst_graph.report.chart import Chart
+from sst_graph.report.html import figure
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_MOST_OBJECTS = 30
+"""Objects of the chart: those with the most points."""
+_LEAST_POINTS = 15
+"""Fewest points whose mean is drawn."""
+_BINS = 12
+_CELLS = 9, 4
+"""Cells of the vector field across and down the picture."""
+_LEAST_IN_CELL = 12
+_RIDGE = 0.05
+"""Share of a cell's points whose contours must run in another direction for a shift along them to count."""
+_MOST_PX = 6.0
+"""Residuals farther out are drawn at the border [px]."""
+
+
+def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
+    """All of them, as figures."""
+    points = fit.points
+    return [
+        _histogram(points),
+        _by_frame(fit),
+        _by_object(points),
+        _over_picture(points, camera),
+        _binned(points, np.linalg.norm(points.lPs, axis=1), "range [m]", "Over the range", _RANGE),
+        _binned(
+            points,
+            np.degrees(np.arctan2(points.lPs[:, 1], points.lPs[:, 0])),
+            "azimuth of the LiDAR [deg], left is positive",
+            "Over the azimuth",
+            _AZIMUTH,
+        ),
+    ]
+
+
+_RANGE = (
+    "Median and middle half of the residuals. A trend towards near points is an error of the translation; one
+    " "at all ranges alike is one of the rotation or of the masks."
+)
+_AZIMUTH = (
+    "Median and middle half of the residuals. Steps or slopes that are wider than the band speak of a wrong "
+    "focal length, a distortion or a sweep that is not compensated."
+)
+
+
+def _histogram(points: PointResiduals) -> str:
+    edges = np.arange(-_MOST_PX, _MOST_PX + 0.25, 0.5)
+    counts, _ = np.histogram(points.residuals_px, edges)
+    shares = 100.0 * counts / max(1, len(points))
+    chart = Chart(
+        (-_MOST_PX, _MOST_PX),
+        (0.0, 1.1 * float(shares.max())),
+        ("distance to the contour [px], outside is positive", "points [%]"),
+        "Histogram of the residuals",
+    )
+    middles = 0.5 * (edges[1:] + edges[:-1])
+    for close, colour in ((True, "good"), (False, "bad")):
+        chosen = (np.abs(middles) < CLOSE_PX) == close
+        titles = [
+            f"{m - 0.25:g} to {m + 0.25:g} px: {s:.1f} %"
+            for m, s in zip(middles[chosen], shares[chosen], strict=True)
+        ]
+        chart.bars(middles[chosen], shares[chosen], 0.46, colour, titles)
+    caption = (
+        f"One peak about 0, most of it within {CLOSE_PX:g} px (green), is what a right calibration shows."
+    )
+    return figure(chart.svg(), "Residuals of all boundary points", caption)
+
+
+def _by_frame(fit: Fit) -> str:
+    points, count = fit.points, len(fit.frames)
+    if count < 2:
+        return ""
+    close = np.full(count, np.nan)
+    for k, own in enumerate(_groups(points.frames, count)):
+        if len(own) >= _LEAST_POINTS:
+            close[k] = 100.0 * np.mean(np.abs(points.residuals_px[own]) < CLOSE_PX)
+    chart = Chart(
+        (0, count - 1),
+        (0.0, 100.0),
+        ("frame, in order", "close points [%]"),
+        "Share of close points by frame",
+    )
+    titles = [
+        f"{frame.drive}, frame {frame.scan}: {value:.0f} %"
+        for frame, value in zip(fit.frames, close, strict=True)
+    ]
+    known = np.flatnonzero(np.isfinite(close))
+    chart.level(100.0 * fit.quality.attainable, "what the labels allow")
+    chart.line(known, close[known], "a")
+    chart.dots(known, close[known], "a", titles=[titles[k] for k in known], size=3.0)
+    return figure(
+        chart.svg(),
+        "By frame",
+        f"Share of the points within {CLOSE_PX:g} px. A step that stays is a mount that moved or a lost image; "
+        "single dips are frames with poor labels.",
+    )
+
+
+def _by_object(points: PointResiduals) -> str:
+    tracks, numbers = np.unique(points.tracks, return_inverse=True)
+    groups = [own for own in _groups(numbers.reshape(-1), len(tracks)) if len(own) >= _LEAST_POINTS]
+    groups = sorted(groups, key=len, reverse=True)[:_MOST_OBJECTS]
+    if len(groups) < 2:
+        return ""
+    middles = [
+        float(np.average(points.residuals_px[own], weights=points.weights[own] + 1e-9)) for own in groups
+    ]
+    order = np.argsort(middles)
+    ranges = [float(np.median(np.linalg.norm(points.lPs[own], axis=1))) for own in groups]
+    titles = [f"{middles[k]:+.2f} px, {len(groups[k])} points, at {ranges[k]:.0f} m" for k in order]
+    most = max(1.0, float(np.abs(middles).max()))
+    chart = Chart(
+        (-0.5, len(groups) - 0.5),
+        (-1.1 * most, 1.1 * most),
+        ("object, from drawn too large to drawn too small", "mean residual [px]"),
+        "Mean residual of each object",
+    )
+    chart.level(0.0)
+    chart.bars(np.arange(len(groups)), np.array(middles)[order], 0.8, "a", titles)
+    return figure(
+        chart.svg(),
+        "By object",
+        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an object far out is "
+        "drawn badly, or moves.",
+    )
+
+
+def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
+    columns, rows = _CELLS
+    uvs = points.pixels
+    cell = (
+        (uvs * [columns / camera.width, rows / camera.height])
+        .astype(np.intp)
+        .clip(0, [columns - 1, rows - 1])
+    )
+    numbers = cell[:, 1] * columns + cell[:, 0]
+    places, shifts, titles = [], [], []
+    for own in _groups(numbers, columns * rows):
+        if len(own) < _LEAST_IN_CELL:
+            continue
+        n, w = points.normals[own], points.weights[own]
+        H = n.T @ (w[:, None] * n)
+        H += _RIDGE * np.trace(H) * np.eye(2)
+        shift = np.linalg.solve(H, n.T @ (w * points.residuals_px[own]))
+        places.append(uvs[own].mean(axis=0))
+        shifts.append(shift)
+        titles.append(f"{shift[0]:+.2f} px right, {shift[1]:+.2f} px down, {len(own)} points")
+    if not places:
+        return ""
+    at, by = np.array(places), np.array(shifts)
+    longest = max(0.5, float(np.linalg.norm(by, axis=1).max()))
+    enlarged = float(f"{0.09 * camera.width / longest:.1g}")
+    chart = Chart(
+        (0.0, camera.width),
+        (0.0, camera.height),
+        ("column [px]", "row [px]"),
+        "Mean shift of the points against the contours, over the picture",
+        down=True,
+        square=True,
+    )
+    chart.arrows(at[:, 0], at[:, 1], enlarged * by[:, 0], enlarged * by[:, 1], titles)
+    return figure(
+        chart.svg(),
+        "Over the picture",
+        f"Where the points lie against the contours, {enlarged:g} times enlarged (longest {longest:.2f} px). Short "
+        "arrows in all directions are good; a common direction, a swirl or a star is a calibration or a lens "
+        "that is wrong.",
+    )
+
+
+def _binned(points: PointResiduals, values: FloatArray, label: str, title: str, caption: str) -> str:
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, _BINS + 1)))
+    if len(edges) < 3 or len(values) < 4 * _LEAST_POINTS:
+        return ""
+    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, len(edges) - 2)
+    quartiles, middles = [], []
+    for own in _groups(numbers, len(edges) - 1):
+        if len(own) >= _LEAST_POINTS:
+            quartiles.append(np.quantile(points.residuals_px[own], (0.25, 0.5, 0.75)))
+            middles.append(float(np.median(values[own])))
+    low, middle, high = np.array(quartiles).T
+    most = min(_MOST_PX, max(2.0, 1.1 * float(np.abs([low, high]).max())))
+    chart = Chart(
+        (min(middles), max(middles)), (-most, most), (label, "residual [px]"), f"Residuals: {title}"
+    )
+    chart.level(0.0)
+    chart.band(middles, low, high, "a", "middle half")
+    chart.line(middles, middle, "a", "median")
+    return figure(chart.svg(), title, caption)
+
+
+def _groups(numbers: IntArray, count: int) -> list[IntArray]:
+    """Positions of each number 0 ... count - 1."""
+    order = np.argsort(numbers, kind="stable")
+    return np.split(order, np.searchsorted(numbers[order], np.arange(1, count)))

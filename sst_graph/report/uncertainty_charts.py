@@ -1,0 +1,115 @@
+"""Charts of the estimation: convergence, profile likelihood, ellipses, correlations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.fit import OuterIteration, Profile
+from sst_graph.inspect.inspection import HUMAN, NAMES, UNITS, Correlation, correlation_matrix
+from sst_graph.report.chart import Chart
+from sst_graph.report.html import figure, table, text
+from sst_graph.result import CalibrationResult
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_SIGMAS = 1e-3
+"""Distances below are drawn at it: they are nothing beside the uncertainty."""
+_SHORT = ("rot x", "rot y", "rot z", "x", "y", "z", "offset")
+_ELLIPSES = 3
+
+
+def convergence_chart(iterations: Sequence[OuterIteration], result: CalibrationResult) -> str:
+    """Distance to the last estimate, iteration by iteration; empty with fewer than two."""
+    if len(iterations) < 2:
+        return ""
+    last, sigmas = iterations[-1], np.sqrt(np.diag(result.covariance))
+    steps = np.array(
+        [
+            [*gtsam.Pose3.Logmap(last.cTl.between(one.cTl)), one.time_offset_s - last.time_offset_s]
+            for one in iterations
+        ]
+    )
+    parts = np.abs(steps) / np.maximum(sigmas, 1e-12)
+    curves = (("rotation", parts[:, :3].max(axis=1), "a"), ("translation", parts[:, 3:6].max(axis=1), "b"))
+    curves = (*curves, ("time offset", parts[:, 6], "c"))
+    logs = [np.log10(np.maximum(values, _LEAST_SIGMAS)) for _, values, _ in curves]
+    top = max(0.5, max(float(one.max()) for one in logs))
+    chart = Chart(
+        (1, len(iterations)),
+        (np.log10(_LEAST_SIGMAS), top),
+        ("outer iteration", "distance to the result, log10 of sigmas"),
+        "Distance to the result in each outer iteration",
+    )
+    chart.level(0.0, "one sigma")
+    for (name, _, colour), values in zip(curves, logs, strict=True):
+        chart.line(np.arange(1, len(iterations) + 1), values, colour, name)
+    return figure(
+        chart.svg(),
+        "Convergence",
+        "Each iteration matches again and solves. The curves should fall below one sigma and stay there.",
+    )
+
+
+def profile_charts(profiles: Sequence[Profile], result: CalibrationResult) -> list[str]:
+    """Likelihood along each unknown beside the Gaussian of the result's sigma."""
+    sigmas = np.sqrt(np.diag(result.covariance))
+    return [_profile(profile, float(sigmas[profile.unknown])) for profile in profiles]
+
+
+def _profile(profile: Profile, sigma: float) -> str:
+    unit, scale = UNITS[profile.unknown], float(HUMAN[profile.unknown])
+    # The cost counts matches as independent; the covariance knows better. Both get the same width.
+    tempered = profile.costs * (profile.sigma / sigma) ** 2
+    x = np.linspace(profile.steps[0], profile.steps[-1], 81)
+    chart = Chart(
+        (scale * profile.steps[0], scale * profile.steps[-1]),
+        (0.0, 1.05),
+        (f"{NAMES[profile.unknown]}, from the result [{unit}]", "likelihood, 1 at its best"),
+        f"Likelihood along {NAMES[profile.unknown]}",
+    )
+    chart.line(scale * x, np.exp(-0.5 * (x / sigma) ** 2), "muted", "Gaussian", dashed=True)
+    chart.line(scale * x, np.exp(-np.interp(x, profile.steps, tempered)), "a", "profile")
+    chart.dots(scale * profile.steps, np.exp(-tempered), "a")
+    title = NAMES[profile.unknown][0].upper() + NAMES[profile.unknown][1:]
+    return figure(chart.svg(), title, f"One sigma of the result: {scale * sigma:.2g} {unit}.")
+
+
+def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> list[str]:
+    """1 and 2 sigma of the pairs of unknowns that are correlated most."""
+    covariance = result.covariance * np.outer(HUMAN, HUMAN)
+    circle = np.stack([np.cos(t := np.linspace(0.0, 2.0 * np.pi, 91)), np.sin(t)])
+    found = []
+    for pair in pairs[:_ELLIPSES]:
+        i, j = pair.first, pair.second
+        values, vectors = np.linalg.eigh(covariance[np.ix_((i, j), (i, j))])
+        ellipse = vectors @ (np.sqrt(np.maximum(values, 0.0))[:, None] * circle)
+        reach = 2.2 * np.sqrt(covariance[[i, j], [i, j]])
+        chart = Chart(
+            (-reach[0], reach[0]),
+            (-reach[1], reach[1]),
+            (f"{NAMES[i]} [{UNITS[i]}]", f"{NAMES[j]} [{UNITS[j]}]"),
+            f"Ellipses of {NAMES[i]} and {NAMES[j]}, correlation {pair.value:+.2f}",
+        )
+        chart.line(*(2.0 * ellipse), "a", "2 sigma", dashed=True)
+        chart.line(*ellipse, "a", "1 sigma")
+        chart.dots([0.0], [0.0], "a")
+        caption = f"Correlation {pair.value:+.2f}: a narrow slanted ellipse is a pair that the data hardly separate."
+        found.append(figure(chart.svg(), f"{_SHORT[i]} against {_SHORT[j]}", caption))
+    return found
+
+
+def correlation_table(result: CalibrationResult) -> str:
+    """The seven by seven correlations, strong ones marked."""
+    values = correlation_matrix(result.covariance)
+    plain = table(
+        ("", *_SHORT),
+        [(name, *(f"{value:+.2f}" for value in row)) for name, row in zip(_SHORT, values, strict=True)],
+        "numbers",
+    )
+    for strong in {f"{value:+.2f}" for value in values.flat if 0.6 <= abs(value) < 1.0}:
+        plain = plain.replace(f"<td>{text(strong)}</td>", f'<td class="strong">{text(strong)}</td>')
+    return plain

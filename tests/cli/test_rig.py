@@ -1,0 +1,115 @@
+"""``sst-graph calibrate`` of several cameras, as a user calls it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.result import read_result
+from sst_graph.rig import read_rig
+
+
+@pytest.fixture(scope="module")
+def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stereo street on disk, in small pictures."""
+    folder = tmp_path_factory.mktemp("rig") / "street"
+    options = ["--seed", "2", "--frames", "24", "--time-offset", "0.05", "--stereo"]
+    small = ["width=621", "height=188", "azimuth_limit_deg=50", "vehicle_density=0.3"]
+    assert main(["simulate", str(folder), *options, *(f"--set={value}" for value in small)]) == 0
+    return folder
+
+
+def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rig"
+    options = ["--camera", "image_2", "image_3", "--rig", "dataset", "--one-trigger"]
+    code = main(["calibrate", str(street), *options, "--out", str(out)])
+    captured = capsys.readouterr()
+    assert (code, captured.err) == (0, "")
+    # 1. What is printed: each camera against the truth, and the pose between them.
+    assert captured.out.count("against the truth") == 2
+    assert "image_2 in image_3: " in captured.out and "-53." in captured.out
+    # 2. The files, read again.
+    rig = read_rig(out)
+    assert list(rig.cameras) == ["image_2", "image_3"] and rig.status == "ok"
+    for name in rig.cameras:
+        assert sorted(path.suffix for path in (out / name).iterdir()) == [".json", ".md", *[".png"] * 3]
+        assert rig[name] == read_result(out / name / "calibration.json")
+        assert rig[name].read_as["camera"] == name
+    document = json.loads((out / "rig.json").read_text())
+    assert document["known"]["one_trigger"] and len(document["covariance"]) == 14
+    assert document["diagnostics"]["known_poses"][0]["used"]
+    # 3. The other commands take each camera's folder.
+    picture = tmp_path / "overlay.png"
+    assert main(["overlay", str(out / "image_3"), str(street), "--out", str(picture)]) == 0
+    assert "read with --camera image_3" in capsys.readouterr().err
+    assert main(["export", str(out / "image_3"), "--to", "opencv"]) == 0
+    assert main(["inspect", str(out / "image_3"), "--json"]) == 0
+    # 4. A rig's result as the start of another one: cameras that it has not are named.
+    capsys.readouterr()
+    again = ["calibrate", str(street), "--init", str(out), "--camera", "image_2", "image_0"]
+    assert main([*again, "--out", str(tmp_path / "x")]) == 2
+    assert "has image_2, image_3" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (["--camera", "image_2", "image_7"], "camera 'image_7': "),
+        (["--camera", "image_2", "image_7"], "has image_2, image_3"),
+        (["--camera", "image_2", "image_2"], "--camera image_2: found twice"),
+        (["--camera", "image_2", "--rig", "dataset"], "--rig: means something for several cameras only"),
+        (["--one-trigger"], "--one-trigger: means something for several cameras only"),
+        (["--camera", "image_2", "image_3", "--rig-sigma", "1,1"], "--rig-sigma: expected with --rig"),
+        (["--camera", "image_2", "image_3", "--rig", "dataset", "--rig-sigma", "a"], "expected DEG,CM"),
+        (["--camera", "image_2", "image_3", "--rig", "none.yaml"], "none.yaml"),
+        (["--camera", "image_2", "image_3", "--method", "motion"], "need method joint, found motion"),
+    ],
+)
+def test_what_is_refused(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], found: str
+) -> None:
+    assert main(["calibrate", str(street), *options, "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert found in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_camchain_without_the_camera(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chain = tmp_path / "camchain.yaml"
+    chain.write_text(
+        "cam0: {rostopic: image_2}\ncam1: {T_cn_cnm1: [1], rostopic: /right}\n".replace("[1]", _UNIT)
+    )
+    options = ["--camera", "image_2", "image_3", "--rig", str(chain), "--out", str(tmp_path / "out")]
+    assert main(["calibrate", str(street), *options]) == 2
+    error = capsys.readouterr().err
+    assert "cam0 (image_2), cam1 (/right)" in error and "image_3" in error
+
+
+_UNIT = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+
+
+def test_a_camera_without_images(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is bad input, which is said before anything is calibrated."""
+    data = tmp_path / "street"
+    sequence = data / "sequences" / "00"
+    (sequence / "image_3").mkdir(parents=True)
+    for entry in (street / "sequences" / "00").iterdir():
+        if entry.name != "image_3":
+            (sequence / entry.name).symlink_to(entry)
+    code = main(["calibrate", str(data), "--camera", "image_2", "image_3", "--out", str(tmp_path / "out")])
+    assert code == 2 and "image_3" in capsys.readouterr().err
+
+
+def test_data_after_the_cameras(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """``--camera NAME DATA`` takes DATA for what it is; without any DATA the usage says so."""
+    out = str(tmp_path / "out")
+    assert main(["calibrate", "--camera", "image_7", str(street), "--out", out]) == 2
+    assert "camera 'image_7'" in capsys.readouterr().err
+    assert main(["calibrate", "--camera", "image_2", "image_3", "--out", out]) == 2
+    assert "required: DATA" in capsys.readouterr().err
