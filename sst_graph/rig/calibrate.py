@@ -66,7 +66,7 @@ def calibrate_rig(
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
     """
-    config, known = _by_labels(config or CalibrationConfig()), known or KnownRig()
+    config, known = config or CalibrationConfig(), known or KnownRig()
     sources = {name: as_sources(own) for name, own in cameras.items()}
     _check(sources, config)
     known.check(list(sources))
@@ -80,7 +80,6 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
-    config = _by_labels(config)
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
@@ -103,7 +102,6 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
-    config = _by_labels(config)
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -116,11 +114,6 @@ def calibrate_rig_prepared(
     # 4. What is known of the rig, where the estimates do not contradict it.
     after = adjusted(rig.marginal, rig.agreed)
     return rig.result(after, config)
-
-
-def _by_labels(config: CalibrationConfig) -> CalibrationConfig:
-    """The settings with method joint for auto: several cameras are calibrated by labels only."""
-    return replace(config, method="joint") if config.method == "auto" else config
 
 
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:
@@ -373,8 +366,8 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
 
 
 _FROM_OTHERS = (
-    "its own images give no estimate: pose and time offset follow from the other cameras and what is known of
-    " "the rig"
+    "its own images give no estimate: pose and time offset follow from the other cameras and what is known "
+    "of the rig"
 )
 
 
