@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import move_points
+from sst_graph.factors.motion import CameraTwist, move_points
 from sst_graph.fit import MatchedFrame
 from sst_graph.types import CameraImage, Scan, Source
 
@@ -46,7 +46,7 @@ class DrawnFrame:
                 np.repeat(motion[0][:, None], len(taus), 1),
                 np.repeat(motion[1][:, None], len(taus), 1),
             )
-        cPs = np.asarray(move_points(cTl, columns, tau, *motion).cPs).T
+        cPs = np.asarray(move_points(cTl, columns, tau, CameraTwist(*motion)).cPs).T
         return self.camera.project(cPs), cPs[:, 2]
 
 

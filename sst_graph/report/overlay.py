@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.motion import move_points
+from sst_graph.factors.motion import CameraTwist, move_points
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
@@ -96,10 +96,10 @@ def project_points(
     """(n, 2) pixels of boundary points of the frame, NaN behind the camera, and their depths (n,) [px], [m]."""
     cTl, time_offset_s = placement
     n, frame = len(points), drawn.frame
-    twist, acceleration = (np.repeat(each[:, None], n, 1) for each in (frame.c_twist, frame.c_acceleration))
+    rows = (np.repeat(each[:, None], n, 1) for each in (frame.c_twist, frame.c_acceleration))
     taus = time_offset_s + points.base_taus_s
     columns = np.ascontiguousarray((points.lPs + taus[:, None] * points.l_velocities).T)
-    cPs = np.asarray(move_points(cTl, columns, taus, twist, acceleration).cPs).T
+    cPs = np.asarray(move_points(cTl, columns, taus, CameraTwist(*rows)).cPs).T
     return drawn.camera.project(cPs), cPs[:, 2]
 
 
