@@ -156,6 +156,10 @@ def test_classes_come_back_from_their_stored_numbers() -> None:
     back, numbers = classes_of_points(semantic_kitti_of(points, instances))
     assert (back == points).all()
     assert (numbers == instances).all()
+    with pytest.raises(DataError, match="labels: found class 12, expected one that Cityscapes and Semantic"):
+        cityscapes_ids_of(np.array([1, SemanticClass.OBJECT], np.uint8))
+    with pytest.raises(DataError, match="labels: found class 12"):
+        semantic_kitti_of(np.array([1, SemanticClass.OBJECT], np.uint8), None)
 
 
 @pytest.mark.parametrize(
