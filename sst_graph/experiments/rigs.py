@@ -178,57 +178,45 @@ _SCALES = np.array([np.degrees(1.0), 100.0, 1000.0])
 
 
 def _sizes(errors: Sequence[FloatArray]) -> str:
-    """Medians (root mean squares) of rotation [deg], translation [cm] and time offset [ms], their lengths."""
+    """Medians of rotation [deg], translation [cm] and time offset [ms], their lengths."""
     lengths = np.array([[np.linalg.norm(e[:3]), np.linalg.norm(e[3:6]), abs(e[6])] for e in errors])
-    medians, squares = np.median(lengths, axis=0) * _SCALES, np.sqrt((lengths**2).mean(axis=0)) * _SCALES
-    forms = ("{:.3f} ({:.3f})", "{:.2f} ({:.2f})", "{:.2f} ({:.2f})")
-    return " | ".join(form.format(m, s) for form, m, s in zip(forms, medians, squares, strict=True))
-
-
-def _claimed(covariances: Sequence[FloatArray]) -> str:
-    """Medians of the claimed deviations, the lengths of those along the axes."""
-    sigmas = np.array([np.sqrt(np.diag(covariance)) for covariance in covariances])
-    lengths = [np.linalg.norm(sigmas[:, :3], axis=1), np.linalg.norm(sigmas[:, 3:6], axis=1), sigmas[:, 6]]
-    rotation, translation, late = np.median(np.array(lengths), axis=1) * _SCALES
-    return f"{rotation:.3f}, {translation:.2f}, {late:.2f}"
+    rotation, translation, late = np.median(lengths, axis=0) * _SCALES
+    return f"{rotation:.3f} | {translation:.2f} | {late:.2f}"
 
 
 _HEAD = (
-    "| {} | rotation [deg] | translation [cm] | time offset [ms] | claimed sigmas [deg, cm, ms] | NEES / 7 | ok |"
-    "\n|---|---|---|---|---|---|---|"
+    "| {} | rotation [deg] | translation [cm] | time offset [ms] | NEES / 7 | {} |\n|---|---|---|---|---|---|"
 )
 
 
-def _row(title: str, cameras: Sequence[tuple[FloatArray, FloatArray]], ok: str = "") -> str:
-    """A row from the errors (7,) and covariances (7, 7) of a camera on every street."""
-    errors, covariances = zip(*cameras, strict=True)
-    nees = np.mean([_nees(error, covariance) for error, covariance in cameras])
-    return f"| {title} | {_sizes(errors)} | {_claimed(covariances)} | {nees:.2f} | {ok} |"
-
-
 def _stereo_tables(streets: Sequence[_Street]) -> str:
-    rows = [_HEAD.format("camera, estimate")]
-    # The weaker camera claims the larger deviation of the translation.
-    weaker = [int(np.argmax([np.trace(_block(s.own, k)[3:6, 3:6]) for k in (0, 1)])) for s in streets]
-    for title, chosen in (("better known camera", [1 - w for w in weaker]), ("weaker camera", weaker)):
-        ok = sum(street.statuses[k] == "ok" for street, k in zip(streets, chosen, strict=True))
-        for words, name, counted in (
-            ("own images", "own", f"{ok} of {len(streets)}"),
-            ("known pose", "by_pose", ""),
-            ("known pose, one trigger", "by_trigger", ""),
+    rows = [_HEAD.format("camera, estimate", "ok")]
+    weaker = [int(np.trace(_block(s.own, 1)[:6, :6]) > np.trace(_block(s.own, 0)[:6, :6])) for s in streets]
+    for title, of_weaker in (("better known camera", False), ("weaker camera", True)):
+        chosen = [w if of_weaker else 1 - w for w in weaker]
+        for words, name in (
+            ("own images", "own"),
+            ("known pose", "by_pose"),
+            ("known pose, one trigger", "by_trigger"),
         ):
-            of_streets = [(getattr(s, name), s.truths, k) for s, k in zip(streets, chosen, strict=True)]
-            cameras = [(_errors(m, truths)[k], _block(m, k)) for m, truths, k in of_streets]
-            rows.append(_row(f"{title}, {words}", cameras, counted))
+            errors, nees = [], []
+            for street, k in zip(streets, chosen, strict=True):
+                marginal = getattr(street, name)
+                errors.append(_errors(marginal, street.truths)[k])
+                nees.append(_nees(errors[-1], _block(marginal, k)))
+            ok = sum(street.statuses[k] == "ok" for street, k in zip(streets, chosen, strict=True))
+            counted = f"{ok} of {len(streets)}" if name == "own" else ""
+            rows.append(f"| {title}, {words} | {_sizes(errors)} | {np.mean(nees):.2f} | {counted} |")
     return "\n".join([*rows, "", *_joint_table(streets, [(1, 0)])]) + "\n"
 
 
 def _surround_tables(streets: Sequence[_Street]) -> str:
-    rows = [_HEAD.format("camera")]
+    rows = [_HEAD.format("camera", "ok")]
     for k, name in enumerate(streets[0].own.names):
+        errors = [_errors(street.own, street.truths)[k] for street in streets]
+        nees = [_nees(e, _block(s.own, k)) for e, s in zip(errors, streets, strict=True)]
         ok = sum(street.statuses[k] == "ok" for street in streets)
-        cameras = [(_errors(s.own, s.truths)[k], _block(s.own, k)) for s in streets]
-        rows.append(_row(name, cameras, f"{ok} of {len(streets)}"))
+        rows.append(f"| {name} | {_sizes(errors)} | {np.mean(nees):.2f} | {ok} of {len(streets)} |")
     neighbours = [(k + 1, k) for k in range(len(streets[0].own.names) - 1)]
     return "\n".join([*rows, "", *_joint_table(streets, neighbours)]) + "\n"
 
