@@ -20,8 +20,8 @@ IntArray = NDArray[np.intp]
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].
 
-Errors of good masks are about 1 px, and 0.3 deg are 3.8 px with KITTI's camera: at 1.5 px most points are
-close under the right calibration, and few under one that is 0.3 deg off."""
+Errors of good masks are about 1 px, and 0.3 deg are 3.8 px with KITTI's camera: at 1.5 px most points are close
+under the right calibration, and few under one that is 0.3 deg off."""
 
 MOST_POINTS = 30_000
 """Most boundary points that are kept; with more, every second, third, ... is."""

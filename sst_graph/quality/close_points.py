@@ -1,10 +1,10 @@
 """Share of the boundary points that are close to their contour, and what a perfect calibration would give.
 
-A wrong calibration moves the outlines of all objects in a stretch of time alike: to first order it turns
-them. So the error of the labels alone is what remains after each stretch was turned by three angles of its
-own that fit it best. That also takes out errors that change with time, such as a mount that moved or a wrong
-time offset. What is left includes the labels' own scatter and is too small by the three angles that were
-fitted; residuals are enlarged for that.
+A wrong calibration moves the outlines of all objects in a stretch of time alike: to first order it turns them.
+So the error of the labels alone is what remains after each stretch was turned by three angles of its own that
+fit it best. That also takes out errors that change with time, such as a mount that moved or a wrong time
+offset. What is left includes the labels' own scatter and is too small by the three angles that were fitted;
+residuals are enlarged for that.
 """
 
 from __future__ import annotations

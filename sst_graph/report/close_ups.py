@@ -142,8 +142,8 @@ def _close_up(
         marks.append(f'<path class="spread" d="M{u - du:.1f} {v - dv:.1f}L{u + du:.1f} {v + dv:.1f}"/>')
         marks.append(f'<path class="residual" d="M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}"/>')
         marks.append(
-            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3"><title>{value:+.1f}
-        px</title></circle>' )
+            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3"><title>{value:+.1f} px</title></circle>'
+        )
     return (
         f'<figure><h3>{text(title)}</h3><svg class="closeup" viewBox="0 0 {width} {height}" role="img" '
         f'aria-label="{text(title)}"><image width="{width}" height="{height}" href="{jpeg(picture)}"/>'
@@ -155,8 +155,7 @@ def _close_up(
 def _two_sigma_moves(
     drawn: DrawnFrame, points: PointResiduals, placements: Placements, result: CalibrationResult
 ) -> FloatArray:
-    """(n, 2) how two sigma of the calibration move each point, in the direction that moves the object
-    most."""
+    """(n, 2) how two sigma of the calibration move each point, in the direction that moves the object most."""
     cTl, time_offset_s = placements.after
     alignment = Alignment(
         drawn.camera,

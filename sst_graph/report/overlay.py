@@ -76,8 +76,8 @@ def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | 
     frame = drawn.frame
     alt = f"Image {frame.image} of {frame.drive} with the LiDAR's points of scan {frame.scan} drawn over it"
     return (
-        f'<div class="overlay"><canvas width="{size[0]}" height="{size[1]}" role="img"
-        aria-label="{text(alt)}">' f'</canvas><img hidden alt="" src="{jpeg(picture)}">'
+        f'<div class="overlay"><canvas width="{size[0]}" height="{size[1]}" role="img" aria-label="{text(alt)}">'
+        f'</canvas><img hidden alt="" src="{jpeg(picture)}">'
         f'<script type="application/json">{_in_script(data)}</script>'
         f"<noscript>{text(alt)}: this picture needs JavaScript.</noscript></div>"
     )
@@ -93,8 +93,7 @@ def classes_of(points: PointResiduals | None) -> list[SemanticClass]:
 def project_points(
     drawn: DrawnFrame, points: PointResiduals, placement: tuple[gtsam.Pose3, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) pixels of boundary points of the frame, NaN behind the camera, and their depths (n,) [px],
-    [m]."""
+    """(n, 2) pixels of boundary points of the frame, NaN behind the camera, and their depths (n,) [px], [m]."""
     cTl, time_offset_s = placement
     n, frame = len(points), drawn.frame
     twist, acceleration = (np.repeat(each[:, None], n, 1) for each in (frame.c_twist, frame.c_acceleration))
@@ -108,8 +107,7 @@ _Columns = Sequence[NDArray[np.float64]]
 
 
 def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
-    """Pixels before and after, depths, classes and (no) residuals of points that are in one of the
-    pictures."""
+    """Pixels before and after, depths, classes and (no) residuals of points that are in one of the pictures."""
     after, depths = drawn.projected(*placements.after)
     before = after if placements.before is None else drawn.projected(*placements.before)[0]
     seen = np.flatnonzero(drawn.camera.in_image(after) | drawn.camera.in_image(before))

@@ -47,8 +47,8 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
 
 
 _RANGE = (
-    "Median and middle half of the residuals. A trend towards near points is an error of the translation; one
-    " "at all ranges alike is one of the rotation or of the masks."
+    "Median and middle half of the residuals. A trend towards near points is an error of the translation; one "
+    "at all ranges alike is one of the rotation or of the masks."
 )
 _AZIMUTH = (
     "Median and middle half of the residuals. Steps or slopes that are wider than the band speak of a wrong "
