@@ -133,6 +133,38 @@ NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
+class PixelStretch(ByValue):
+    """By how much the pixels of a resampled image are enlarged against those of the image it was made of.
+
+    With J the derivative of a pixel's place in the original by its place here, A = J^-1 J^-T: a distance d
+    across a contour of unit normal n is d / sqrt(n' A n) in the original.
+
+    Attributes:
+        squares: (rows, columns, 3) float32: xx, xy and yy of A at every ``step_px``-th pixel.
+        step_px: between two of them [px].
+    """
+
+    squares: NDArray[np.float32]
+    step_px: int
+
+    def across(self, uvs: FloatArray, normals: FloatArray) -> FloatArray:
+        """Stretch (n,) across contours at pixels uvs (n, 2) [px], unit normals (n, 2).
+
+        1 where pixels were made smaller: the pixels here then limit what is seen.
+        """
+        rows, columns = self.squares.shape[:2]
+        place = np.clip(uvs.T / self.step_px, 0.0, np.array([[columns - 1.0], [rows - 1.0]]))
+        first = np.minimum(place.astype(np.intp), np.array([[columns - 2], [rows - 2]]))
+        (a, b), (u, v) = (place - first)[:, :, None], first
+        xx, xy, yy = (
+            (1.0 - b) * ((1.0 - a) * self.squares[v, u] + a * self.squares[v, u + 1])
+            + b * ((1.0 - a) * self.squares[v + 1, u] + a * self.squares[v + 1, u + 1])
+        ).T
+        x, y = normals.T
+        return np.asarray(np.sqrt(np.maximum(xx * x * x + 2.0 * xy * x * y + yy * y * y, 1.0)))
+
+
+@dataclass(frozen=True, eq=False)
 class CameraImage(ByValue):
     """One camera image with its semantic mask.
 
@@ -143,6 +175,7 @@ class CameraImage(ByValue):
         instances: (h, w) uint16 instance number (0: none), or None.
         valid: (h, w) bool, False where the camera saw nothing (rectified from a lens that sees less), or None
             where it saw everything. Its border is no edge of anything; the mask is IGNORE beyond it.
+        stretch: of a rectified image, by how much its pixels are enlarged; None: they are as taken.
     """
 
     stamp_ns: int
@@ -150,6 +183,7 @@ class CameraImage(ByValue):
     pixels: NDArray[np.uint8]
     instances: NDArray[np.uint16] | None = None
     valid: NDArray[np.bool_] | None = None
+    stretch: PixelStretch | None = None
 
     @property
     def has_mask(self) -> bool:

@@ -88,7 +88,7 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         valid = _array(valid, size, f"{place}: valid", "the camera's size")
         if valid.dtype != np.bool_:
             raise DataError(f"{place}: valid", f"dtype {valid.dtype}", "bool")
-    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid)
+    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid, image.stretch)
 
 
 def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:
