@@ -1,10 +1,10 @@
 """Share of the boundary points that are close to their contour, and what a perfect calibration would give.
 
-A wrong calibration moves the outlines of all objects in a stretch of time alike: to first order it turns them.
-So the error of the labels alone is what remains after each stretch was turned by three angles of its own that
-fit it best. That also takes out errors that change with time, such as a mount that moved or a wrong time
-offset. What is left includes the labels' own scatter and is too small by the three angles that were fitted;
-residuals are enlarged for that.
+A wrong calibration moves the outlines of all objects in a stretch of time alike: to first order it turns
+them. So the error of the labels alone is what remains after each stretch was turned by three angles of its
+own that fit it best. That also takes out errors that change with time, such as a mount that moved or a wrong
+time offset. What is left includes the labels' own scatter and is too small by the three angles that were
+fitted; residuals are enlarged for that.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def attainable_share(
 
 def _best_turn(r: FloatArray, J: FloatArray) -> FloatArray:
     """(3,) rotation that robustly minimises r + J x [rad]."""
-    x = np.zeros(3)
+    x: FloatArray = np.zeros(3)
     for scale in _KERNELS_PX:
         w = RobustKernel("geman_mcclure", scale).weight(r + J @ x)
         H = J.T @ (w[:, None] * J)
         H += _RIDGE * np.trace(H) * np.eye(3)
-        x = np.linalg.solve(H, -J.T @ (w * r))
-    return np.asarray(x)
+        x = np.asarray(np.linalg.solve(H, -J.T @ (w * r)))
+    return x
 
 
 def _stretches(frames: IntArray, sides: IntArray) -> list[tuple[IntArray, int]]:

@@ -127,9 +127,9 @@ def _close_up(
     )
     caption = (
         f"{size:.1f} px from the contour (median of {len(r)} points; {sides}), "
-        f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration moves "
-        f"it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:g} times enlarged; "
-        f"{100.0 * detection.share:.1f} % of the information."
+        f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
+        f"moves it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:.2g} times "
+        f"enlarged; {100.0 * detection.share:.1f} % of the information."
     )
     width, height = picture.shape[1], picture.shape[0]
     marks = [
@@ -142,7 +142,8 @@ def _close_up(
         marks.append(f'<path class="spread" d="M{u - du:.1f} {v - dv:.1f}L{u + du:.1f} {v + dv:.1f}"/>')
         marks.append(f'<path class="residual" d="M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}"/>')
         marks.append(
-            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3"><title>{value:+.1f} px</title></circle>'
+            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3">'
+            f"<title>{value:+.1f} px</title></circle>"
         )
     return (
         f'<figure><h3>{text(title)}</h3><svg class="closeup" viewBox="0 0 {width} {height}" role="img" '
@@ -155,7 +156,7 @@ def _close_up(
 def _two_sigma_moves(
     drawn: DrawnFrame, points: PointResiduals, placements: Placements, result: CalibrationResult
 ) -> FloatArray:
-    """(n, 2) how two sigma of the calibration move each point, in the direction that moves the object most."""
+    """(n, 2) how two sigma of the calibration move each point, along what moves the object most [px]."""
     cTl, time_offset_s = placements.after
     alignment = Alignment(
         drawn.camera,
