@@ -193,7 +193,8 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
         "The objects that determine the calibration most, then those whose labels disagree with it most. "
         "Yellow: contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the "
         f"object end, green within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its "
-        "contour. Blue bars: how far ±2 sigma of the calibration would move the point. Most points should lie "
+        "contour. Blue bars: how far ±2 sigma of the calibration would move the point. Most points "
+        "should lie "
         "on the yellow line."
     )
     return section("objects", "Ten telling objects", paragraph(hint), grid(figures)) if figures else ""
@@ -218,7 +219,8 @@ def _likelihood(inspection: Inspection) -> str:
     hint = (
         "Profile likelihood: one unknown is moved by some sigmas, all others are optimised again on the "
         "matches of the result. The dashed curve is the Gaussian of the result's sigma. The profile is "
-        "widened as a whole to the result's sigma, for errors of neighbouring matches are correlated. A profile that "
+        "widened as a whole to the result's sigma, for errors of neighbouring matches are "
+        "correlated. A profile that "
         "leans or has a shoulder is a sigma that holds to one side only."
     )
     return section("likelihood", "Likelihood", paragraph(hint), grid(profile_charts(fit.profiles, result)))

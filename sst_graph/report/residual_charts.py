@@ -134,7 +134,8 @@ def _by_object(points: PointResiduals) -> str:
     return figure(
         chart.svg(),
         "By object",
-        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an object far out "
+        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an "
+        "object far out "
         "is drawn badly, or moves.",
     )
 
@@ -177,7 +178,8 @@ def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
         chart.svg(),
         "Over the picture",
         f"Where the points lie against the contours, {enlarged:g} times enlarged (longest {longest:.2f} px). "
-        "Short arrows in all directions are good; a common direction, a swirl or a star is a calibration or a lens "
+        "Short arrows in all directions are good; a common direction, a swirl or a star is a "
+        "calibration or a lens "
         "that is wrong.",
     )
 

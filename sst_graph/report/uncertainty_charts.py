@@ -100,7 +100,7 @@ def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> l
         chart.line(2.0 * ellipse[0], 2.0 * ellipse[1], "a", "2 sigma", dashed=True)
         chart.line(ellipse[0], ellipse[1], "a", "1 sigma")
         chart.dots([0.0], [0.0], "a")
-        caption = f"Correlation {pair.value:+.2f}: a narrow slanted ellipse is a pair that the data hardly separate."
+        caption = f"Correlation {pair.value:+.2f}: in a narrow slanted ellipse the two hardly separate."
         found.append(figure(chart.svg(), f"{_SHORT[i]} against {_SHORT[j]}", caption))
     return found
 
