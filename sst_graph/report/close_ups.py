@@ -25,10 +25,14 @@ IntArray = NDArray[np.intp]
 COUNT = 10
 """Close-ups of a report."""
 _WORST = 3
-"""How many of them are those whose labels disagree most."""
+"""How many of them are those whose labels agree least."""
+_PARTS = 3
+"""Parts of the record in each of which an object may be shown."""
 _LEAST_POINTS = 12
 """Fewest boundary points of an object that is shown."""
-_MOST_ZOOM = 8
+_MOST_ZOOM, _LEAST_ZOOM = 8, 4
+"""Enlargement: as much as the object leaves room for; of a large one, the part that determines most is
+shown."""
 _WIDTH, _HEIGHT = 480, 360
 """Size of a close-up [px of the page]."""
 _MARGIN_PX = 8.0
@@ -43,7 +47,7 @@ class Detection:
     Attributes:
         points: positions of its boundary points.
         share: of the information that the whole drive gives, on average over the unknowns.
-        worst: whether it is shown because it disagrees.
+        worst: whether it is shown because its labels agree least.
     """
 
     points: IntArray
@@ -52,20 +56,27 @@ class Detection:
 
 
 def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[Detection]:
-    """Objects that determine most, then those that disagree most, each in one frame.
+    """Objects that determine most, then those that agree least; with few of them, the same in other frames.
 
     Args:
         covariance: (7, 7) of the result.
     """
     leverages = _leverages(points, covariance)
     total = max(float(leverages.sum()), 1e-12)
-    best: dict[int, Detection] = {}
+    frames = 1 + int(points.frames.max(initial=0))
+    best: dict[tuple[int, int], Detection] = {}
     for own in _by_detection(points):
         found = Detection(own, float(leverages[own].sum()) / total)
-        track = int(points.tracks[own[0]])
-        if len(own) >= _LEAST_POINTS and (track not in best or found.share > best[track].share):
-            best[track] = found
-    ranked = sorted(best.values(), key=lambda one: -one.share)
+        track, frame = int(points.tracks[own[0]]), int(points.frames[own[0]])
+        key = track, frame * _PARTS // frames
+        if len(own) >= _LEAST_POINTS and (key not in best or found.share > best[key].share):
+            best[key] = found
+    seen: set[int] = set()
+    firsts, again = [], []
+    for (track, _), found in sorted(best.items(), key=lambda item: -item[1].share):
+        (again if track in seen else firsts).append(found)
+        seen.add(track)
+    ranked = [*firsts, *again]
     strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
 
     def misfit(one: Detection) -> float:
@@ -114,14 +125,15 @@ def _close_up(
 ) -> str:
     uvs, _ = project_points(drawn, points, placements.after)
     moves = _two_sigma_moves(drawn, points, placements, result)
-    crop = _Crop.around(uvs, drawn.image.pixels)
+    crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)
     picture, zoom = crop.enlarged(drawn.image.pixels), crop.zoom
     class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
     r = points.residuals_px
     size = float(np.median(np.abs(r)))
     reach = float(np.median(np.linalg.norm(moves, axis=1)))
     range_m = float(np.median(np.linalg.norm(points.lPs, axis=1)))
-    title = f"{class_name} at {range_m:.0f} m, {'disagrees most' if detection.worst else 'determines most'}"
+    why = "labels agree least" if detection.worst else "determines most"
+    title = f"{class_name} at {range_m:.0f} m, {why}"
     sides = ", ".join(
         f"{_SIDE_NAMES[side]} {np.mean(r[points.sides == side]):+.1f} px" for side in np.unique(points.sides)
     )
@@ -192,9 +204,14 @@ class _Crop:
     zoom: float
 
     @classmethod
-    def around(cls, uvs: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
-        """Points (n, 2) with what is around them, in the shape of a close-up."""
+    def around(cls, uvs: FloatArray, importance: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
+        """Points (n, 2) with what is around them, in the shape of a close-up; the most important (n,) of
+        many."""
         rows, columns = pixels.shape[:2]
+        room = 0.5 * np.array([_WIDTH, _HEIGHT]) / _LEAST_ZOOM - _MARGIN_PX
+        near = (np.abs(uvs[:, None] - uvs[None]) <= room).all(axis=2)
+        if not near.all():
+            uvs = uvs[near[int(np.argmax(near @ importance))]]
         low, high = np.nanmin(uvs, axis=0) - _MARGIN_PX, np.nanmax(uvs, axis=0) + _MARGIN_PX
         width, height = np.maximum(high - low, [_WIDTH / _MOST_ZOOM, _HEIGHT / _MOST_ZOOM])
         width = max(width, height * _WIDTH / _HEIGHT)
@@ -231,11 +248,17 @@ def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop)
     part = contour.distance[top:bottom, left:right]
     fine = cv2.resize(part, None, fx=times, fy=times, interpolation=cv2.INTER_LINEAR)
     outlines, _ = cv2.findContours((fine < 0.0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_TC89_L1)
-    return "".join(
-        _path((outline[:, 0] + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop)
-        for outline in outlines
-    )
+    found = []
+    for outline in outlines:
+        at = outline[:, 0]
+        cut = ((at <= 1) | (at >= np.array(fine.shape[1::-1]) - 2)).any(axis=1)
+        found.append(_path((at + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop, cut))
+    return "".join(found)
 
 
-def _path(uvs: FloatArray, crop: _Crop) -> str:
-    return "M" + "L".join(f"{u:.1f} {v:.1f}" for u, v in crop.places(uvs)) + "Z"
+def _path(uvs: FloatArray, crop: _Crop, cut: NDArray[np.bool_]) -> str:
+    """A closed line through points (n, 2), without what runs along the crop's border: cut (n,)."""
+    places, gone = crop.places(uvs), cut & np.roll(cut, 1)
+    moves = ["M" if skip or k == 0 else "L" for k, skip in enumerate(gone.tolist())]
+    line = "".join(f"{move}{u:.1f} {v:.1f}" for move, (u, v) in zip(moves, places, strict=True))
+    return line if gone[0] else f"{line}L{places[0, 0]:.1f} {places[0, 1]:.1f}"

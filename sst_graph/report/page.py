@@ -17,7 +17,7 @@ from sst_graph.inspect.inspection import Inspection, inspect_result
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import short_reason
 from sst_graph.inspect.report import Comparison, error_lines, summary
-from sst_graph.inspect.verdict import DRIVING_MPS, misfits, quality_line, verdict
+from sst_graph.inspect.verdict import DRIVING_MPS, figure, misfits, quality_line, verdict
 from sst_graph.report.close_ups import close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -101,9 +101,9 @@ def _verdict(inputs: ReportInputs) -> str:
     rows = [
         (
             f"{one.depth_m:.0f} m",
-            f"{one.pixels:.2g} px",
-            f"{one.cm:.2g} cm",
-            f"{one.driving_pixels:.2g} px",
+            f"{figure(one.pixels)} px",
+            f"{figure(one.cm)} cm",
+            f"{figure(one.driving_pixels)} px",
         )
         for one in misfits(result)
     ]
@@ -124,10 +124,8 @@ def _verdict(inputs: ReportInputs) -> str:
         ),
         paragraph(quality_line(quality)[0].upper() + quality_line(quality)[1:] + "." if quality else ""),
         table(head, rows, "numbers"),
+        paragraph(f"Errors against {inputs.comparison.name}:") if inputs.comparison else "",
         bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
-        paragraph(f"These are the errors against {inputs.comparison.name}.", "note")
-        if inputs.comparison
-        else "",
     )
 
 
@@ -190,14 +188,14 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
         return ""
     figures = close_ups(fit, inputs.result, lambda drive: _placements(inputs.result, drive), reader)
     hint = (
-        "The objects that determine the calibration most, then those whose labels disagree with it most. "
+        "The objects that determine the calibration most, then those whose labels agree with it least. "
         "Yellow: contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the "
         f"object end, green within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its "
         "contour. Blue bars: how far ±2 sigma of the calibration would move the point. Most points "
         "should lie "
         "on the yellow line."
     )
-    return section("objects", "Ten telling objects", paragraph(hint), grid(figures)) if figures else ""
+    return section("objects", "Telling objects", paragraph(hint), grid(figures)) if figures else ""
 
 
 def _residuals(result: CalibrationResult) -> str:

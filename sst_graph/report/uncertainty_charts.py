@@ -75,7 +75,9 @@ def _profile(profile: Profile, sigma: float) -> str:
         f"Likelihood along {NAMES[profile.unknown]}",
     )
     chart.line(scale * x, np.exp(-0.5 * (x / sigma) ** 2), "muted", "Gaussian", dashed=True)
-    chart.line(scale * x, np.exp(-np.interp(x, profile.steps, tempered)), "a", "profile")
+    # Interpolated as a root of the cost, which is a straight line where the profile is a Gaussian.
+    roots = np.interp(x, profile.steps, np.sign(profile.steps) * np.sqrt(tempered))
+    chart.line(scale * x, np.exp(-(roots**2)), "a", "profile")
     chart.dots(scale * profile.steps, np.exp(-tempered), "a")
     title = NAMES[profile.unknown][0].upper() + NAMES[profile.unknown][1:]
     return figure(chart.svg(), title, f"One sigma of the result: {scale * sigma:.2g} {unit}.")
