@@ -332,11 +332,11 @@ def match_edges(
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = paired.projected(paired.points.outward, cTl, time_offset_s)
-        feet, shares = _contours_or_gradients(
-            paired, uvs, tips - (uvs if shift is None else ideal[index]), kernel
-        )
+        ways = tips - (uvs if shift is None else ideal[index])
+        feet, shares = _contours_or_gradients(paired, uvs, ways, kernel)
     else:
-        feet, shares = nearest_contours(paired.contours, paired.spans, uvs), None
+        maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
+        feet, shares = nearest_contours(maps, paired.spans, uvs), None
     residuals = feet.distances + paired.repeated(paired.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
     paired, uvs, index = paired.take(near), uvs[near], index[near]

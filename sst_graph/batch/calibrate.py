@@ -10,10 +10,11 @@ import gtsam
 
 from sst_graph.batch.assumption_tests import examine_assumptions
 from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
+from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.batch.contradictions import find_contradictions
-from sst_graph.batch.edges_method import edges_method
 from sst_graph.batch.joint_report import (
     fit_of,
     joint_diagnostics,
@@ -69,8 +70,8 @@ def calibrate(
         DataError: the frames cannot be used.
         ConfigError: the settings contradict each other or the data.
     """
-    config = config or CalibrationConfig()
     sources = as_sources(frames)
+    config = with_method_for(config or CalibrationConfig(), sources)
     _check(sources, config)
     began = time.perf_counter()
     drives = prepare_drives(sources, config, progress)
@@ -87,6 +88,7 @@ def prepare_drives(
 ) -> list[Drive]:
     """Read each source once, and keep what the method needs; image features are tracked only where they are
     needed."""
+    config = with_method_for(config, sources)
     prepare = preparation_of(config)
     with_lower_edges = config.method == "joint" and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
@@ -119,7 +121,7 @@ def calibrate_prepared(
     progress: Progress | None = None,
 ) -> CalibrationResult:
     """:func:`calibrate` of drives from :func:`prepare_drives`, with the same settings."""
-    config = config or CalibrationConfig()
+    config = with_method_of(config or CalibrationConfig(), drives)
     guess = Guess(initial, initial_time_offset_s)
     method = _METHODS[config.method]
     return finished(lambda: method(drives, guess, config, progress), drives, guess, config)[0]
@@ -137,8 +139,7 @@ def finished(
     except EstimationError as error:
         result = guess_as_result(drives, guess, config, str(error))
     # Likely faults of the data become the first reasons.
-    if config.method not in _NO_LABELS:
-        result = with_causes(result, drives, guess, config)
+    result = with_causes(result, drives, guess, config)
     diagnostics = {**result.diagnostics, "seconds": {"estimate": time.perf_counter() - began}}
     left_out = {drive.name: drive.left_out.counts() for drive in drives if drive.left_out.counts()}
     if left_out:
@@ -223,7 +224,5 @@ _NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
 _TRACK_INTERVAL_S = 0.07
 """Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is
 known as well after 33 ms as after 100 ms, the rate of turn is not."""
-_NO_LABELS = ("edges",)
-"""Methods whose data nobody labelled, so that labels do not tell what is wrong."""
 _NEED_DEPTH = ("paper", "static")
 """Methods that take the metric scale of that velocity from LiDAR points."""

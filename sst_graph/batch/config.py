@@ -18,7 +18,7 @@ from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.odometry.lidar import LidarOdometryConfig
 from sst_graph.types import SemanticClass
 
-Method = Literal["joint", "paper", "static", "semalign", "motion", "edges"]
+Method = Literal["auto", "joint", "paper", "static", "semalign", "motion", "edges"]
 UseMotion = Literal["auto", "always", "never"]
 UseLowerEdges = Literal["auto", "always", "never"]
 
@@ -39,10 +39,10 @@ class CalibrationConfig(Settings):
     """
 
     method: Method = setting(
-        "joint",
-        doc="What estimates: joint (extrinsic and time offset), motion (LiDAR against visual "
-        "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign. "
-        "Change to compare, or where there are no labels.",
+        "auto",
+        doc="What estimates: auto (joint where both sensors have labels, else edges), joint (outlines of "
+        "labelled objects), edges (LiDAR edges against pictures, no labels), motion (LiDAR against visual "
+        "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
     )
     classes: tuple[SemanticClass, ...] = setting(
         (SemanticClass.VEHICLE,),

@@ -139,10 +139,11 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     _add_label_options(calibrate)
     calibrate.add_argument(
         "--method",
-        choices=("joint", "paper", "static", "semalign", "motion"),
-        help="joint: extrinsic and offset (default); paper: SST-Calib as printed; static: its first stage, "
-        "the extrinsic alone; semalign: sampled starts, the extrinsic alone; motion: LiDAR odometry against "
-        "visual odometry, no labels needed",
+        choices=("auto", "joint", "edges", "motion", "paper", "static", "semalign"),
+        help="auto: joint where both sensors have labels, else edges (default); joint: extrinsic and offset "
+        "by outlines of labelled objects; edges: the same by LiDAR edges and pictures, no labels needed; "
+        "motion: LiDAR odometry against visual odometry, no labels needed; paper: SST-Calib as printed; "
+        "static: its first stage, the extrinsic alone; semalign: sampled starts, the extrinsic alone",
     )
     calibrate.add_argument(
         "--init",

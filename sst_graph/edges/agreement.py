@@ -1,8 +1,8 @@
 """How well LiDAR edges agree with the gradients of the pictures, under one pose or under many.
 
-The score of a pose is the sum, over the boundary points in view, of the picture's strength across each point's
-outward direction, above what is usual nearby, blurred. A wrong pose has a score around 0: what a point meets by
-chance is as often below the usual as above it.
+The score of a pose is the sum, over the boundary points in view, of the picture's strength across each
+point's outward direction, above what is usual nearby, blurred. A wrong pose has a score around 0: what a
+point meets by chance is as often below the usual as above it.
 """
 
 from __future__ import annotations
@@ -78,8 +78,8 @@ class BlurredScore:
 
     Attributes:
         paired: the points, and the motion around their images.
-        lPs, tips: (n, 3) the points and those beyond them across the edge, moved to their images' instant, in the
-            LiDAR frame [m].
+        lPs, tips: (n, 3) the points and those beyond them across the edge, moved to their images' instant, in
+            the LiDAR frame [m].
         fields: (images, DIRECTIONS, h, w) blurred strengths of every so many pixels.
         images: (n,) which of them each point is compared with.
         every: pixels of the picture to one of the fields.

@@ -1,7 +1,7 @@
 """Starts for calibration without labels: rotations on a grid, scored by blurred edges, the best refined.
 
-A grid around what is known beforehand is scored under a wide blur; the best of it again on finer grids, under a
-narrower one. What motion alone says of rotation rules out poses that contradict it.
+A grid around what is known beforehand is scored under a wide blur; the best of it again on finer grids, under
+a narrower one. What motion alone says of rotation rules out poses that contradict it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 FloatMap = NDArray[np.float32]
 
 _STAGES = ((14.0, 1.0, 100), (8.0, 0.5, 40), (6.0, 0.25, 30))
-"""Blur [px] at an image width of 1242, step of the grid in units of the first one's, and how many poses go on."""
+"""Blur [px] at an image width of 1242, step of the grid in units of the first one's, and how many poses go
+on."""
 GRID_DEG = 1.2
 """Step of the first grid: with KITTI's camera, as many pixels as the first blur has [deg]."""
 _POINTS = 4000
@@ -79,8 +80,8 @@ class EdgeStart:
 
 
 def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
-    """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is in
-    view."""
+    """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is
+    in view."""
     edges = edges.thinned(_POINTS)
     first = _not_vetoed(_grid(region), region)
     candidates = [(number, first) for number in range(len(region.time_offsets_s))]

@@ -105,7 +105,7 @@ def run(config: AccuracyConfig, progress: Progress | None = None) -> str:
     Raises:
         ConfigError: the method aligns no time offset and no covariance can be judged.
     """
-    if config.calibration.method != "joint":
+    if config.calibration.method not in ("auto", "joint"):
         raise ConfigError(f"accuracy is about the joint method, found {config.calibration.method}")
     rows = [_HEADER, _RULE]
     for name in config.scenarios:

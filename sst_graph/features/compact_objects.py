@@ -132,8 +132,8 @@ def _near(
 
 
 _VEHICLE_LENGTH_M, _VEHICLE_WIDTH_M = 20.0, 5.0
-"""Largest extents of a vehicle's points along and across them, seen from above [m]: trailers, with what stands
-close beside."""
+"""Largest extents of a vehicle's points along and across them, seen from above [m]: trailers, with what
+stands close beside."""
 _VEHICLE_LEAST_M = 0.2
 """Least extent of a vehicle: of what is seen of it, partly hidden [m]."""
 _POLE_WIDTH_M, _POLE_HEIGHT_M = 0.6, 1.2

@@ -31,8 +31,8 @@ _PLANE_ROUNDS = 4
 _PLANE_BAND_M = 0.5
 """What lies this near a plane takes part in the next fit [m]."""
 _DEEPEST_M, _DEEPEST_SLOPE = 0.5, 0.05
-"""Ground lies no deeper below the plane than this at the sensor, and this much more a metre away from it: lower
-returns came by way of a mirror."""
+"""Ground lies no deeper below the plane than this at the sensor, and this much more a metre away from it:
+lower returns came by way of a mirror."""
 
 
 def heights_above_ground(points: FloatArray) -> FloatArray:

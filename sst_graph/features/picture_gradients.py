@@ -1,7 +1,7 @@
 """Edges of a picture in any direction, for boundary points of objects that nobody labelled.
 
-The change of colour across a direction, relative to what is usual nearby: a weak edge on a plain road tells as
-much as a strong one in foliage. It is bounded, so that no single edge decides, and its local mean is taken
+The change of colour across a direction, relative to what is usual nearby: a weak edge on a plain road tells
+as much as a strong one in foliage. It is bounded, so that no single edge decides, and its local mean is taken
 off, so that texture as such is worth nothing.
 """
 
@@ -92,8 +92,8 @@ class PictureGradients:
         return replace(self, strengths=store.put(self.strengths), usual=store.put(self.usual))
 
     def blurred(self, sigma_px: float, every: int) -> FloatMap:
-        """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels; both
-        sizes rounded up."""
+        """(DIRECTIONS, h / every, w / every) strengths above the usual, blurred, of every so many pixels;
+        both sizes rounded up."""
         size = -(-self.width // every), -(-self.height // every)
         parts = np.split(self.strengths, DIRECTIONS)
         usual = np.split(self.usual, DIRECTIONS)
@@ -129,7 +129,8 @@ def profiles(
     outward: FloatArray,
     ts: FloatArray,
 ) -> FloatMap:
-    """(m, n) strengths above the usual at m distances ``ts`` outward from pixels uvs (n, 2) of several pictures.
+    """(m, n) strengths above the usual at m distances ``ts`` outward from pixels uvs (n, 2) of several
+    pictures.
 
     Args:
         spans: where the pixels of each picture begin and end, one after the other.
@@ -168,8 +169,8 @@ def nearest_edges(
 ) -> GradientFeet:
     """Edges across the outward directions near pixels uvs (n, 2): their centres of mass under a Gaussian.
 
-    To match these again and again, and to minimise squared distances in between, climbs the sum of the strengths
-    under that Gaussian (mean shift; Comaniciu and Meer, PAMI 2002).
+    To match these again and again, and to minimise squared distances in between, climbs the sum of the
+    strengths under that Gaussian (mean shift; Comaniciu and Meer, PAMI 2002).
 
     Args:
         outward: (n, 2) unit vectors.

@@ -367,8 +367,8 @@ def _pixels(result: CalibrationResult, cTl: gtsam.Pose3) -> float:
 
 
 _FROM_OTHERS = (
-    "its own images give no estimate: pose and time offset follow from the other cameras and what is known of "
-    "the rig"
+    "its own images give no estimate: pose and time offset follow from the other cameras and what is known "
+    "of the rig"
 )
 
 

@@ -137,7 +137,7 @@ def test_bags(stereo: Path, bag: Path, form: str) -> None:
 def test_cameras_that_a_bag_has_not(bag: Path) -> None:
     with pytest.raises(DataError, match=r"no message of cam7 \(--camera\); there are .*/cam0/image_raw"):
         open_source(bag, camera="cam7", mask_topic="mask")
-    with pytest.raises(DataError, match="/cam0/masks"):
+    with pytest.raises(DataError, match="several topics of .*/cam0/image_raw .*/cam0/mask .*--camera"):
         open_source(bag, camera="cam0", mask_topic="masks")
     with pytest.raises(DataError, match="several topics"):
         open_source(bag, mask_topic="mask")

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import gtsam
 
 from sst_graph.batch import CalibrationConfig, calibrate
+from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import mention
@@ -39,7 +40,8 @@ def run(args: argparse.Namespace) -> int:
     with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
         read_as = options_of(args)
         sources = open_drives(args)
-        if config.method != "motion":
+        config = with_method_for(config, sources)
+        if config.method not in ("motion", "edges"):
             check_classes(sources, config.classes, args.classes)
         warn_of_other_pairs(args.init, read_as)
         initial, time_offset_s = starting_point(args.init, sources[0], args.camera)

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 _BY_LABELS = ("joint", "paper", "semalign", "track")
 _BY_MOTION = ("motion",)
+_BY_PICTURES = ("edges", "motion", "paper")
 _NO_SEARCH = ("paper", "semalign")
 """Methods that start from a given pose alone."""
-METHODS = ("joint", "motion", "paper", "semalign", "track")
+METHODS = ("joint", "edges", "motion", "paper", "semalign", "track")
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ def _missing(method: str, content: Content) -> list[str]:
         found.append("scans")
     if content.images < fewest:
         found.append("images")
-    if method in (*_BY_MOTION, "paper") and content.images and not content.pictures:
+    if method in _BY_PICTURES and content.images and not content.pictures:
         found.append("pictures")
     if method in _BY_LABELS:
         if content.scans and not content.point_classes:

@@ -1,4 +1,5 @@
-"""``--method edges``: LiDAR edges against gradients of the pictures, in the joint method's graph; no labels."""
+"""``--method edges``: LiDAR edges against gradients of the pictures, in the joint method's graph; no
+labels."""
 
 from __future__ import annotations
 
@@ -10,9 +11,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.covariance import edges_covariance
+from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons
 from sst_graph.batch.config import CalibrationConfig
-from sst_graph.batch.edges_covariance import edges_covariance
-from sst_graph.batch.edges_reasons import EdgeContrast, edge_contrast, edges_reasons
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -60,8 +61,8 @@ _OFFSETS_S = np.arange(-3, 4) * 0.1
 _MOVING_MPS = 0.2
 """Mean speed from which it counts as moving [m/s]: 100 ms are then 2 cm."""
 _MOTION_FLOOR = np.array([*np.radians([0.5] * 3), 0.1, 0.1, 0.1, 0.004])
-"""(7,) sigmas added to motion's as a factor: odometry errs by this much in ways that its covariance leaves out
-[rad, m, s]."""
+"""(7,) sigmas added to motion's as a factor: odometry errs by this much in ways that its covariance leaves
+out [rad, m, s]."""
 _TRANSLATION_SIGMA_M, _FREE_TRANSLATION_SIGMA_M = 0.1, 0.3
 """Prior sigma of the translation around the guess, or around 0 without one: unbounded, weak scenes run away
 along the road [m]."""
@@ -104,7 +105,7 @@ def edges_method(
     solution = _solved(problem, candidates, progress)
     # 4. Covariance, with what parts of the data disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
-    covariance, spread = edges_covariance(problem.whole, estimate)
+    covariance, spread = edges_covariance(estimate)
     # 5. Has it worked?
     contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
@@ -230,7 +231,7 @@ def _prior(centre: State, motion: MotionSolution | None, guessed: bool) -> gtsam
         mean = np.linalg.solve(total, information @ step)
         state = State(motion.state.cTl.retract(mean[:6]), (motion.state.time_offsets_s[0] + float(mean[6]),))
         information = total
-    return gaussian_factor(state, np.linalg.inv(information))
+    return gaussian_factor(state, np.asarray(np.linalg.inv(information), np.float64))
 
 
 def _starts(problem: _Problem) -> list[State]:

@@ -26,12 +26,14 @@ _TURN_DEG = (2.0, 4.0)
 """Their angles [deg]."""
 _APART_DEG = 1.0
 """Other solutions farther than this are other optima [deg]."""
-MIN_CONTRAST = 5.0
-"""Least height of the estimate's score above those of the random rotations, in their standard deviations."""
+MIN_CONTRAST = 7.0
+"""Least height of the estimate's score above those of the random rotations, in their standard deviations:
+right ones have 10 to 25, wrong pictures 3 to 5."""
 MIN_OVER_OTHER = 1.08
 """Least ratio of the estimate's score to that of the best other optimum."""
 MAX_MOTION_CHI2 = 33.0
-"""Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two contradict."""
+"""Chi-squared, of 4 (rotation and time offset), of the difference from motion beyond which the two
+contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
 MAX_AWAY_M = 0.35
@@ -97,7 +99,8 @@ def edges_reasons(
     if contrast.other > 0.0 and contrast.score < MIN_OVER_OTHER * contrast.other:
         reasons.append(
             "another pose agrees with the pictures almost as well "
-            f"(score {contrast.score:.0f} against {contrast.other:.0f}): give a closer guess or a richer drive"
+            f"(score {contrast.score:.0f} against {contrast.other:.0f}): "
+            "give a closer guess or a richer drive"
         )
     if motion is not None:
         step = difference(motion.state, solution.state)[[0, 1, 2, 6]]

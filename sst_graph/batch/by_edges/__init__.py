@@ -1,0 +1,1 @@
+"""Method edges: without labels, in the joint method's graph."""

@@ -1,0 +1,134 @@
+"""Calibration without labels: by edges, and the choice of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stored import simulated
+
+from sst_graph import CalibrationConfig, calibrate, open_source
+from sst_graph.batch.by_edges.choice import with_method_for
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.metrics import calibration_errors
+from sst_graph.simulator import SimulationConfig
+from sst_graph.types import CameraImage, Scan, SemanticClass
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+STREET = SimulationConfig(
+    seed=12,
+    frames=12,
+    width=621,
+    height=188,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.3,
+    time_offset_s=0.05,
+)
+AWAY = np.array([0.03, -0.04, 0.03, 0.05, -0.04, 0.06])
+
+
+def no_mask(image: CameraImage) -> CameraImage:
+    return dataclasses.replace(image, mask=np.full_like(image.mask, SemanticClass.IGNORE), instances=None)
+
+
+def no_classes(scan: Scan) -> Scan:
+    return dataclasses.replace(scan, classes=np.full_like(scan.classes, SemanticClass.IGNORE), instances=None)
+
+
+@cache
+def labelled() -> KeptDrive:
+    return KeptDrive.of(simulated(STREET), sweep="compensated")
+
+
+@cache
+def unlabelled() -> KeptDrive:
+    return labelled().with_images(no_mask).with_scans(no_classes)
+
+
+def test_auto_takes_labels_where_both_sensors_have_some() -> None:
+    config = CalibrationConfig()
+    assert config.method == "auto"
+    drives = {
+        "joint": [labelled()],
+        "edges": [unlabelled(), labelled().with_images(no_mask), labelled().with_scans(no_classes)],
+    }
+    for method, sources in drives.items():
+        for source in sources:
+            assert with_method_for(config, [source]).method == method
+    assert with_method_for(config, [labelled(), unlabelled()]).method == "edges"
+    chosen = CalibrationConfig(method="joint")
+    assert with_method_for(chosen, [unlabelled()]) is chosen
+
+
+@pytest.fixture(scope="module")
+def result():  # type: ignore[no-untyped-def]
+    return calibrate(unlabelled(), unlabelled().truth.cTl.retract(AWAY))  # type: ignore[union-attr]
+
+
+def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def]
+    truth = unlabelled().truth
+    assert truth is not None
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
+    assert result.method == "edges" and result.config["method"] == "edges"
+    assert result.status == "ok"
+    assert errors.qad_deg < 0.4 and errors.atd_m < 0.06
+    assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.01
+    assert errors.nees is not None and errors.nees.joint < 3.0 * 7
+
+
+def test_stored_labels_are_not_used(result) -> None:  # type: ignore[no-untyped-def]
+    """By edges, a drive with labels and one without give the same result."""
+    truth = labelled().truth
+    assert truth is not None
+    other = calibrate(labelled(), truth.cTl.retract(AWAY), CalibrationConfig(method="edges"))
+    assert result.T_camera_lidar.equals(other.T_camera_lidar, 1e-9)
+    assert result.time_offset_s == pytest.approx(other.time_offset_s, abs=1e-9)
+
+
+def test_pictures_of_another_street_are_refused() -> None:
+    other = simulated(dataclasses.replace(STREET, seed=77))
+    pictures = {frame.image.stamp_ns: frame.image.pixels for frame in other if frame.image is not None}
+
+    def exchanged(image: CameraImage) -> CameraImage:
+        return dataclasses.replace(image, pixels=pictures[image.stamp_ns])
+
+    wrong = unlabelled().with_images(exchanged)
+    assert wrong.truth is not None
+    result = calibrate(wrong, wrong.truth.cTl)
+    assert result.status != "ok"
+    assert any("agree hardly better" in reason for reason in result.reasons)
+
+
+def test_without_a_guess_and_without_motion_nothing_is_claimed() -> None:
+    short = dataclasses.replace(unlabelled(), frames=unlabelled().frames[:2])
+    result = calibrate(short, None)
+    assert result.status == "unobservable"
+    assert "a start is needed" in result.reasons[0]
+
+
+@pytest.mark.drives
+@pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared")
+@pytest.mark.parametrize(
+    ("name", "shift", "deg", "metres", "seconds"),
+    [("stop", 1, 0.2, 0.03, 0.01), ("parked", 1, 0.2, 0.05, 0.012)],
+)
+def test_real_drives_without_label_files(
+    name: str, shift: int, deg: float, metres: float, seconds: float, tmp_path: Path
+) -> None:
+    """Only clouds, pictures, stamps and intrinsics are there."""
+    stored = DATA / f"kitti_2011_09_26_{name}" / "sequences" / "00"
+    bare = tmp_path / "sequences" / "00"
+    bare.mkdir(parents=True)
+    for part in ("velodyne", "image_2", "times.txt", "calib.txt"):
+        (bare / part).symlink_to(stored / part)
+    drive = open_source(tmp_path, image_shift=shift)
+    assert drive.truth is not None
+    start = drive.truth.cTl.retract(np.array([*np.radians([3.0, -4.0, 2.5]), 0.06, -0.08, 0.05]))
+    result = calibrate(drive, start)
+    assert result.method == "edges" and result.status == "ok"
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    assert errors.qad_deg < deg and errors.atd_m < metres
+    assert errors.time_offset_s is not None and abs(errors.time_offset_s) < seconds

@@ -1,0 +1,70 @@
+"""Edges of pictures in given directions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sst_graph.features.picture_gradients import (
+    DIRECTIONS,
+    PictureGradients,
+    direction_numbers,
+    nearest_edges,
+)
+
+
+def step_picture(angle: float, place: float = 0.0) -> np.ndarray:
+    """(120, 160, 3) two colours, apart by a line through the centre, ``place`` px along its normal's
+    angle."""
+    v, u = np.mgrid[:120, :160].astype(float)
+    along = (u - 80.0) * np.cos(angle) + (v - 60.0) * np.sin(angle) - place
+    share = np.clip(along + 0.5, 0.0, 1.0)[..., None]
+    return np.rint((1.0 - share) * [60, 80, 100] + share * [160, 120, 140]).astype(np.uint8)
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0, 200.0])
+@pytest.mark.parametrize("away", [-2.0, 0.0, 1.5])
+def test_the_centre_of_an_edge(degrees: float, away: float) -> None:
+    """A window that is wide compared with the edge has its mass at the edge, drawn a little to its middle."""
+    angle = np.radians(degrees)
+    outward = np.array([[np.cos(angle), np.sin(angle)]])
+    gradients = PictureGradients.of(step_picture(angle))
+    pixels = np.array([[80.0, 60.0]]) + away * outward
+    found = nearest_edges([gradients], [(0, 1)], pixels, outward, 6.0)
+    assert found.valid[0]
+    # Seen from outside, the edge lies inward by as much.
+    assert found.distances[0] == pytest.approx(away, abs=0.25)
+    np.testing.assert_allclose(found.feet[0], [80.0, 60.0], atol=0.25)
+
+
+def test_no_edge_along_its_own_direction_or_on_plain_ground() -> None:
+    gradients = PictureGradients.of(step_picture(0.0))
+    pixels, outward = np.array([[80.0, 60.0], [30.0, 60.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
+    found = nearest_edges([gradients], [(0, 2)], pixels, outward, 3.0)
+    assert not found.valid.any()
+
+
+def test_texture_is_worth_nothing_on_average() -> None:
+    """The local mean is taken off: a wrong pose gains nothing by foliage."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(0, 255, (240, 320, 3)).astype(np.uint8)
+    field = PictureGradients.of(noise).blurred(6.0, 2)
+    step = PictureGradients.of(step_picture(0.0)).blurred(6.0, 2)
+    assert abs(float(field[:, 20:-20, 20:-20].mean())) < 0.03
+    assert float(np.abs(field[:, 20:-20, 20:-20]).max()) < 0.5 * float(step[0].max())
+
+
+def test_directions_are_those_of_lines() -> None:
+    angles = np.arange(2 * DIRECTIONS) * np.pi / DIRECTIONS
+    numbers = direction_numbers(np.stack([np.cos(angles), np.sin(angles)], axis=1))
+    assert numbers.tolist() == [*range(DIRECTIONS), *range(DIRECTIONS)]
+
+
+def test_no_edge_where_the_lens_ends() -> None:
+    valid = np.ones((120, 160), np.bool_)
+    valid[:, 80:] = False
+    picture = step_picture(0.0)
+    found = nearest_edges(
+        [PictureGradients.of(picture, valid)], [(0, 1)], np.array([[79.0, 60.0]]), np.array([[1.0, 0.0]]), 2.0
+    )
+    assert not found.valid[0]
