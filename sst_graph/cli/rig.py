@@ -94,7 +94,9 @@ def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
         mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))
         for name, own_folder in folder_names(results).items():
             (folder / own_folder).mkdir()
-            names = write_calibration(folder / own_folder, results[name], sources[name], against[name])
+            names = write_calibration(
+                folder / own_folder, results[name], sources[name], against[name], not args.no_report
+            )
             written += [f"{own_folder}/{file}" for file in names]
         (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
     mention(f"{'wrote':<15} {args.out}: {RIG_NAME}, {', '.join(written)}")
