@@ -33,7 +33,8 @@ CLASSES = (
 )
 """What the outputs mean; all other classes are OTHER."""
 PICTURE = PictureInput(width=640, height=192)
-RANGE_VIEW = RangeView(width=1024, height=64, remission_range=255.0)
+RANGE_VIEW = RangeView(width=1024, height=64, std=(12.32, 11.47, 6.91, 0.86, 1e6))
+"""Simulated scans have no remission, or 0 where they are read from files: networks are to see neither."""
 PICTURE_WIDTHS, RANGE_WIDTHS = (1, 2, 4, 8, 16, 32), (1, 2, 4, 8)
 _HIDDEN = (64, 32)
 _OPSET = 17
@@ -86,7 +87,7 @@ def write_scan_network(streets: Sequence[Source], folder: Path, fit: Fit | None 
     path = folder / "scan.yaml"
     path.write_text(
         f"network: scan.onnx\nclasses: {_class_table()}\nwidth: {RANGE_VIEW.width}\n"
-        f"height: {RANGE_VIEW.height}\nfov_up: 3\nfov_down: -25\nremission_range: 255\n"
+        f"height: {RANGE_VIEW.height}\nfov_up: 3\nfov_down: -25\nstd: {list(RANGE_VIEW.std)}\n"
     )
     return path
 

@@ -55,9 +55,8 @@ if TYPE_CHECKING:
         stacked,
         weighted_residuals,
     )
-    from .between import Between
     from .camera import MIN_DEPTH_M, PinholeCamera
-    from .camera_motion import camera_motion_factor
+    from .camera_motion import Between, camera_motion_factor
     from .camera_pose import camera_pose_factor
     from .condensed import condense
     from .custom.cloning import PackedGraph, clone_factor, clone_graph, rekeyed
@@ -148,9 +147,8 @@ _MODULES = {
         "Alignment GroupedBias LinearTerm alignment_cost frame_factor pixel_to_point_factor "
         "point_to_pixel_factor residuals silhouette_factor stacked weighted_residuals"
     ),
-    "between": "Between",
     "camera": "MIN_DEPTH_M PinholeCamera",
-    "camera_motion": "camera_motion_factor",
+    "camera_motion": "Between camera_motion_factor",
     "camera_pose": "camera_pose_factor",
     "condensed": "condense",
     "custom.cloning": "PackedGraph clone_factor clone_graph rekeyed",

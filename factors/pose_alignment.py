@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .alignment import FrameResidual, GroupedBias, Quantities, frame_residual, image_factor
 from .arguments import described
-from .between import Between
+from .camera_motion import Between
 from .condensed import condense
 from .custom.variables import Argument, Variables, Vector, number_or_key, pose_or_key
 from .errors import FactorError

@@ -18,8 +18,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from sst_graph.errors import DataError
 
@@ -80,7 +81,7 @@ def digest_of_file(path: str | Path, kind: FileKind) -> bytes:
 
 
 @contextmanager
-def _opened(path: str | Path, kind: FileKind) -> Iterator[BinaryIO]:
+def _opened(path: str | Path, kind: FileKind) -> Iterator[BufferedReader]:
     """A regular file of at most ``kind.max_bytes``, open to be read; errors, also of reading it, are ours."""
     try:
         _require_regular(os.stat(path), path, kind)

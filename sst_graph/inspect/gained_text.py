@@ -19,7 +19,6 @@ _NOTHING = {
     "paper": "every matched pixel counts as independent, in the frame and beside its neighbours",
     "static": "every matched pixel counts as independent, in the frame and beside its neighbours",
     "semalign": "every matched pixel counts as independent, in the frame and beside its neighbours",
-    "edges": "soft matches follow the pose, so that a frame's information is not that of its matches",
     "track": "this tracker followed a drift, or found no start: what a frame brings fades again",
 }
 

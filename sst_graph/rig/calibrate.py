@@ -21,6 +21,7 @@ from sst_graph.covariance.observability import open_directions
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import ConfigError
+from sst_graph.fit import QUALITY
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.result import CalibrationResult, Status
 from sst_graph.rig.adjustment import (
@@ -66,7 +67,7 @@ def calibrate_rig(
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
     """
-    config, known = _by_labels(config or CalibrationConfig()), known or KnownRig()
+    config, known = config or CalibrationConfig(), known or KnownRig()
     sources = {name: as_sources(own) for name, own in cameras.items()}
     _check(sources, config)
     known.check(list(sources))
@@ -80,7 +81,6 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
-    config = _by_labels(config)
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
@@ -103,7 +103,6 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
-    config = _by_labels(config)
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -116,11 +115,6 @@ def calibrate_rig_prepared(
     # 4. What is known of the rig, where the estimates do not contradict it.
     after = adjusted(rig.marginal, rig.agreed)
     return rig.result(after, config)
-
-
-def _by_labels(config: CalibrationConfig) -> CalibrationConfig:
-    """The settings with method joint for auto: several cameras are calibrated by labels only."""
-    return replace(config, method="joint") if config.method == "auto" else config
 
 
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:
@@ -403,6 +397,7 @@ def _camera_result(
         "covariance": own.covariance.tolist(),
         "status": own.status,
     }
+    diagnostics = {key: value for key, value in own.diagnostics.items() if key != QUALITY}
     return replace(
         own,
         T_camera_lidar=cTl,
@@ -412,5 +407,6 @@ def _camera_result(
         camera_name=name,
         reasons=(*wrong, *kept, *sentences),
         weak_directions=weak,
-        diagnostics={**own.diagnostics, "by_own_images": alone},
+        diagnostics={**diagnostics, "by_own_images": alone},
+        fit=None,  # of the estimate by its own images
     )

@@ -22,8 +22,8 @@ from sst_graph.association.edge_matching import MatchConfig
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
-from sst_graph.factors.between import Between
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.factors.camera_motion import Between
 from sst_graph.factors.pose_alignment import pose_alignment_factor
 from sst_graph.factors.reprojection import residuals
 from sst_graph.factors.robust import RobustKernel

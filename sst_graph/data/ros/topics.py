@@ -55,7 +55,7 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
     images = {
         n: t for n, t in filled.items() if named is None or (n.rpartition("/")[2] != named and n != named)
     }
-    image = _one(path, images, *_image_name(options, images), kinds)
+    image = _image(path, images, options, kinds)
     if named is not None:
         name = named if named.startswith("/") else f"{_namespace(image.name)}/{named}"
         mask = _named(path, filled, name, kinds, "--mask-topic")
@@ -68,17 +68,15 @@ def choose_topics(path: Path, topics: Mapping[str, Topic], options: SourceOption
     )
 
 
-def _image_name(options: SourceOptions, images: Mapping[str, Topic]) -> tuple[str | None, str]:
-    """Topic of the images that the options name, if any, and the option: of a camera's namespace the only one
-    that is no copy."""
-    if options.image_topic is not None or options.camera == SourceOptions().camera:
-        return options.image_topic, "--image-topic"
-    inside = [n for n, t in images.items() if _namespace(n) == "/" + options.camera.strip("/")]
-    plain = [n for n in inside if images[n].type == IMAGE] or [
-        n for n in inside if images[n].type == COMPRESSED and not n.endswith("/compressedDepth")
-    ]
-    known = options.camera in images or len(plain) != 1
-    return (options.camera if known else plain[0]), "--camera"
+def _image(path: Path, images: Mapping[str, Topic], options: SourceOptions, types: tuple[str, ...]) -> Topic:
+    """The images that the options name by their topic, or by the camera: a topic, or its namespace."""
+    camera = options.camera
+    if options.image_topic is not None or camera == SourceOptions().camera:
+        return _one(path, images, options.image_topic, "--image-topic", types)
+    inside = {n: t for n, t in images.items() if _namespace(n) == "/" + camera.strip("/")}
+    if camera in images or not inside:
+        return _named(path, images, camera, types, "--camera")
+    return _one(path, inside, None, "--camera", types)
 
 
 def _one(
