@@ -17,6 +17,7 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import (
@@ -106,6 +107,8 @@ def edges_method(
     # 4. Covariance, with what parts of the data disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
     covariance, spread = edges_covariance(estimate)
+    sweeps = sweep_effects(calibration, solution, covariance)
+    covariance = covariance + sweeps.covariance
     # 5. Has it worked?
     contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
@@ -114,7 +117,7 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        reasons,
+        (*reasons, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
     )
