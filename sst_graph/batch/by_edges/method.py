@@ -17,6 +17,7 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
+from sst_graph.batch.total_covariance import sweep_effects
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import (
@@ -32,7 +33,7 @@ from sst_graph.graph.building import Tracks
 from sst_graph.graph.matching import DriveEdges, edges_of
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint
 from sst_graph.graph.state import State
-from sst_graph.hand_eye.solution import MotionSolution, alternative, solve_motion
+from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
 
 FloatArray = NDArray[np.float64]
 
@@ -42,7 +43,7 @@ POINTS_A_SCAN = 1000
 """Most boundary points of a scan that are matched: neighbours on one edge tell the same."""
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 """Scales of the kernel from a start that is a degree off [px]."""
-KERNELS_PX = (*[5.0] * 4, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
+KERNELS_PX = (*[5.0] * 6, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
 """From the best of the starts [px]. Pictures have edges beside the objects'; the last scale is below most of
 their distances."""
 SCORE_PX = 1.5
@@ -106,6 +107,8 @@ def edges_method(
     # 4. Covariance, with what parts of the data disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
     covariance, spread = edges_covariance(estimate)
+    sweeps = sweep_effects(calibration, solution, covariance)
+    covariance = covariance + sweeps.covariance
     # 5. Has it worked?
     contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
@@ -114,7 +117,7 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        reasons,
+        (*reasons, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
     )
@@ -287,9 +290,20 @@ def _solved(
     again = _refined(problem, rolled)
     candidates += [one for one in again if angle_deg(one[1].state.cTl, best[1].state.cTl) > _SAME_DEG]
     candidates.sort(key=lambda pair: -pair[0])
-    return solve_joint(problem.whole, candidates[0][1].state, KERNELS_PX, progress)
+    solution = solve_joint(problem.whole, candidates[0][1].state, KERNELS_PX, progress)
+    # Soft matches follow the pose, so that steps are too short: from wide scales again, until nothing moves.
+    for _ in range(_ROUNDS):
+        before, solution = solution, solve_joint(problem.whole, solution.state, KERNELS_PX, progress)
+        step = np.abs(difference(before.state, solution.state))
+        if (step < _SETTLED).all():
+            break
+    return solution
 
 
+_ROUNDS = 3
+"""Most times that the scales are gone through again."""
+_SETTLED = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
+"""(7,) a round that changes nothing by more is the last [rad, m, s]."""
 _SAME_DEG = 0.3
 """Solutions nearer than this are one [deg]."""
 
