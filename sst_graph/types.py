@@ -91,8 +91,6 @@ class Scan(ByValue):
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
         left_out: number of further points in the data, which were NaN or inf.
-        intensities: (n,) float32 strength of the return, in the data's own unit, or None where the data have
-            none; only networks use it.
     """
 
     stamp_ns: int
@@ -102,12 +100,32 @@ class Scan(ByValue):
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     left_out: int = 0
-    intensities: NDArray[np.float32] | None = None
 
     @property
     def has_labels(self) -> bool:
         """Whether any point is known to be of some class."""
         return bool((self.classes != SemanticClass.IGNORE).any())
+
+
+@dataclass(frozen=True, eq=False)
+class ScanWithIntensities(Scan):
+    """A scan of data that tell how strong the returns were; only networks look at it.
+
+    Attributes:
+        intensities: (n,) float32, in the data's own unit.
+    """
+
+    intensities: NDArray[np.float32] = dataclasses.field(kw_only=True)
+
+
+def with_intensities(scan: Scan, intensities: NDArray[np.float32] | None) -> Scan:
+    """The scan with the strength of its returns (n,), where the data tell it."""
+    return scan if intensities is None else ScanWithIntensities(**vars(scan), intensities=intensities)
+
+
+def intensities_of(scan: Scan) -> NDArray[np.float32] | None:
+    """Strength of the returns (n,), or None where the data do not tell it."""
+    return scan.intensities if isinstance(scan, ScanWithIntensities) else None
 
 
 NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)

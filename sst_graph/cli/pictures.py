@@ -62,7 +62,8 @@ def overlay(
 
 
 def drawn_frames(sources: Sequence[Source], result: CalibrationResult, count: int) -> list[DrawnFrame]:
-    """Frames for the report of a result without a fit, of all drives, each with the image closest in time."""
+    """Frames for the report of a result without a fit, over all drives: each with the image closest in
+    time."""
     found = []
     for source in sources:
         drive = RecentReader(source)

@@ -47,7 +47,7 @@ from sst_graph.errors import ConfigError, printable
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.timestamps import read_times
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
@@ -188,7 +188,7 @@ class KittiSource:
         classes, instances = point_labels(self.files.labels.get(index), used)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])
-        return Scan(
+        scan = Scan(
             stamp_ns=int(self.stamps_ns[index]),
             points=points,
             classes=classes,
@@ -196,8 +196,8 @@ class KittiSource:
             offsets_s=None if offsets_s is None else offsets_s[used],
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
-            intensities=intensities[used],
         )
+        return with_intensities(scan, intensities[used])
 
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
