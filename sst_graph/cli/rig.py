@@ -7,19 +7,21 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gtsam
 import numpy as np
 
 from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
+from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
+from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import summary
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
@@ -74,8 +76,8 @@ def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
     with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
         # 1. The drives of each camera, their starts, and what is known of the rig.
         of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
-        read_as = {name: options_of(own) for name, own in of_camera.items()}
-        sources = {name: open_drives(own) for name, own in of_camera.items()}
+        sources, read_as = _opened(of_camera)
+        check_classes(next(iter(sources.values())), config.classes, args.classes)
         initial, offsets_s = _starts(args.init, sources, read_as)
         known = KnownRig(
             _known_poses(args.rig, sources, rotation_deg, translation_m), one_trigger=args.one_trigger
@@ -101,6 +103,32 @@ def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
         (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
     mention(f"{'wrote':<15} {args.out}: {RIG_NAME}, {', '.join(written)}")
     return _exit_code(rig)
+
+
+def _opened(
+    of_camera: Mapping[str, argparse.Namespace],
+) -> tuple[dict[str, list[Source]], dict[str, dict[str, Any]]]:
+    """The drives of each camera, and how they were read.
+
+    Where each sensor has stamps of its own, ``--frames`` are those of the first camera; of the others the
+    frames of the same span of time are used.
+    """
+    sources: dict[str, list[Source]] = {}
+    read_as: dict[str, dict[str, Any]] = {}
+    first: list[Any] = []
+    for name, own in of_camera.items():
+        spans = [drive.span_ns for drive in first if hasattr(drive, "span_ns")]
+        if own.frames is None or not first or len(spans) < len(first):
+            read_as[name], sources[name] = options_of(own), open_drives(own)
+        else:
+            own.frames = None
+            read_as[name], whole = options_of(own), cast(list[Any], open_drives(own))
+            cuts = [drive.within(span) for drive, span in zip(whole, spans, strict=True)]
+            sources[name] = [drive[cut] for drive, cut in zip(whole, cuts, strict=True)]
+            if len(cuts) == 1:
+                read_as[name]["frames"] = f"{cuts[0].start}:{cuts[0].stop}"
+        first = first or list(sources[name])
+    return sources, read_as
 
 
 def _calibrated(
@@ -194,7 +222,7 @@ def _exit_code(rig: RigResult) -> int:
         return 0
     bad = {name: result for name, result in rig.cameras.items() if result.status != "ok"}
     for name, result in bad.items():
-        first, *others = result.reasons or ("the result carries no reason",)
-        more = f" ({len(others)} more in the summary and in report.md)" if others else ""
+        first, *others = short_reasons(result) or ("the result carries no reason",)
+        more = f" ({len(others)} more in the summary; in full in the report)" if others else ""
         complain(f"{name}: {result.status}: {first}{more}")
     return 3

@@ -160,6 +160,24 @@ class TwoClockSource:
         """Index of the frame at a position; nothing is read."""
         return self.indices[position]
 
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """Stamps of the first and the last frame."""
+        return self._stamp_ns(0), self._stamp_ns(-1)
+
+    def within(self, span_ns: tuple[int, int]) -> slice:
+        """Positions of the frames whose stamps lie in a span, both ends included."""
+        first, last = span_ns
+        inside = [k for k in range(len(self)) if first <= self._stamp_ns(k) <= last]
+        return slice(inside[0], inside[-1] + 1) if inside else slice(0, 0)
+
+    def _stamp_ns(self, position: int) -> int:
+        place = self.places[self.indices[position]]
+        if place.scan is not None:
+            return int(self.scans.stamps_ns[place.scan])
+        assert place.image is not None
+        return int(self.images.stamps_ns[place.image])
+
     def facts(self) -> SourceFacts:
         """Sensors and their stamps."""
         places = [self.places[index] for index in self.indices]

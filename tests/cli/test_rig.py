@@ -35,7 +35,12 @@ def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.Cap
     rig = read_rig(out)
     assert list(rig.cameras) == ["image_2", "image_3"] and rig.status == "ok"
     for name in rig.cameras:
-        assert sorted(path.suffix for path in (out / name).iterdir()) == [".json", ".md", *[".png"] * 3]
+        assert sorted(path.suffix for path in (out / name).iterdir()) == [
+            ".html",
+            ".json",
+            ".md",
+            *[".png"] * 3,
+        ]
         assert rig[name] == read_result(out / name / "calibration.json")
         assert rig[name].read_as["camera"] == name
     document = json.loads((out / "rig.json").read_text())

@@ -137,7 +137,7 @@ def test_bags(stereo: Path, bag: Path, form: str) -> None:
 def test_cameras_that_a_bag_has_not(bag: Path) -> None:
     with pytest.raises(DataError, match=r"no message of cam7 \(--camera\); there are .*/cam0/image_raw"):
         open_source(bag, camera="cam7", mask_topic="mask")
-    with pytest.raises(DataError, match="several topics of .*/cam0/image_raw .*/cam0/mask .*--camera"):
+    with pytest.raises(DataError, match=r"several topics of .*/cam0/image_raw .*/cam0/mask .*--camera"):
         open_source(bag, camera="cam0", mask_topic="masks")
     with pytest.raises(DataError, match="several topics"):
         open_source(bag, mask_topic="mask")
@@ -146,3 +146,15 @@ def test_cameras_that_a_bag_has_not(bag: Path) -> None:
 def test_cameras_that_kitti_has_not(stereo: Path) -> None:
     with pytest.raises(ConfigError, match=r"camera 'image_0': .* has image_2, image_3"):
         open_source(stereo, camera="image_0")
+
+
+def test_the_same_span_of_a_drive_whose_cameras_have_other_rates(bag: Path) -> None:
+    """Frames are counted in the order of stamps; a span of time is the same for every camera."""
+    whole = open_source(bag, camera="cam0", mask_topic="mask")
+    part = whole[0:1]  # type: ignore[index]
+    assert part.span_ns[0] == part.span_ns[1]
+    other = open_source(bag, camera="cam1", mask_topic="mask")
+    cut = other.within(part.span_ns)  # type: ignore[attr-defined]
+    assert (cut.start, cut.stop) == (0, 1)
+    assert other.within(whole.span_ns) == slice(0, len(other))  # type: ignore[attr-defined]
+    assert other.within((0, 1)) == slice(0, 0)  # type: ignore[attr-defined]
