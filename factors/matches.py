@@ -41,6 +41,9 @@ class Alignment:
         weights: (n,) or one number: factor on the cost of each match (after the kernel).
         l_velocities: (n, 3) velocity over ground of the object that each point lies on, in the LiDAR frame
             [m/s], or None where all are static.
+        stretches: (n,) pixels of the image for one of those in which distances across the contour, their
+            sigmas and the mask's bias count, or None: they count in the image's own. An image that was
+            rectified is enlarged here and there, and the mask's errors with it.
     """
 
     camera: PinholeCamera
@@ -54,6 +57,7 @@ class Alignment:
     motion_model: MotionModel = "se3"
     weights: FloatArray = field(default_factory=lambda: np.ones(()))
     l_velocities: FloatArray | None = None
+    stretches: FloatArray | None = None
 
     def __post_init__(self) -> None:
         store = object.__setattr__
@@ -75,6 +79,12 @@ class Alignment:
         if self.l_velocities is not None:
             velocities = checked_array("l_velocities of an alignment", self.l_velocities, (n, 3))
             store(self, "l_velocities", velocities)
+        if self.stretches is not None:
+            stretches = checked_array("stretches of an alignment", self.stretches, (n,))
+            store(self, "stretches", stretches)
+            if self.normals is None or (stretches <= 0.0).any():
+                found = "no normals" if self.normals is None else f"{stretches.min():.3g}"
+                raise FactorError("stretches of an alignment", found, "normals, and values above 0")
         shape = (n, 6) if np.ndim(self.c_acceleration) == 2 else (6,)
         acceleration = checked_array("c_acceleration of an alignment", self.c_acceleration, shape)
         store(self, "c_acceleration", acceleration)
@@ -112,6 +122,7 @@ class Alignment:
             weights=self.weights[index],
             c_acceleration=c_acceleration,
             l_velocities=None if self.l_velocities is None else self.l_velocities[index],
+            stretches=None if self.stretches is None else self.stretches[index],
         )
 
     @property
@@ -121,8 +132,10 @@ class Alignment:
 
     @cached_property
     def columns(self) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """lPs (3, n), pixels (2, n) and normals (2, n), contiguous by row, for the hot path."""
+        """lPs (3, n), pixels (2, n), normals over stretches (2, n), contiguous by row, for the hot path."""
         normals = None if self.normals is None else np.ascontiguousarray(self.normals.T)
+        if normals is not None and self.stretches is not None:
+            normals = normals / self.stretches
         return np.ascontiguousarray(self.lPs.T), np.ascontiguousarray(self.pixels.T), normals
 
     @cached_property

@@ -20,8 +20,8 @@ IntArray = NDArray[np.intp]
 CLOSE_PX = 1.5
 """A boundary point closer to its contour than this counts as close [px].
 
-Errors of good masks are about 1 px, and 0.3 deg are 3.8 px with KITTI's camera: at 1.5 px most points are close
-under the right calibration, and few under one that is 0.3 deg off."""
+Errors of good masks are about 1 px, and 0.3 deg are 3.8 px with KITTI's camera: at 1.5 px most points are
+close under the right calibration, and few under one that is 0.3 deg off."""
 
 MOST_POINTS = 30_000
 """Most boundary points that are kept; with more, every second, third, ... is."""
@@ -57,16 +57,18 @@ class FitQuality:
         if not isinstance(entry, Mapping):
             return None
         points, start = entry.get("points"), entry.get("share_at_start")
-        share, attainable = entry.get("share"), entry.get("attainable")
+        share, attainable = (_share(entry.get(name)) for name in ("share", "attainable"))
         if not isinstance(points, int) or isinstance(points, bool) or not 0 < points < 10**12:
             return None
-        if not (_is_share(share) and _is_share(attainable) and (start is None or _is_share(start))):
+        if share is None or attainable is None or (start is not None and _share(start) is None):
             return None
-        return cls(points, share, start, attainable)
+        return cls(points, share, _share(start), attainable)
 
 
-def _is_share(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value <= 1.0
+def _share(value: Any) -> float | None:
+    """The number if it is a share, 0 to 1."""
+    good = isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value <= 1.0
+    return float(value) if good else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -91,8 +91,6 @@ class Scan(ByValue):
             points are taken at (or compensated to) the stamp.
         rings: (n,) uint16 laser number, or None where the data does not name it.
         left_out: number of further points in the data, which were NaN or inf.
-        intensities: (n,) float32 strength of the return, in the data's own unit, or None where the data have
-            none; only networks use it.
     """
 
     stamp_ns: int
@@ -102,7 +100,6 @@ class Scan(ByValue):
     offsets_s: NDArray[np.float32] | None = None
     rings: NDArray[np.uint16] | None = None
     left_out: int = 0
-    intensities: NDArray[np.float32] | None = None
 
     @property
     def has_labels(self) -> bool:
@@ -110,8 +107,61 @@ class Scan(ByValue):
         return bool((self.classes != SemanticClass.IGNORE).any())
 
 
+@dataclass(frozen=True, eq=False)
+class ScanWithIntensities(Scan):
+    """A scan of data that tell how strong the returns were; only networks look at it.
+
+    Attributes:
+        intensities: (n,) float32, in the data's own unit.
+    """
+
+    intensities: NDArray[np.float32] = dataclasses.field(kw_only=True)
+
+
+def with_intensities(scan: Scan, intensities: NDArray[np.float32] | None) -> Scan:
+    """The scan with the strength of its returns (n,), where the data tell it."""
+    return scan if intensities is None else ScanWithIntensities(**vars(scan), intensities=intensities)
+
+
+def intensities_of(scan: Scan) -> NDArray[np.float32] | None:
+    """Strength of the returns (n,), or None where the data do not tell it."""
+    return scan.intensities if isinstance(scan, ScanWithIntensities) else None
+
+
 NO_PICTURE: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)
 """Pixels of an image whose picture is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PixelStretch(ByValue):
+    """By how much the pixels of a resampled image are enlarged against those of the image it was made of.
+
+    With J the derivative of a pixel's place in the original by its place here, A = J^-1 J^-T: a distance d
+    across a contour of unit normal n is d / sqrt(n' A n) in the original.
+
+    Attributes:
+        squares: (rows, columns, 3) float32: xx, xy and yy of A at every ``step_px``-th pixel.
+        step_px: between two of them [px].
+    """
+
+    squares: NDArray[np.float32]
+    step_px: int
+
+    def across(self, uvs: FloatArray, normals: FloatArray) -> FloatArray:
+        """Stretch (n,) across contours at pixels uvs (n, 2) [px], unit normals (n, 2).
+
+        1 where pixels were made smaller: the pixels here then limit what is seen.
+        """
+        rows, columns = self.squares.shape[:2]
+        place = np.clip(uvs.T / self.step_px, 0.0, np.array([[columns - 1.0], [rows - 1.0]]))
+        first = np.minimum(place.astype(np.intp), np.array([[columns - 2], [rows - 2]]))
+        (a, b), (u, v) = (place - first)[:, :, None], first
+        xx, xy, yy = (
+            (1.0 - b) * ((1.0 - a) * self.squares[v, u] + a * self.squares[v, u + 1])
+            + b * ((1.0 - a) * self.squares[v + 1, u] + a * self.squares[v + 1, u + 1])
+        ).T
+        x, y = normals.T
+        return np.asarray(np.sqrt(np.maximum(xx * x * x + 2.0 * xy * x * y + yy * y * y, 1.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +175,7 @@ class CameraImage(ByValue):
         instances: (h, w) uint16 instance number (0: none), or None.
         valid: (h, w) bool, False where the camera saw nothing (rectified from a lens that sees less), or None
             where it saw everything. Its border is no edge of anything; the mask is IGNORE beyond it.
+        stretch: of a rectified image, by how much its pixels are enlarged; None: they are as taken.
     """
 
     stamp_ns: int
@@ -132,6 +183,7 @@ class CameraImage(ByValue):
     pixels: NDArray[np.uint8]
     instances: NDArray[np.uint16] | None = None
     valid: NDArray[np.bool_] | None = None
+    stretch: PixelStretch | None = None
 
     @property
     def has_mask(self) -> bool:

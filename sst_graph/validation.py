@@ -57,10 +57,7 @@ def checked_scan(scan: object, place: str = "scan", fewest: int = 1) -> Scan:
     left_out = scan.left_out
     if not isinstance(left_out, int | np.integer) or left_out < 0:
         raise DataError(f"{place}: left_out", f"{left_out!r:.60}", "a number of points")
-    intensities = scan.intensities
-    if intensities is not None:
-        intensities = _array(intensities, (n,), f"{place}: intensities").astype(np.float32, copy=False)
-    return Scan(stamp_ns, points, classes, instances, offsets_s, rings, int(left_out), intensities)
+    return Scan(stamp_ns, points, classes, instances, offsets_s, rings, int(left_out))
 
 
 def checked_image(image: object, camera: PinholeCamera, place: str = "image") -> CameraImage:
@@ -91,7 +88,7 @@ def checked_image(image: object, camera: PinholeCamera, place: str = "image") ->
         valid = _array(valid, size, f"{place}: valid", "the camera's size")
         if valid.dtype != np.bool_:
             raise DataError(f"{place}: valid", f"dtype {valid.dtype}", "bool")
-    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid)
+    return CameraImage(stamp_ns, mask, np.ascontiguousarray(pixels), instances, valid, image.stretch)
 
 
 def _check_size(array: object, size: tuple[int, int], what: str, place: str) -> None:

@@ -148,13 +148,18 @@ def test_names_of_labels_mean_classes() -> None:
 
 
 def test_classes_come_back_from_their_stored_numbers() -> None:
-    classes = np.array([int(c) for c in SemanticClass], np.uint8)
+    """All but objects found by geometry, which no data set labels."""
+    classes = np.array([int(c) for c in SemanticClass if c != SemanticClass.OBJECT], np.uint8)
     assert (classes_of_mask(cityscapes_ids_of(classes[None]), MaskEncoding.IDS)[0] == classes).all()
     points = classes[classes != SemanticClass.SKY]  # no point of a cloud is sky
     instances = np.arange(len(points), dtype=np.uint16)
     back, numbers = classes_of_points(semantic_kitti_of(points, instances))
     assert (back == points).all()
     assert (numbers == instances).all()
+    with pytest.raises(DataError, match="labels: found class 12, expected one that Cityscapes and Semantic"):
+        cityscapes_ids_of(np.array([1, SemanticClass.OBJECT], np.uint8))
+    with pytest.raises(DataError, match="labels: found class 12"):
+        semantic_kitti_of(np.array([1, SemanticClass.OBJECT], np.uint8), None)
 
 
 @pytest.mark.parametrize(

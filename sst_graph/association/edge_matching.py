@@ -26,7 +26,7 @@ from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
-from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours
+from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
 from sst_graph.features.picture_gradients import PictureGradients, nearest_edges
 from sst_graph.types import SemanticClass
 
@@ -337,9 +337,12 @@ def match_edges(
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         feet, shares = nearest_contours(maps, paired.spans, uvs), None
-    residuals = feet.distances + paired.repeated(paired.biases_px)
+    enlarged = stretches(paired.contours, paired.spans, feet)
+    distances = feet.distances if enlarged is None else feet.distances / enlarged
+    residuals = distances + paired.repeated(paired.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
     paired, uvs, index = paired.take(near), uvs[near], index[near]
+    enlarged = None if enlarged is None else enlarged[near]
     normals, pixels = feet.normals[near], feet.feet[near]
     # 3. Keep contours that face the outward direction of the object.
     tips = paired.projected(paired.points.outward, cTl, time_offset_s)
@@ -353,8 +356,11 @@ def match_edges(
     cosine = (outward * normals).sum(axis=1)
     # 4. Keep objects of which enough points have a match.
     on = np.flatnonzero(of_matched_objects(faces(cosine), paired.owners, objects_seen, MIN_OBJECT_SHARE))
-    paired, index = paired.take(on), index[on]
-    sigmas = match_sigmas(length[on], cosine[on], config)
+    paired, index, length = paired.take(on), index[on], length[on]
+    if enlarged is not None:
+        enlarged = enlarged[on]
+        length = length / enlarged
+    sigmas = match_sigmas(length, cosine[on], config)
     sides = sides_of(paired.points.edges, outward[on, 0])
     weights = side_weights(paired.owners, sides, sigmas, config)
     if shares is not None:
@@ -370,6 +376,7 @@ def match_edges(
         c_acceleration=paired.accelerations(),
         weights=weights,
         l_velocities=paired.velocities,
+        stretches=enlarged,
     )
     return EdgeMatches(index, sides, alignment, paired.bounds, seen)
 

@@ -18,13 +18,18 @@ from sst_graph.cameras.model import BoolArray, CameraModel, FloatArray
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.files.checked_values import checked_camera
-from sst_graph.types import CameraImage, SemanticClass
+from sst_graph.types import CameraImage, PixelStretch, SemanticClass
 
 FIELD_OF_VIEW_DEG = 110.0
 """Widest default field of a rectified camera [deg]: a pinhole stretches the rim by 1 / cos^2, here by 3."""
 WIDEST_DEG = 150.0
 """Widest field that can be asked for [deg]: the rim is stretched 15 times. More needs several pinholes."""
 _LEAST_SIDE_PX = 16
+_STRETCH_STEP_PX = 32
+"""Of the grid on which the enlargement is known [px]; from one place to the next it changes by some per
+cent."""
+_LEAST_SHRINKING = 1e-3
+"""Least area in the raw image of a pixel of the pinhole [px^2]: below it the lens's field ends."""
 
 
 def rectified_camera(model: CameraModel, field_of_view_deg: float = FIELD_OF_VIEW_DEG) -> PinholeCamera:
@@ -129,6 +134,29 @@ class Rectification:
         rows, columns = np.nonzero(~self.valid)
         return rows, columns, nearest[0][rows, columns], nearest[1][rows, columns]
 
+    @cached_property
+    def stretch(self) -> PixelStretch:
+        """By how much the pinhole's pixels are enlarged."""
+        camera, sides = self.camera, (self.camera.width, self.camera.height)
+        us, vs = (np.arange(0, side - 1 + _STRETCH_STEP_PX, _STRETCH_STEP_PX) for side in sides)
+        centres = np.stack(np.meshgrid(us, vs), axis=-1).reshape(-1, 2)
+        around = centres + 0.5 * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[:, None]
+        rays = (around - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        uvs, valid = self.model.project(np.append(rays, np.ones((*rays.shape[:2], 1)), axis=2).reshape(-1, 3))
+        right, left, below, above = np.where(valid[:, None], uvs, np.nan).reshape(4, -1, 2)
+        J = np.stack([right - left, below - above], axis=-1)
+        known = np.isfinite(J).all(axis=(1, 2))
+        known[known] = np.abs(np.linalg.det(J[known])) > _LEAST_SHRINKING
+        if not known.any():
+            J, known = np.tile(np.eye(2), (len(J), 1, 1)), np.ones(len(J), np.bool_)
+        inverse = np.linalg.inv(np.where(known[:, None, None], J, np.eye(2)))
+        A = inverse @ np.swapaxes(inverse, 1, 2)
+        squares = A.reshape(len(vs), len(us), 4)[:, :, [0, 1, 3]].astype(np.float32)
+        # Beyond the lens's field as at the nearest place within it.
+        missing = ~known.reshape(len(vs), len(us))
+        nearest = ndimage.distance_transform_edt(missing, return_distances=False, return_indices=True)
+        return PixelStretch(squares[nearest[0], nearest[1]], _STRETCH_STEP_PX)
+
     def picture(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(h, w, 3) rectified picture, bilinear.
 
@@ -188,7 +216,7 @@ class Rectification:
         mask, instances = self.labels(image.mask, image.instances)
         pixels = self.picture(image.pixels) if image.has_picture else image.pixels
         valid = None if self.valid.all() else self.valid
-        return CameraImage(image.stamp_ns, mask, pixels, instances, valid)
+        return CameraImage(image.stamp_ns, mask, pixels, instances, valid, self.stretch)
 
     def _check(self, array: NDArray[Any], what: str) -> None:
         if array.shape[:2] != (self.model.height, self.model.width):

@@ -179,7 +179,12 @@ def guess_mask_encoding(masks: Iterable[NDArray[np.uint8]], place: str | Path = 
 
 
 def cityscapes_ids_of(classes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Cityscapes ids (...) of classes (...), as :func:`classes_of_mask` reads them back."""
+    """Cityscapes ids (...) of classes (...), as :func:`classes_of_mask` reads them back.
+
+    Raises:
+        DataError: a class that is in no data set (OBJECT), or none at all.
+    """
+    _check_stored(classes)
     return _CITYSCAPES_OF_CLASS[classes]
 
 
@@ -190,9 +195,20 @@ def semantic_kitti_of(classes: NDArray[np.uint8], instances: NDArray[np.uint16] 
 
     Args:
         instances: (n,) for the high 16 bits, or None.
+
+    Raises:
+        DataError: a class that is in no data set (OBJECT), or none at all.
     """
+    _check_stored(classes)
     labels = _SEMANTIC_KITTI_OF_CLASS[classes]
     return labels if instances is None else labels | (instances.astype(np.uint32) << np.uint32(16))
+
+
+def _check_stored(classes: NDArray[np.uint8]) -> None:
+    known = _HAS_NUMBER[classes]
+    if not known.all():
+        found = int(classes[~known][0])
+        raise DataError("labels", f"class {found}", "one that Cityscapes and SemanticKITTI have a number for")
 
 
 def _plain(name: str) -> str:
@@ -228,5 +244,7 @@ _STORED = {
 """Numbers of Cityscapes and of SemanticKITTI under which a class is stored."""
 _CITYSCAPES_OF_CLASS = np.full(256, 255, np.uint8)
 _SEMANTIC_KITTI_OF_CLASS = np.zeros(256, np.uint32)
+_HAS_NUMBER = np.zeros(256, bool)
+_HAS_NUMBER[[int(one) for one in _STORED]] = True
 for _class, (_city, _kitti) in _STORED.items():
     _CITYSCAPES_OF_CLASS[_class], _SEMANTIC_KITTI_OF_CLASS[_class] = _city, _kitti

@@ -84,7 +84,7 @@ def chosen_classes(text: str | None) -> list[str] | None:
     """
     if text is None:
         return None
-    not_alignable = (SemanticClass.OTHER, SemanticClass.IGNORE)
+    not_alignable = (SemanticClass.OTHER, SemanticClass.IGNORE, SemanticClass.OBJECT)
     alignable = [label.name.lower() for label in SemanticClass if label not in not_alignable]
     if text == "all":
         return alignable

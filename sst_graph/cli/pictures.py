@@ -62,7 +62,8 @@ def overlay(
 
 
 def drawn_frames(sources: Sequence[Source], result: CalibrationResult, count: int) -> list[DrawnFrame]:
-    """Frames for the report of a result without a fit, over all drives: each with the image closest in time."""
+    """Frames for the report of a result without a fit, over all drives: each with the image closest in
+    time."""
     found = []
     for source in sources:
         drive = RecentReader(source)
@@ -90,8 +91,12 @@ def _at_true_time(drive: RecentReader, position: int, time_offset_s: float) -> t
     frame = drive.frame(position)
     if frame.scan is None or frame.image is None:
         return _whole(drive, frame, time_offset_s), False
-    neighbour = drive.scan(position - 1 if position else min(1, len(drive) - 1))
     scan, image = frame.scan, frame.image
+    if hasattr(drive.source, "image_positions"):
+        stamp_ns = scan.stamp_ns - round(time_offset_s * 1e9)
+        nearest = _closest(drive.image, image_positions(drive.source), stamp_ns) or image
+        return replace(frame, image=nearest), nearest.stamp_ns != image.stamp_ns
+    neighbour = drive.scan(position - 1 if position else min(1, len(drive) - 1))
     if neighbour is None or neighbour.stamp_ns == scan.stamp_ns:
         return frame, False
     period_s = abs(scan.stamp_ns - neighbour.stamp_ns) * 1e-9

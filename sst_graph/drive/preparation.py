@@ -134,7 +134,15 @@ class ImageFeatures:
             c: contour.edges if isinstance(contour, ContourMap) else contour
             for c, contour in self.contours.items()
         }
-        return {"index": self.index, "stamp_ns": self.stamp_ns, "mask": self.packed, "contours": edges}
+        maps = (contour for contour in self.contours.values() if isinstance(contour, ContourMap))
+        stretch = next((contour.stretch for contour in maps), None)
+        return {
+            "index": self.index,
+            "stamp_ns": self.stamp_ns,
+            "mask": self.packed,
+            "contours": edges,
+            "stretch": stretch,
+        }
 
     @cached_property
     def packed(self) -> PackedArray:
@@ -142,15 +150,18 @@ class ImageFeatures:
         return PackedArray.of(self.mask)
 
     def __setstate__(self, state: Mapping[str, Any]) -> None:
-        mask = state["mask"]
+        mask, stretch = state["mask"], state.get("stretch")
         if isinstance(mask, PackedArray):
             mask = mask.array()
         fields = {
-            c: edges if isinstance(edges, PictureGradients) else ContourMap.of(mask, c, edges=edges)
+            c: edges
+            if isinstance(edges, PictureGradients)
+            else ContourMap.of(mask, c, edges=edges, stretch=stretch)
             for c, edges in state["contours"].items()
         }
         contours = {c: field for c, field in fields.items() if field is not None}
-        for name, value in {**state, "mask": mask, "contours": contours}.items():
+        values = {"index": state["index"], "stamp_ns": state["stamp_ns"], "mask": mask, "contours": contours}
+        for name, value in values.items():
             object.__setattr__(self, name, value)
 
 
@@ -407,7 +418,7 @@ def image_features(
     """Mask and contours of an image; ``use_picture``: the contours follow its picture."""
     picture = image.pixels if use_picture else None
     fields = {
-        c: ContourMap.of(image.mask, c, picture, valid=image.valid)
+        c: ContourMap.of(image.mask, c, picture, valid=image.valid, stretch=image.stretch)
         for c in classes
         if c != SemanticClass.OBJECT
     }

@@ -13,6 +13,7 @@ from sst_graph.experiments import (
     assumptions,
     consistency,
     drives,
+    fit,
     motion,
     paper_table,
     rigs,
@@ -56,6 +57,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "real drives from many wrong starts: one result, and its distance from the reference",
         drives.DrivesConfig(),
         drives.run,
+    ),
+    "fit": Experiment(
+        "share of boundary points close to their contour: right calibrations against turned ones",
+        fit.FitTableConfig(),
+        fit.run,
     ),
     "motion": Experiment(
         "what motion alone determines on simulated streets, and what it adds to the joint method",

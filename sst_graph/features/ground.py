@@ -57,7 +57,10 @@ def heights_above_ground(points: FloatArray) -> FloatArray:
     lowest = lowest[heights[lowest] > -(_DEEPEST_M + _DEEPEST_SLOPE * rho)]
     floor = np.full(size * size, 1e3, np.float32)
     floor[cells[lowest]] = heights[lowest]
-    envelope = _slope_limited(floor.reshape(size, size)).reshape(-1)
+    envelope = _slope_limited(floor.reshape(size, size))
+    # A cell that shows no ground of its own has that of the lowest cell beside it.
+    beside = cv2.erode(envelope, np.ones((3, 3), np.uint8)).reshape(-1)
+    envelope = np.where(envelope.reshape(-1) < floor, beside, envelope.reshape(-1))
     return np.asarray(heights - envelope[cells])
 
 

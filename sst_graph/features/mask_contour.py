@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.features.image_edges import Picture, PictureEdges, find_picture_edges
 from sst_graph.features.sampling import sampled
 from sst_graph.files.array_store import ArrayStore, shape_of, storable
-from sst_graph.types import SemanticClass
+from sst_graph.types import PixelStretch, SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -63,6 +63,7 @@ class ContourMap:
         unknown: 1 near ``IGNORE`` pixels, where a contour is not the object's, and where the picture shows no
             edge along it; in the same box.
         edges: what the picture shows along the contour, if it was used; in ``distance`` already.
+        stretch: of the image's pixels, where it was rectified.
     """
 
     distance: FloatMap
@@ -72,6 +73,7 @@ class ContourMap:
     height: int
     unknown: NDArray[np.uint8]
     edges: PictureEdges | None = None
+    stretch: PixelStretch | None = None
 
     @classmethod
     def of(
@@ -81,6 +83,7 @@ class ContourMap:
         picture: Picture | None = None,
         edges: PictureEdges | None = None,
         valid: NDArray[np.bool_] | None = None,
+        stretch: PixelStretch | None = None,
     ) -> ContourMap | None:
         """The field of a class in a mask (h, w); None where the class is absent or fills the image.
 
@@ -89,6 +92,7 @@ class ContourMap:
             edges: what was found in the picture before, instead of the picture.
             valid: (h, w) whether the lens shows anything there; beside pixels where it does not, the contour
                 does not follow the picture. None: everywhere.
+            stretch: of the mask's pixels, where it was rectified.
         """
         # Compared with a plain int: compared with an enum, all pixels are converted to int64.
         inside = (mask == int(semantic_class)).view(np.uint8)
@@ -111,7 +115,7 @@ class ContourMap:
             shifts, unseen = edges.fields(box)
             distance -= shifts
             unknown |= unseen
-        return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges)
+        return cls(distance, left, top, mask.shape[1], mask.shape[0], unknown, edges, stretch)
 
     @property
     def box(self) -> tuple[int, int]:
@@ -166,6 +170,27 @@ def nearest_contours(
     valid &= length > MIN_GRADIENT
     valid &= ~are_unknown(contours, spans, feet - corner)
     return ContourFeet(centre, normals.T, feet.T, valid)
+
+
+def stretches(
+    contours: Sequence[object], spans: Sequence[tuple[int, int]], found: ContourFeet
+) -> FloatArray | None:
+    """(n,) stretch of the images across the contours that were found; None where no mask was rectified.
+
+    Args:
+        contours: of masks or of pictures; these have none.
+        spans: as in :func:`nearest_contours`.
+    """
+    own = [contour.stretch if isinstance(contour, ContourMap) else None for contour in contours]
+    if not any(own):
+        return None
+    across = np.ones(len(found.feet))
+    # The images of a drive share one, so that few are different.
+    numbers = np.repeat([id(stretch) for stretch in own], [b - a for a, b in spans])
+    for stretch in {id(one): one for one in own if one is not None}.values():
+        some = np.flatnonzero(numbers == id(stretch))
+        across[some] = stretch.across(found.feet[some], found.normals[some])
+    return across
 
 
 def are_unknown(

@@ -120,8 +120,9 @@ def _column(alignment: Alignment, J: FloatArray, cTl: gtsam.Pose3, effect: Effec
     if effect.time_s is not None:
         total += J[:, 6] * effect.time_s
     if effect.pixel_shift is not None:
-        assert alignment.normals is not None
-        total += J[:, 13] * np.einsum("ij,ij->i", alignment.normals, effect.pixel_shift)
+        normals = alignment.columns[2]
+        assert normals is not None
+        total += J[:, 13] * np.einsum("ji,ij->i", normals, effect.pixel_shift)
     if effect.twist_shift is not None:
         total += (J[:, 7:13] @ np.asarray(cTl.AdjointMap()) * effect.twist_shift).sum(axis=1)
     return total

@@ -82,8 +82,8 @@ def _known(result: CalibrationResult) -> str:
     degrees, cm, ms = largest_sigmas(result)
     middle = misfits(result)[1]
     return (
-        f"{_figure(degrees)}° and {_figure(cm)} cm: at {middle.depth_m:.0f} m the cloud sits within "
-        f"{_figure(middle.pixels)} pixels of the picture. The time offset is known to {_figure(ms)} ms."
+        f"{figure(degrees)}° and {figure(cm)} cm: at {middle.depth_m:.0f} m the cloud sits within "
+        f"{figure(middle.pixels)} pixels of the picture. The time offset is known to {figure(ms)} ms."
     )
 
 
@@ -126,7 +126,7 @@ def _worst(J: FloatArray, covariance: FloatArray) -> float:
     return float(np.sqrt(max(0.0, np.linalg.eigvalsh(J @ covariance @ J.T)[-1])))
 
 
-def _figure(value: float) -> str:
+def figure(value: float) -> str:
     """Two significant digits of small numbers, whole numbers above ten."""
     if value == 0.0 or value >= 10.0:
         return f"{value:.0f}"

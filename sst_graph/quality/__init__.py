@@ -1,1 +1,2 @@
-"""How well a solution fits its labels: share of close points, residuals point by point, profile likelihood."""
+"""How well a solution fits its labels: share of close points, residuals point by point, profile
+likelihood."""

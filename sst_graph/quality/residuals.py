@@ -23,7 +23,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 
 WIDE_PX = 5.0
-"""Kernel scale under which contours are nearby: up to 15 px away, three times as far as for an estimate [px]."""
+"""Kernel scale under which contours are nearby: up to 15 px away, three times as far as for an estimate
+[px]."""
 
 
 @dataclass(frozen=True)

@@ -101,8 +101,8 @@ class Chart:
         ends_u, ends_v = self._u(np.asarray(x) + dxs), self._v(np.asarray(y) + dys)
         for u, v, a, b, title in zip(us, vs, ends_u, ends_v, titles, strict=True):
             self._marks.append(
-                f'<g><title>{text(title)}</title><line class="arrow a" x1="{u:.1f}" y1="{v:.1f}" x2="{a:.1f}" '
-                f'y2="{b:.1f}"/><circle class="dot a" cx="{u:.1f}" cy="{v:.1f}" r="2"/></g>'
+                f'<g><title>{text(title)}</title><line class="arrow a" x1="{u:.1f}" y1="{v:.1f}" '
+                f'x2="{a:.1f}" y2="{b:.1f}"/><circle class="dot a" cx="{u:.1f}" cy="{v:.1f}" r="2"/></g>'
             )
 
     def level(self, y: float, name: str = "") -> None:
@@ -112,7 +112,8 @@ class Chart:
     def svg(self) -> str:
         """The chart."""
         parts = [
-            f'<svg class="chart" viewBox="0 0 {WIDTH} {self.height}" role="img" aria-label="{text(self.alt)}">'
+            f'<svg class="chart" viewBox="0 0 {WIDTH} {self.height}" role="img" '
+            f'aria-label="{text(self.alt)}">'
         ]
         bottom = self.height - _BOTTOM
         for value in _ticks(*self.x):

@@ -25,10 +25,14 @@ IntArray = NDArray[np.intp]
 COUNT = 10
 """Close-ups of a report."""
 _WORST = 3
-"""How many of them are those whose labels disagree most."""
+"""How many of them are those whose labels agree least."""
+_PARTS = 3
+"""Parts of the record in each of which an object may be shown."""
 _LEAST_POINTS = 12
 """Fewest boundary points of an object that is shown."""
-_MOST_ZOOM = 8
+_MOST_ZOOM, _LEAST_ZOOM = 8, 4
+"""Enlargement: as much as the object leaves room for; of a large one, the part that determines most is
+shown."""
 _WIDTH, _HEIGHT = 480, 360
 """Size of a close-up [px of the page]."""
 _MARGIN_PX = 8.0
@@ -43,7 +47,7 @@ class Detection:
     Attributes:
         points: positions of its boundary points.
         share: of the information that the whole drive gives, on average over the unknowns.
-        worst: whether it is shown because it disagrees.
+        worst: whether it is shown because its labels agree least.
     """
 
     points: IntArray
@@ -52,20 +56,27 @@ class Detection:
 
 
 def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[Detection]:
-    """Objects that determine most, then those that disagree most, each in one frame.
+    """Objects that determine most, then those that agree least; with few of them, the same in other frames.
 
     Args:
         covariance: (7, 7) of the result.
     """
     leverages = _leverages(points, covariance)
     total = max(float(leverages.sum()), 1e-12)
-    best: dict[int, Detection] = {}
+    frames = 1 + int(points.frames.max(initial=0))
+    best: dict[tuple[int, int], Detection] = {}
     for own in _by_detection(points):
         found = Detection(own, float(leverages[own].sum()) / total)
-        track = int(points.tracks[own[0]])
-        if len(own) >= _LEAST_POINTS and (track not in best or found.share > best[track].share):
-            best[track] = found
-    ranked = sorted(best.values(), key=lambda one: -one.share)
+        track, frame = int(points.tracks[own[0]]), int(points.frames[own[0]])
+        key = track, frame * _PARTS // frames
+        if len(own) >= _LEAST_POINTS and (key not in best or found.share > best[key].share):
+            best[key] = found
+    seen: set[int] = set()
+    firsts, again = [], []
+    for (track, _), found in sorted(best.items(), key=lambda item: -item[1].share):
+        (again if track in seen else firsts).append(found)
+        seen.add(track)
+    ranked = [*firsts, *again]
     strong, others = ranked[: COUNT - _WORST], ranked[COUNT - _WORST :]
 
     def misfit(one: Detection) -> float:
@@ -114,22 +125,23 @@ def _close_up(
 ) -> str:
     uvs, _ = project_points(drawn, points, placements.after)
     moves = _two_sigma_moves(drawn, points, placements, result)
-    crop = _Crop.around(uvs, drawn.image.pixels)
+    crop = _Crop.around(uvs, _leverages(points, result.covariance), drawn.image.pixels)
     picture, zoom = crop.enlarged(drawn.image.pixels), crop.zoom
     class_name = SemanticClass(int(points.classes[0])).name.lower().replace("_", " ")
     r = points.residuals_px
     size = float(np.median(np.abs(r)))
     reach = float(np.median(np.linalg.norm(moves, axis=1)))
     range_m = float(np.median(np.linalg.norm(points.lPs, axis=1)))
-    title = f"{class_name} at {range_m:.0f} m, {'disagrees most' if detection.worst else 'determines most'}"
+    why = "labels agree least" if detection.worst else "determines most"
+    title = f"{class_name} at {range_m:.0f} m, {why}"
     sides = ", ".join(
         f"{_SIDE_NAMES[side]} {np.mean(r[points.sides == side]):+.1f} px" for side in np.unique(points.sides)
     )
     caption = (
         f"{size:.1f} px from the contour (median of {len(r)} points; {sides}), "
-        f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration moves "
-        f"it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:g} times enlarged; "
-        f"{100.0 * detection.share:.1f} % of the information."
+        f"{100.0 * np.mean(np.abs(r) < CLOSE_PX):.0f} % within {CLOSE_PX:g} px. ±2 sigma of the calibration "
+        f"moves it by ±{reach:.1f} px. {drawn.frame.drive}, image {drawn.frame.image}, {zoom:.2g} times "
+        f"enlarged; {100.0 * detection.share:.1f} % of the information."
     )
     width, height = picture.shape[1], picture.shape[0]
     marks = [
@@ -142,7 +154,8 @@ def _close_up(
         marks.append(f'<path class="spread" d="M{u - du:.1f} {v - dv:.1f}L{u + du:.1f} {v + dv:.1f}"/>')
         marks.append(f'<path class="residual" d="M{u:.1f} {v:.1f}L{x:.1f} {y:.1f}"/>')
         marks.append(
-            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3"><title>{value:+.1f} px</title></circle>'
+            f'<circle class="point {colour}" cx="{u:.1f}" cy="{v:.1f}" r="3">'
+            f"<title>{value:+.1f} px</title></circle>"
         )
     return (
         f'<figure><h3>{text(title)}</h3><svg class="closeup" viewBox="0 0 {width} {height}" role="img" '
@@ -155,7 +168,7 @@ def _close_up(
 def _two_sigma_moves(
     drawn: DrawnFrame, points: PointResiduals, placements: Placements, result: CalibrationResult
 ) -> FloatArray:
-    """(n, 2) how two sigma of the calibration move each point, in the direction that moves the object most."""
+    """(n, 2) how two sigma of the calibration move each point, along what moves the object most [px]."""
     cTl, time_offset_s = placements.after
     alignment = Alignment(
         drawn.camera,
@@ -191,9 +204,14 @@ class _Crop:
     zoom: float
 
     @classmethod
-    def around(cls, uvs: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
-        """Points (n, 2) with what is around them, in the shape of a close-up."""
+    def around(cls, uvs: FloatArray, importance: FloatArray, pixels: NDArray[np.uint8]) -> _Crop:
+        """Points (n, 2) with what is around them, in the shape of a close-up; the most important (n,) of
+        many."""
         rows, columns = pixels.shape[:2]
+        room = 0.5 * np.array([_WIDTH, _HEIGHT]) / _LEAST_ZOOM - _MARGIN_PX
+        near = (np.abs(uvs[:, None] - uvs[None]) <= room).all(axis=2)
+        if not near.all():
+            uvs = uvs[near[int(np.argmax(near @ importance))]]
         low, high = np.nanmin(uvs, axis=0) - _MARGIN_PX, np.nanmax(uvs, axis=0) + _MARGIN_PX
         width, height = np.maximum(high - low, [_WIDTH / _MOST_ZOOM, _HEIGHT / _MOST_ZOOM])
         width = max(width, height * _WIDTH / _HEIGHT)
@@ -230,11 +248,17 @@ def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop)
     part = contour.distance[top:bottom, left:right]
     fine = cv2.resize(part, None, fx=times, fy=times, interpolation=cv2.INTER_LINEAR)
     outlines, _ = cv2.findContours((fine < 0.0).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_TC89_L1)
-    return "".join(
-        _path((outline[:, 0] + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop)
-        for outline in outlines
-    )
+    found = []
+    for outline in outlines:
+        at = outline[:, 0]
+        cut = ((at <= 1) | (at >= np.array(fine.shape[1::-1]) - 2)).any(axis=1)
+        found.append(_path((at + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop, cut))
+    return "".join(found)
 
 
-def _path(uvs: FloatArray, crop: _Crop) -> str:
-    return "M" + "L".join(f"{u:.1f} {v:.1f}" for u, v in crop.places(uvs)) + "Z"
+def _path(uvs: FloatArray, crop: _Crop, cut: NDArray[np.bool_]) -> str:
+    """A closed line through points (n, 2), without what runs along the crop's border: cut (n,)."""
+    places, gone = crop.places(uvs), cut & np.roll(cut, 1)
+    moves = ["M" if skip or k == 0 else "L" for k, skip in enumerate(gone.tolist())]
+    line = "".join(f"{move}{u:.1f} {v:.1f}" for move, (u, v) in zip(moves, places, strict=True))
+    return line if gone[0] else f"{line}L{places[0, 0]:.1f} {places[0, 1]:.1f}"

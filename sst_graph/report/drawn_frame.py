@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import move_points
+from sst_graph.factors.motion import CameraTwist, move_points
 from sst_graph.fit import MatchedFrame
 from sst_graph.types import CameraImage, Scan, Source
 
@@ -35,18 +35,20 @@ class DrawnFrame:
 
     def projected(self, cTl: gtsam.Pose3, time_offset_s: float) -> tuple[FloatArray, FloatArray]:
         """(n, 2) pixels of the scan's points, NaN behind the camera, and their depths (n,) [px], [m]."""
-        columns = np.ascontiguousarray(self.scan.points.T, dtype=np.float64)
-        taus = np.full(columns.shape[1], time_offset_s + self.frame.base_tau_s)
+        taus = np.full(len(self.scan.points), time_offset_s + self.frame.base_tau_s)
         if self.scan.offsets_s is not None:
             taus -= self.scan.offsets_s
-        motion = self.frame.c_twist, self.frame.c_acceleration
-        tau: FloatArray | float = float(taus[0]) if len(taus) and (taus == taus[0]).all() else taus
-        if isinstance(tau, np.ndarray):
-            motion = (
-                np.repeat(motion[0][:, None], len(taus), 1),
-                np.repeat(motion[1][:, None], len(taus), 1),
-            )
-        cPs = np.asarray(move_points(cTl, columns, tau, *motion).cPs).T
+        return self.placed(self.scan.points.astype(np.float64), taus, cTl)
+
+    def placed(self, lPs: FloatArray, taus_s: FloatArray, cTl: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+        """(n, 2) pixels of points (n, 3) in the LiDAR frame, NaN behind the camera, and their depths (n,).
+
+        Args:
+            taus_s: (n,) from the instant of each point to that of the image [s].
+        """
+        each = (np.repeat(a[:, None], len(lPs), 1) for a in (self.frame.c_twist, self.frame.c_acceleration))
+        columns = np.ascontiguousarray(lPs.T)
+        cPs = np.asarray(move_points(cTl, columns, taus_s, CameraTwist(*each)).cPs).T
         return self.camera.project(cPs), cPs[:, 2]
 
 

@@ -11,7 +11,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.factors.motion import move_points
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
@@ -76,8 +75,8 @@ def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | 
     frame = drawn.frame
     alt = f"Image {frame.image} of {frame.drive} with the LiDAR's points of scan {frame.scan} drawn over it"
     return (
-        f'<div class="overlay"><canvas width="{size[0]}" height="{size[1]}" role="img" aria-label="{text(alt)}">'
-        f'</canvas><img hidden alt="" src="{jpeg(picture)}">'
+        f'<div class="overlay"><canvas width="{size[0]}" height="{size[1]}" role="img" '
+        f'aria-label="{text(alt)}"></canvas><img hidden alt="" src="{jpeg(picture)}">'
         f'<script type="application/json">{_in_script(data)}</script>'
         f"<noscript>{text(alt)}: this picture needs JavaScript.</noscript></div>"
     )
@@ -93,28 +92,22 @@ def classes_of(points: PointResiduals | None) -> list[SemanticClass]:
 def project_points(
     drawn: DrawnFrame, points: PointResiduals, placement: tuple[gtsam.Pose3, float]
 ) -> tuple[FloatArray, FloatArray]:
-    """(n, 2) pixels of boundary points of the frame, NaN behind the camera, and their depths (n,) [px], [m]."""
+    """(n, 2) pixels of boundary points of the frame [px], NaN behind the camera, and depths (n,) [m]."""
     cTl, time_offset_s = placement
-    n, frame = len(points), drawn.frame
-    twist, acceleration = (np.repeat(each[:, None], n, 1) for each in (frame.c_twist, frame.c_acceleration))
-    taus = time_offset_s + points.base_taus_s
-    columns = np.ascontiguousarray((points.lPs + taus[:, None] * points.l_velocities).T)
-    cPs = np.asarray(move_points(cTl, columns, taus, twist, acceleration).cPs).T
-    return drawn.camera.project(cPs), cPs[:, 2]
-
-
-_Columns = Sequence[NDArray[np.float64]]
+    taus_s = time_offset_s + points.base_taus_s
+    return drawn.placed(points.lPs + taus_s[:, None] * points.l_velocities, taus_s, cTl)
 
 
 def _cloud(drawn: DrawnFrame, placements: Placements) -> list[FloatArray]:
-    """Pixels before and after, depths, classes and (no) residuals of points that are in one of the pictures."""
+    """Pixels before and after, depths, classes and (no) residuals of points in one of the pictures."""
     after, depths = drawn.projected(*placements.after)
     before = after if placements.before is None else drawn.projected(*placements.before)[0]
     seen = np.flatnonzero(drawn.camera.in_image(after) | drawn.camera.in_image(before))
     seen = seen[:: max(1, -(-len(seen) // _MOST_POINTS))]
     seen = seen[np.argsort(-depths[seen])]
     none = np.full(len(seen), np.nan)
-    return [before[seen], after[seen], depths[seen], drawn.scan.classes[seen].astype(np.float64), none, none]
+    classes = drawn.scan.classes[seen].astype(np.float64)
+    return [before[seen], after[seen], depths[seen], classes, none, none]
 
 
 def _boundary(drawn: DrawnFrame, placements: Placements, points: PointResiduals) -> list[FloatArray]:
@@ -137,8 +130,8 @@ def _fitted(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
 def _pixels(uvs: FloatArray, scale: float, size: tuple[int, int]) -> str:
     """Columns, then rows, as fractions of the picture's size in 16 bit."""
     places = (scale * (uvs + 0.5)) / size
-    outside = ~((places >= 0.0) & (places <= 1.0)).all(axis=1)
-    stored = np.where(outside[:, None], _HIDDEN, np.round(np.nan_to_num(places) * 65534.0).clip(0, 65535))
+    inside: NDArray[np.bool_] = ((places >= 0.0) & (places <= 1.0)).all(axis=1)
+    stored = np.where(inside[:, None], np.round(np.nan_to_num(places) * 65534.0), _HIDDEN)
     return packed(stored.astype(np.uint16).T.copy())
 
 

@@ -1,4 +1,4 @@
-"""The report's page, part by part: verdict, what to record next, pictures, residuals, likelihood, background."""
+"""The report's page, part by part: verdict, advice, pictures, objects, residuals, likelihood, background."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from sst_graph.inspect.inspection import Inspection, inspect_result
 from sst_graph.inspect.inspection_text import MOST_SENTENCES, advice_sentences, correlation_sentence
 from sst_graph.inspect.reasons import short_reason
 from sst_graph.inspect.report import Comparison, error_lines, summary
-from sst_graph.inspect.verdict import DRIVING_MPS, misfits, quality_line, verdict
+from sst_graph.inspect.verdict import DRIVING_MPS, figure, misfits, quality_line, verdict
 from sst_graph.report.close_ups import close_ups
 from sst_graph.report.drawn_frame import DrawnFrame, DriveReader
 from sst_graph.report.html import (
@@ -83,7 +83,8 @@ def report_html(inputs: ReportInputs) -> str:
     title = f"Calibration of {result.camera_name}" + (f" from {drives}" if drives else "")
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n<link rel="icon" href="data:,">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
         f"<title>{text(title)}</title>\n<style>\n{_file('page.css')}</style>\n</head>\n<body>\n"
         f"<h1>{text(title)}</h1>\n<main>\n" + "\n".join(body) + "\n</main>\n"
         f"<script>\n{_file('page.js')}</script>\n</body>\n</html>\n"
@@ -100,9 +101,9 @@ def _verdict(inputs: ReportInputs) -> str:
     rows = [
         (
             f"{one.depth_m:.0f} m",
-            f"{one.pixels:.2g} px",
-            f"{one.cm:.2g} cm",
-            f"{one.driving_pixels:.2g} px",
+            f"{figure(one.pixels)} px",
+            f"{figure(one.cm)} cm",
+            f"{figure(one.driving_pixels)} px",
         )
         for one in misfits(result)
     ]
@@ -117,16 +118,14 @@ def _verdict(inputs: ReportInputs) -> str:
         "Verdict",
         f'<p class="verdict {result.status}">{text(verdict(result))}</p>',
         paragraph(
-            "All figures are one standard deviation, of the worst axis or direction and at the worst place in the "
-            "picture. About 19 times in 20 the error is below twice as much.",
+            "All figures are one standard deviation, of the worst axis or direction and at the worst place "
+            "in the picture. About 19 times in 20 the error is below twice as much.",
             "note",
         ),
         paragraph(quality_line(quality)[0].upper() + quality_line(quality)[1:] + "." if quality else ""),
         table(head, rows, "numbers"),
+        paragraph(f"Errors against {inputs.comparison.name}:") if inputs.comparison else "",
         bullets(error_lines(inputs.comparison.errors)) if inputs.comparison else "",
-        paragraph(f"These are the errors against {inputs.comparison.name}.", "note")
-        if inputs.comparison
-        else "",
     )
 
 
@@ -156,9 +155,9 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
         points = None if fit is None else fit.points.take(_points_of(fit, one.frame))
         pictures.append(overlay(one, _placements(result, one.frame.drive), points))
     hint = (
-        "Drag in the picture or move the slider: left of the line the cloud as the start would place it, right of it "
-        "as the result does. Edges of vehicles, poles and kerbs must meet their picture. Coloured by residual, only "
-        "boundary points are shown: green ones lie within "
+        "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
+        "right of it as the result does. Edges of vehicles, poles and kerbs must meet their picture. "
+        "Coloured by residual, only boundary points are shown: green ones lie within "
         f"{CLOSE_PX:g} px of the contour of the labels (yellow)."
     )
     return section("pictures", "Before and after", paragraph(hint), *pictures) if pictures else ""
@@ -189,12 +188,14 @@ def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:
         return ""
     figures = close_ups(fit, inputs.result, lambda drive: _placements(inputs.result, drive), reader)
     hint = (
-        "The objects that determine the calibration most, then those whose labels disagree with it most. Yellow: "
-        "contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the object end, green "
-        f"within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its contour. Blue bars: how far "
-        "±2 sigma of the calibration would move the point. Most points should lie on the yellow line."
+        "The objects that determine the calibration most, then those whose labels agree with it least. "
+        "Yellow: contour of the labels, moved to the edges of the picture. Points: where the LiDAR sees the "
+        f"object end, green within {CLOSE_PX:g} px of the contour, red beyond; magenta joins each with its "
+        "contour. Blue bars: how far ±2 sigma of the calibration would move the point. Most points "
+        "should lie "
+        "on the yellow line."
     )
-    return section("objects", "Ten telling objects", paragraph(hint), grid(figures)) if figures else ""
+    return section("objects", "Telling objects", paragraph(hint), grid(figures)) if figures else ""
 
 
 def _residuals(result: CalibrationResult) -> str:
@@ -214,10 +215,11 @@ def _likelihood(inspection: Inspection) -> str:
     if fit is None or not fit.profiles:
         return ""
     hint = (
-        "Profile likelihood: one unknown is moved by some sigmas, all others are optimised again on the matches of "
-        "the result. The dashed curve is the Gaussian of the result's sigma. The profile is widened as a whole to the "
-        "result's sigma, for errors of neighbouring matches are correlated. A profile that leans or has a shoulder is "
-        "a sigma that holds to one side only."
+        "Profile likelihood: one unknown is moved by some sigmas, all others are optimised again on the "
+        "matches of the result. The dashed curve is the Gaussian of the result's sigma. The profile is "
+        "widened as a whole to the result's sigma, for errors of neighbouring matches are "
+        "correlated. A profile that "
+        "leans or has a shoulder is a sigma that holds to one side only."
     )
     return section("likelihood", "Likelihood", paragraph(hint), grid(profile_charts(fit.profiles, result)))
 

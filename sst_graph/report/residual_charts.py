@@ -47,8 +47,8 @@ def residual_charts(fit: Fit, camera: PinholeCamera) -> list[str]:
 
 
 _RANGE = (
-    "Median and middle half of the residuals. A trend towards near points is an error of the translation; one "
-    "at all ranges alike is one of the rotation or of the masks."
+    "Median and middle half of the residuals. A trend towards near points is an error of the translation; "
+    "one at all ranges alike is one of the rotation or of the masks."
 )
 _AZIMUTH = (
     "Median and middle half of the residuals. Steps or slopes that are wider than the band speak of a wrong "
@@ -105,8 +105,8 @@ def _by_frame(fit: Fit) -> str:
     return figure(
         chart.svg(),
         "By frame",
-        f"Share of the points within {CLOSE_PX:g} px. A step that stays is a mount that moved or a lost image; "
-        "single dips are frames with poor labels.",
+        f"Share of the points within {CLOSE_PX:g} px. A step that stays is a mount that moved or a lost "
+        "image; single dips are frames with poor labels.",
     )
 
 
@@ -134,8 +134,9 @@ def _by_object(points: PointResiduals) -> str:
     return figure(
         chart.svg(),
         "By object",
-        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an object far out is "
-        "drawn badly, or moves.",
+        f"The {len(groups)} objects with the most points. Most labels err by less than 1 px; an "
+        "object far out "
+        "is drawn badly, or moves.",
     )
 
 
@@ -176,8 +177,9 @@ def _over_picture(points: PointResiduals, camera: PinholeCamera) -> str:
     return figure(
         chart.svg(),
         "Over the picture",
-        f"Where the points lie against the contours, {enlarged:g} times enlarged (longest {longest:.2f} px). Short "
-        "arrows in all directions are good; a common direction, a swirl or a star is a calibration or a lens "
+        f"Where the points lie against the contours, {enlarged:g} times enlarged (longest {longest:.2f} px). "
+        "Short arrows in all directions are good; a common direction, a swirl or a star is a "
+        "calibration or a lens "
         "that is wrong.",
     )
 

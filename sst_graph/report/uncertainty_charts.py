@@ -34,8 +34,11 @@ def convergence_chart(iterations: Sequence[OuterIteration], result: CalibrationR
         ]
     )
     parts = np.abs(steps) / np.maximum(sigmas, 1e-12)
-    curves = (("rotation", parts[:, :3].max(axis=1), "a"), ("translation", parts[:, 3:6].max(axis=1), "b"))
-    curves = (*curves, ("time offset", parts[:, 6], "c"))
+    curves = (
+        ("rotation", parts[:, :3].max(axis=1), "a"),
+        ("translation", parts[:, 3:6].max(axis=1), "b"),
+        ("time offset", parts[:, 6], "c"),
+    )
     logs = [np.log10(np.maximum(values, _LEAST_SIGMAS)) for _, values, _ in curves]
     top = max(0.5, max(float(one.max()) for one in logs))
     chart = Chart(
@@ -72,7 +75,9 @@ def _profile(profile: Profile, sigma: float) -> str:
         f"Likelihood along {NAMES[profile.unknown]}",
     )
     chart.line(scale * x, np.exp(-0.5 * (x / sigma) ** 2), "muted", "Gaussian", dashed=True)
-    chart.line(scale * x, np.exp(-np.interp(x, profile.steps, tempered)), "a", "profile")
+    # Interpolated as a root of the cost, which is a straight line where the profile is a Gaussian.
+    roots = np.interp(x, profile.steps, np.sign(profile.steps) * np.sqrt(tempered))
+    chart.line(scale * x, np.exp(-(roots**2)), "a", "profile")
     chart.dots(scale * profile.steps, np.exp(-tempered), "a")
     title = NAMES[profile.unknown][0].upper() + NAMES[profile.unknown][1:]
     return figure(chart.svg(), title, f"One sigma of the result: {scale * sigma:.2g} {unit}.")
@@ -94,10 +99,10 @@ def ellipse_charts(result: CalibrationResult, pairs: Sequence[Correlation]) -> l
             (f"{NAMES[i]} [{UNITS[i]}]", f"{NAMES[j]} [{UNITS[j]}]"),
             f"Ellipses of {NAMES[i]} and {NAMES[j]}, correlation {pair.value:+.2f}",
         )
-        chart.line(*(2.0 * ellipse), "a", "2 sigma", dashed=True)
-        chart.line(*ellipse, "a", "1 sigma")
+        chart.line(2.0 * ellipse[0], 2.0 * ellipse[1], "a", "2 sigma", dashed=True)
+        chart.line(ellipse[0], ellipse[1], "a", "1 sigma")
         chart.dots([0.0], [0.0], "a")
-        caption = f"Correlation {pair.value:+.2f}: a narrow slanted ellipse is a pair that the data hardly separate."
+        caption = f"Correlation {pair.value:+.2f}: in a narrow slanted ellipse the two hardly separate."
         found.append(figure(chart.svg(), f"{_SHORT[i]} against {_SHORT[j]}", caption))
     return found
 

@@ -21,6 +21,7 @@ from sst_graph.covariance.observability import open_directions
 from sst_graph.drive.further_camera import with_camera
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import ConfigError
+from sst_graph.fit import QUALITY
 from sst_graph.graph.outer_loop import KERNELS_PX
 from sst_graph.result import CalibrationResult, Status
 from sst_graph.rig.adjustment import (
@@ -403,6 +404,7 @@ def _camera_result(
         "covariance": own.covariance.tolist(),
         "status": own.status,
     }
+    diagnostics = {key: value for key, value in own.diagnostics.items() if key != QUALITY}
     return replace(
         own,
         T_camera_lidar=cTl,
@@ -412,5 +414,6 @@ def _camera_result(
         camera_name=name,
         reasons=(*wrong, *kept, *sentences),
         weak_directions=weak,
-        diagnostics={**own.diagnostics, "by_own_images": alone},
+        diagnostics={**diagnostics, "by_own_images": alone},
+        fit=None,  # of the estimate by its own images
     )

@@ -108,7 +108,7 @@ def label_numbers(value: Any, place: str) -> LabelNumbers:
 
 
 def _class(value: Any, place: str) -> SemanticClass:
-    names = {one.name.lower(): one for one in SemanticClass}
+    names = {one.name.lower(): one for one in SemanticClass if one != SemanticClass.OBJECT}
     if not isinstance(value, str) or value.lower() not in names:
         raise DataError(place, f"the class {value!r:.40}", f"one of {', '.join(names)}")
     return names[value.lower()]

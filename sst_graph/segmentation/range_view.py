@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.types import Scan
+from sst_graph.types import Scan, intensities_of
 
 CHANNELS = 5
 """Range, x, y, z [m], remission."""
@@ -72,10 +72,11 @@ class RangeView:
         order = np.argsort(-ranges, kind="stable")
         point = np.full((self.height, self.width), -1, np.int64)
         point[rows[order], columns[order]] = order
-        if scan.intensities is None:
+        intensities = intensities_of(scan)
+        if intensities is None:
             remission = np.full(len(points), self.mean[4])
         else:
-            remission = np.nan_to_num(scan.intensities.astype(np.float64)) / self.remission_range
+            remission = np.nan_to_num(intensities.astype(np.float64)) / self.remission_range
         features = np.column_stack([ranges, points, remission])
         normal = ((features - self.mean) / self.std).astype(np.float32)
         values = np.zeros((CHANNELS, self.height, self.width), np.float32)

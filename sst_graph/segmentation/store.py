@@ -39,7 +39,7 @@ from sst_graph.errors import ConfigError, DataError
 from sst_graph.files import atomic_write_bytes, atomic_write_text
 from sst_graph.files.reading import FileKind, read_json
 from sst_graph.segmentation.segmenter import ImageLabels, PointLabels, Segmenter
-from sst_graph.types import CameraImage, Scan, SemanticClass
+from sst_graph.types import CameraImage, Scan, SemanticClass, intensities_of
 
 Side = Literal["images", "scans"]
 FORMAT = "sst-graph/labels"
@@ -168,7 +168,8 @@ class LabelStore:
         return self._place("images", model) / f"{_key(image.pixels)}.png"
 
     def _scan_path(self, model: str, scan: Scan) -> Path:
-        arrays = (scan.points,) if scan.intensities is None else (scan.points, scan.intensities)
+        intensities = intensities_of(scan)
+        arrays = (scan.points,) if intensities is None else (scan.points, intensities)
         return self._place("scans", model) / f"{_key(*arrays)}.label"
 
 

@@ -19,7 +19,7 @@ from sst_graph.factors import PinholeCamera, RobustKernel, residuals
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.features.lidar_edges import Boundaries, Edge
 from sst_graph.features.mask_contour import ContourMap
-from sst_graph.types import SemanticClass
+from sst_graph.types import PixelStretch, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 CAMERA = PinholeCamera(300.0, 300.0, 160.3, 119.6, 320, 240)
@@ -105,6 +105,37 @@ def test_gate_and_bias() -> None:
     assert len(match(ring(), grown)) == 90
     pair = ScanWithImage({VEHICLE: ring()}, {VEHICLE: disc()}, CAMERA, 0.0, STILL)
     assert match_silhouettes(pair, grown, 0.0, {VEHICLE: 3.0}, KERNEL, MatchConfig()) == {}
+
+
+def test_where_an_image_is_enlarged_its_masks_err_as_much_more() -> None:
+    """Enlarged three times along u: a distance there is a third in the pixels that were taken."""
+    squares = np.zeros((9, 11, 3), np.float32)
+    squares[..., 0], squares[..., 2] = 9.0, 1.0
+    stretch = PixelStretch(squares, 32)
+    moved = gtsam.Pose3(gtsam.Rot3(), np.array([6.0 / CAMERA.fx * DEPTH, 0.0, 0.0])).compose(CTL)
+    plain = disc()
+    enlarged = replace(plain, stretch=stretch)
+    one, other = (
+        match_silhouettes(
+            ScanWithImage({VEHICLE: ring()}, {VEHICLE: field}, CAMERA, 0.0, STILL),
+            moved,
+            0.0,
+            {VEHICLE: 0.3},
+            KERNEL,
+            MatchConfig(),
+        )[VEHICLE]
+        for field in (plain, enlarged)
+    )
+    np.testing.assert_array_equal(one.index, other.index)
+    normals = one.alignment.normals
+    assert normals is not None and other.alignment.stretches is not None
+    wanted = np.sqrt(9.0 * normals[:, 0] ** 2 + normals[:, 1] ** 2)
+    np.testing.assert_allclose(other.alignment.stretches, wanted, rtol=1e-6)
+    r, s = (residuals(m.alignment, moved, 0.0, np.zeros(6), 0.3)[0].ravel() for m in (one, other))
+    np.testing.assert_allclose(s - 0.3, (r - 0.3) / wanted, rtol=1e-6, atol=1e-9)
+    # The step to the next beam counts in the same pixels as the mask's own error.
+    steps = np.sqrt(one.alignment.sigmas_px**2 - 1.0)
+    np.testing.assert_allclose(np.sqrt(other.alignment.sigmas_px**2 - 1.0), steps / wanted, rtol=1e-6)
 
 
 def test_contours_that_face_another_direction_do_not_match() -> None:

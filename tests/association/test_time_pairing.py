@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sst_graph.association.time_pairing import Pair, nearest_images, pair_by_time
+from sst_graph.association.time_pairing import Pair, nearest_images, pair_by_time, pair_every_image
 
 EPOCH_NS = 1_700_000_000_000_000_000
 
@@ -69,3 +69,21 @@ def test_many_offsets_at_once_are_each_by_itself() -> None:
         for k, stamp in enumerate(scans):
             apart = [abs(1e-9 * (image - stamp) + time_offset_s) for image in images]
             assert own[k] == (int(np.argmin(apart)) if min(apart) <= 0.1 else -1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_image_with_its_nearest_scan(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scans = stamps(*np.sort(rng.uniform(0.0, 3.0, 20)))
+    images = stamps(*np.sort(rng.uniform(0.0, 3.0, 70)))
+    time_offset_s = rng.uniform(-0.5, 0.5)
+    expected = []
+    for j, image in enumerate(images):
+        taus = [(image - scan) * 1e-9 + time_offset_s for scan in scans]
+        nearest = int(np.argmin(np.abs(taus)))
+        if abs(taus[nearest]) <= 0.06:
+            expected.append((nearest, j, taus[nearest] - time_offset_s))
+    found = pair_every_image(scans, images, time_offset_s, 0.06)
+    assert [(p.scan, p.image) for p in found] == [(k, j) for k, j, _ in expected]
+    assert [p.base_tau_s for p in found] == pytest.approx([tau for _, _, tau in expected], abs=1e-12)
+    assert pair_every_image([], images, 0.0, 1.0) == pair_every_image(scans, [], 0.0, 1.0) == []

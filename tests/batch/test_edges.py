@@ -6,6 +6,7 @@ import dataclasses
 from functools import cache
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 from stored import simulated
@@ -18,15 +19,7 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
-STREET = SimulationConfig(
-    seed=12,
-    frames=12,
-    width=621,
-    height=188,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.3,
-    time_offset_s=0.05,
-)
+STREET = SimulationConfig(seed=504, frames=12, motion="no_stop", azimuth_limit_deg=50.0, time_offset_s=0.05)
 AWAY = np.array([0.03, -0.04, 0.03, 0.05, -0.04, 0.06])
 
 
@@ -79,21 +72,22 @@ def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def
     assert errors.nees is not None and errors.nees.joint < 3.0 * 7
 
 
-def test_stored_labels_are_not_used(result) -> None:  # type: ignore[no-untyped-def]
-    """By edges, a drive with labels and one without give the same result."""
+def test_labels_hardly_matter(result) -> None:  # type: ignore[no-untyped-def]
+    """By edges; masks still keep the features of vehicles out of visual odometry."""
     truth = labelled().truth
     assert truth is not None
     other = calibrate(labelled(), truth.cTl.retract(AWAY), CalibrationConfig(method="edges"))
-    assert result.T_camera_lidar.equals(other.T_camera_lidar, 1e-9)
-    assert result.time_offset_s == pytest.approx(other.time_offset_s, abs=1e-9)
+    step = gtsam.Pose3.Logmap(result.T_camera_lidar.between(other.T_camera_lidar))
+    assert np.degrees(np.linalg.norm(step[:3])) < 0.05 and np.linalg.norm(step[3:]) < 0.01
 
 
 def test_pictures_of_another_street_are_refused() -> None:
     other = simulated(dataclasses.replace(STREET, seed=77))
-    pictures = {frame.image.stamp_ns: frame.image.pixels for frame in other if frame.image is not None}
+    pictures = [frame.image.pixels for frame in other if frame.image is not None]
+    stamps = [frame.image.stamp_ns for frame in unlabelled() if frame.image is not None]
 
     def exchanged(image: CameraImage) -> CameraImage:
-        return dataclasses.replace(image, pixels=pictures[image.stamp_ns])
+        return dataclasses.replace(image, pixels=pictures[stamps.index(image.stamp_ns)])
 
     wrong = unlabelled().with_images(exchanged)
     assert wrong.truth is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,11 +21,12 @@ from sst_graph.cameras import (
 from sst_graph.data.frame_parts import AheadReader, SeparateReader
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.data.rectified import RectifiedSource
+from sst_graph.drive.preparation import image_features
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.mask_contour import ContourMap
 from sst_graph.odometry.features import FeatureTracker, detect_corners, gray_of, trackable_area
-from sst_graph.types import NO_PICTURE, CameraImage, Frame, SemanticClass
+from sst_graph.types import NO_PICTURE, CameraImage, Frame, PixelStretch, SemanticClass
 from sst_graph.validation import checked_image
 
 K = PinholeCamera(300.0, 305.0, 322.3, 238.6, 640, 480)
@@ -220,3 +222,34 @@ def test_a_rectified_source_streams_and_passes_on_what_its_source_says() -> None
     assert ahead.look(1) is None and ahead.frame(1) == source[1]
     with pytest.raises(IndexError):
         source[4]
+
+
+def test_stretch_of_a_fisheye_by_its_angles() -> None:
+    """Equidistant: r = f theta there, f tan(theta) here: 1 / cos^2 along the radius, tan / theta across."""
+    model = FisheyeCamera(PinholeCamera(190.0, 190.0, 321.4, 240.2, 640, 480), field_of_view_deg=190.0)
+    rectification = Rectification.of(model)
+    camera = rectification.camera
+    angles = np.deg2rad([[5.0, 0.0], [50.0, 10.0], [40.0, 100.0], [30.0, 220.0]])
+    theta, way = angles.T
+    radial = np.column_stack([np.cos(way), np.sin(way)])
+    uvs = camera.fx * np.tan(theta)[:, None] * radial + [camera.cx, camera.cy]
+    along = rectification.stretch.across(uvs, radial)
+    across = rectification.stretch.across(uvs, radial @ np.array([[0.0, 1.0], [-1.0, 0.0]]))
+    np.testing.assert_allclose(along, 1.0 / np.cos(theta) ** 2, rtol=0.03)
+    np.testing.assert_allclose(across, np.tan(theta) / theta, rtol=0.03)
+
+
+def test_stretch_goes_with_the_image_and_its_contours() -> None:
+    rectification = Rectification.of(MODELS[2])
+    raw = np.full((480, 640), OTHER, np.uint8)
+    raw[200:300, 250:400] = VEHICLE
+    image = rectification.image(CameraImage(0, raw, NO_PICTURE))
+    assert image.stretch is rectification.stretch
+    checked = checked_image(image, rectification.camera, "here")
+    features = image_features(0, checked, [SemanticClass.VEHICLE])
+    for one in (features, pickle.loads(pickle.dumps(features))):
+        contour = one.contours[SemanticClass.VEHICLE]
+        assert isinstance(contour, ContourMap) and contour.stretch == rectification.stretch
+    # Where pixels were made smaller, the pixels here limit what is seen.
+    shrunk = PixelStretch(np.full((2, 2, 3), 0.25, np.float32), 32)
+    np.testing.assert_array_equal(shrunk.across(np.ones((1, 2)), np.array([[1.0, 0.0]])), 1.0)

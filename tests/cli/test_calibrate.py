@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from stored import written
 
 from sst_graph.cli import main
 from sst_graph.cli.commands.demo import MAX_ROTATION_DEG, over_bounds
+from sst_graph.inspect.reasons import short_reasons
 from sst_graph.metrics import CalibrationErrors
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
@@ -53,7 +56,7 @@ def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest
     assert document["config"]["observability"]["time_offset_s"] == 0.05
     assert document["camera"]["name"] == "image_2"
     assert {frame["drive"] for frame in document["frames_used"]} == {"street/00"}
-    assert sorted(path.suffix for path in out.glob("[!.]*")) == [".json", ".md", *[".png"] * 3]
+    assert sorted(path.suffix for path in out.glob("[!.]*")) == [".html", ".json", ".md", *[".png"] * 3]
 
     truth = street / "sequences" / "00" / "groundtruth.json"
     assert main(["evaluate", str(out), "--truth", str(truth), "--json"]) == 0
@@ -77,12 +80,32 @@ def test_an_unobservable_direction_is_reported(
     result = read_result(out / "calibration.json")
     assert result.status == "unobservable" and result.reasons
     assert captured.err.startswith("sst-graph: unobservable: ") and captured.err.count("\n") == 1
-    assert " ".join(result.reasons[0].split()) in captured.err
+    assert short_reasons(result)[0] in captured.err
     assert any("time offset" in reason for reason in result.reasons)
     printed = " ".join(captured.out.split())
-    assert all(" ".join(reason.split()) in printed for reason in result.reasons)
+    assert all(reason in printed for reason in short_reasons(result))
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Not finished: " in page and all(html.escape(reason) in page for reason in result.reasons)
     assert result.sigmas().time_offset_ms > 100.0
     assert (out / "report.md").is_file()
+
+
+def test_the_fit_is_on_the_terminal_and_in_inspect(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "result"
+    assert _calibrate(street, out, *ONE_FRAME, "--no-report") == 3
+    line = r"fit +\d+ % of \d+ boundary points within 1.5 px of the contour \(at the start \d+ %\); labels"
+    assert re.search(line, capsys.readouterr().out)
+    assert main(["inspect", str(out)]) == 0
+    assert re.search(line, capsys.readouterr().out)
+    assert not (out / "report.html").exists() and (out / "report.md").is_file()
+
+
+def test_a_method_without_a_fit_has_a_report_too(street: Path, tmp_path: Path) -> None:
+    _calibrate(street, tmp_path / "result", *ONE_FRAME, "--method", "static")
+    page = (tmp_path / "result" / "report.html").read_text(encoding="utf-8")
+    assert 'class="overlay"' in page and 'id="residuals"' not in page
 
 
 def test_a_result_is_a_start(street: Path, tmp_path: Path) -> None:

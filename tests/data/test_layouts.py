@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 
 import gtsam
@@ -12,8 +13,9 @@ from layouts import EPOCH_NS, as_folder, as_kitti_raw, as_nuscenes, row, write_r
 from stored import written
 from streets import CROWDED_STREET
 
-from sst_graph import calibrate
+from sst_graph import CalibrationConfig, calibrate
 from sst_graph.cameras import BrownConradyCamera, Rectification
+from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.types import Frame, Source
@@ -64,6 +66,27 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     for found, raw in zip(drive[1:3], plain[1:3], strict=True):  # type: ignore[misc]
         assert found.image == rectification.image(raw.image) and found.scan == raw.scan
         assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
+
+
+def test_motion_needs_neither_labels_nor_tr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """KITTI odometry with clouds, pictures, stamps and intrinsics alone."""
+    street = written(CROWDED_STREET) / "sequences" / "00"
+    bare = tmp_path / "bare"
+    for name in ("velodyne", "image_2"):
+        shutil.copytree(street / name, bare / name)
+    shutil.copy(street / "times.txt", bare)
+    lines = (street / "calib.txt").read_text().splitlines()
+    results = []
+    for kept in (lines, [line for line in lines if not line.startswith("Tr")]):
+        (bare / "calib.txt").write_text("".join(f"{line}\n" for line in kept))
+        source = open_source(bare)
+        assert (source.nominal is None) == (source.truth is None) == (kept is not lines)
+        results.append(calibrate(source, None, CalibrationConfig(method="motion")))
+    step = gtsam.Pose3.Logmap(results[0].T_camera_lidar.between(results[1].T_camera_lidar))
+    assert np.abs(step).max() < 1e-12 and results[0].time_offset_s == results[1].time_offset_s
+    assert results[1].frames_used
+    assert main(["calibrate", str(bare), "--method", "motion", "--out", str(tmp_path / "out")]) == 2
+    assert "brings no nominal calibration: give --init none" in capsys.readouterr().err
 
 
 def test_raw_pictures_as_recorded_are_rectified(tmp_path: Path) -> None:

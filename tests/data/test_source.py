@@ -15,7 +15,7 @@ import pytest
 
 from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError, DataError
-from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source, intensities_of
 
 FRAMES, POINTS, WIDTH, HEIGHT = 5, 12, 8, 6
 TIMES_S = [0.0, 0.1, 0.2, 0.31, 0.41]
@@ -291,3 +291,13 @@ def test_shift_of_a_real_drive() -> None:
     source = open_source(DRIVES / name, image_shift=3)
     assert offset_of(source) == pytest.approx(3 * 0.1036, abs=1e-6)
     assert [frame.image is None for frame in (source[56], source[57], source[59])] == [False, True, True]
+
+
+def test_strengths_of_returns_are_those_of_the_points_that_are_used(drive: Path) -> None:
+    path = drive / "velodyne/000001.bin"
+    values = np.fromfile(path, "<f4").reshape(-1, 4)
+    values[3, 0] = np.nan
+    values.tofile(path)
+    scan = open_source(drive)[1].scan
+    assert scan is not None
+    assert np.array_equal(intensities_of(scan), np.delete(values[:, 3], 3))

@@ -12,6 +12,7 @@ from stored import simulated
 from streets import CROWDED_STREET
 
 from sst_graph import calibrate
+from sst_graph.cli.pictures import drawn_frames
 from sst_graph.data import SourceOptions, open_source
 from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, DataError
@@ -144,4 +145,12 @@ def test_a_camera_of_30_hz_with_a_lidar_of_10_hz() -> None:
     result = calibrate(street(drive), drive.nominal)
     assert result.status == "ok"
     rotation_deg, translation_m, time_offset_s = errors(result, drive)
-    assert rotation_deg < 0.08 and translation_m < 0.017 and time_offset_s < 0.007
+    assert rotation_deg < 0.08 and translation_m < 0.017 and time_offset_s < 0.004
+    # Every image is matched, a scan is named once, and pictures show a scan with the image of its instant.
+    assert result.diagnostics["pairs"] > 2 * len(result.frames_used)
+    assert len(set(result.frames_used)) == len(result.frames_used)
+    shown = drawn_frames([street(drive)], result, 3)
+    assert len(shown) == 3
+    for one in shown:
+        apart_s = (one.image.stamp_ns - one.scan.stamp_ns) * 1e-9 + result.time_offset_s
+        assert abs(apart_s) < 0.5 / 30.0 + 0.002

@@ -31,12 +31,19 @@ GOOD = {
         ("c_acceleration", np.zeros(3), r"\(3,\)"),
         ("motion_model", "se2", "se2"),
         ("weights", -1.0, "-1"),
+        ("stretches", np.ones(3), r"\(3,\)"),
+        ("stretches", np.array([1.0, 2.0, 0.0, 1.0]), "0"),
     ],
 )
 def test_says_what_is_wrong(name, value, found):
     with pytest.raises(FactorError, match=found) as caught:
         Alignment(CAMERA, **(GOOD | {name: value}))
     assert caught.value.expected
+
+
+def test_stretches_need_normals():
+    with pytest.raises(FactorError, match="no normals"):
+        Alignment(CAMERA, **(GOOD | {"normals": None, "stretches": np.ones(4)}))
 
 
 def test_arrays_are_frozen_copies():

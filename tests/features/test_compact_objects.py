@@ -79,7 +79,8 @@ def test_vehicles_of_a_street_are_compact_objects() -> None:
     scan = standing_street(0.0)[0].scan
     assert scan is not None
     found, of = recall(scan.points, scan.rings, scan.classes == SemanticClass.VEHICLE)
-    assert of > 500 and found > 0.9 * of
+    # What is lower than 0.2 m counts as ground: more of a simulated vehicle, whose labels reach down to it.
+    assert of > 500 and found > 0.85 * of
 
 
 @pytest.mark.drives

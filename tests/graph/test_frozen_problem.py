@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from streets import prepared_street, standing_street
 
+from sst_graph.covariance.cluster_robust import robust_covariance
 from sst_graph.drive.preparation import Drive, ScanFeatures
 from sst_graph.factors import RobustKernel
 from sst_graph.graph.building import GraphConfig, Tracks, associate, joint_graph, state_from
@@ -114,6 +115,59 @@ def test_normal_equations_are_the_graphs(rolling: bool, by_object: bool, config:
         x, twists = system.step(0.0)
         step = np.concatenate([x, twists.reshape(-1)])
         np.testing.assert_allclose(scale * (expected @ step) / size, scale * b / size, atol=1e-7)
+
+
+def dense() -> Drive:
+    """The moving street with three images for each scan: two more, 34 ms before and after its own."""
+    drive = moving(False)
+    images = [
+        replace(image, index=3 * k + n, stamp_ns=image.stamp_ns + (n - 1) * 34_000_000)
+        for k, image in enumerate(drive.images)
+        for n in range(3)
+    ]
+    return replace(drive, images=tuple(images))
+
+
+def test_several_images_of_a_scan_are_matched_each_by_itself() -> None:
+    drive, config = dense(), replace(PLAIN, every_image=True)
+    assert drive.has_dense_images and drive.part([0, 2]).has_dense_images
+    state = State(standing_street().truth.cTl, (0.0,), {(0, VEHICLE): 0.4}, {})
+    tracks, objects = Tracks([drive], [object_tracks(drive)]), object_tracks(drive)
+    together = associate([drive], tracks, state, KERNEL, config)
+    assert [(pair.pair.scan, pair.pair.image) for pair in together] == [(k // 3, k) for k in range(9)]
+    for pair in together:
+        (alone,) = (
+            one
+            for one in associate(
+                [replace(drive, images=drive.images[pair.pair.image : pair.pair.image + 1])],
+                tracks,
+                state,
+                KERNEL,
+                PLAIN,
+            )
+            if one.pair.scan == pair.pair.scan
+        )
+        both, own = pair.matches[VEHICLE], alone.matches[VEHICLE]
+        assert both.seen == own.seen
+        assert pair.pair.base_tau_s == pytest.approx(alone.pair.base_tau_s, abs=1e-12)
+        np.testing.assert_array_equal(both.index, own.index)
+        for name in ("pixels", "normals", "sigmas_px", "weights"):
+            one, other = getattr(both.alignment, name), getattr(own.alignment, name)
+            np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    # The normal equations are the graph's, and what the images show of a scan is one frame of the covariance.
+    (matches,) = matched([drive], state, config, True)
+    graph, values = joint_graph(together, state, config)
+    problem = FrozenProblem([matches], state, config)
+    H, _ = whole(problem.linearized(problem.start))
+    expected, _ = graph.linearize(values).hessian(problem.ordering)
+    np.testing.assert_allclose(H, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
+    robust = robust_covariance(graph, values, together, state, [objects])
+    assert sorted(set(robust.table.frames.tolist())) == [0, 1, 2]
+    # Without the setting, or at equal rates, a scan has its nearest image alone.
+    nearest = associate([drive], tracks, state, KERNEL, PLAIN)
+    assert [(pair.pair.scan, pair.pair.image) for pair in nearest] == [(k, 3 * k + 1) for k in range(3)]
+    plain = [associate([moving(False)], tracks, state, KERNEL, one) for one in (PLAIN, config)]
+    assert [p.pair for p in plain[0]] == [p.pair for p in plain[1]] and len(plain[0]) == 3
 
 
 @pytest.mark.parametrize("rolling", [False, True])

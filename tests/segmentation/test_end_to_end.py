@@ -91,8 +91,12 @@ def test_a_drive_without_labels_is_calibrated_by_networks(
     with monkeypatch.context() as patch:
         # What is stored needs no network, and no picture is labelled a second time.
         patch.setattr("sst_graph.segmentation.onnx_network.OnnxNetwork.run", None)
-        code = main(["calibrate", str(unlabelled), "--labels", labels, "--out", str(tmp_path / "a")])
-        assert main(["calibrate", str(unlabelled), *models, "--out", str(tmp_path / "b")]) == code
+        code = main(
+            ["calibrate", str(unlabelled), "--labels", labels, "--no-report", "--out", str(tmp_path / "a")]
+        )
+        assert (
+            main(["calibrate", str(unlabelled), *models, "--no-report", "--out", str(tmp_path / "b")]) == code
+        )
     first, second = (read_result(tmp_path / name / "calibration.json") for name in "ab")
     assert (first.T_camera_lidar.matrix() == second.T_camera_lidar.matrix()).all()
     assert first.time_offset_s == second.time_offset_s

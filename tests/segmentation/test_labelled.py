@@ -32,7 +32,8 @@ from sst_graph.segmentation import (
 from sst_graph.segmentation.store import StoredModel
 from sst_graph.types import NO_PICTURE, CameraImage, Frame, Scan, SemanticClass
 
-CLASSES = np.array([int(c) for c in SemanticClass if c != SemanticClass.SKY], np.uint8)
+CLASSES = np.array([c for c in SemanticClass if c != SemanticClass.OBJECT], np.uint8)
+"""That labels have; OBJECT is what geometry finds."""
 
 
 class Threshold:

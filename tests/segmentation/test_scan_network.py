@@ -14,12 +14,12 @@ from sst_graph.errors import DataError
 from sst_graph.segmentation import open_scan_segmenter
 from sst_graph.segmentation.range_view import Neighbours, RangeView
 from sst_graph.segmentation.scan_network import OnnxScanSegmenter
-from sst_graph.types import Scan, SemanticClass
+from sst_graph.types import Scan, SemanticClass, with_intensities
 
 
 def scan_of(points: np.ndarray, intensities: np.ndarray | None = None) -> Scan:
     classes = np.full(len(points), SemanticClass.IGNORE, np.uint8)
-    return Scan(7, points.astype(np.float32), classes, intensities=intensities)
+    return with_intensities(Scan(7, points.astype(np.float32), classes), intensities)
 
 
 ABOVE_AND_BELOW = scan_of(np.array([[9.0, 0, 0.4], [9.0, 3, 0.3], [9.0, 0, -1.6], [9.0, -4, -1.5]]))

@@ -123,13 +123,21 @@ def edges_method(
 def _motion_alone(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
 ) -> MotionSolution | None:
-    """What motion says; None where it says nothing or two things."""
+    """What motion says; None where it says nothing, two things, or what the guess rules out."""
+    reach_s = config.search.time_offset_s
     try:
-        reach_s = config.search.time_offset_s
         solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, reach_s, progress)
     except EstimationError:
         return None
-    return solutions[0] if solutions[0].converged and alternative(solutions) is None else None
+    possible = [
+        one
+        for one in solutions
+        if abs(one.state.time_offsets_s[0] - guess.time_offset_s) <= reach_s
+        and (guess.cTl is None or angle_deg(one.state.cTl, guess.cTl) < _MOST_DEG)
+    ]
+    if not possible or not possible[0].converged or alternative(possible) is not None:
+        return None
+    return possible[0]
 
 
 def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> _Problem:

@@ -26,9 +26,9 @@ _TURN_DEG = (2.0, 4.0)
 """Their angles [deg]."""
 _APART_DEG = 1.0
 """Other solutions farther than this are other optima [deg]."""
-MIN_CONTRAST = 7.0
+MIN_CONTRAST = 6.0
 """Least height of the estimate's score above those of the random rotations, in their standard deviations:
-right ones have 10 to 25, wrong pictures 3 to 5."""
+right ones have 7 to 25, wrong pictures 3 to 5."""
 MIN_OVER_OTHER = 1.08
 """Least ratio of the estimate's score to that of the best other optimum."""
 MAX_MOTION_CHI2 = 33.0

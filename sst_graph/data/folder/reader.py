@@ -29,7 +29,7 @@ from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, Scan, Source
+from sst_graph.types import CameraImage, Scan, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class CloudFiles:
             offsets_s = times[used]
         rings, intensities = cloud.rings(), cloud.intensities()
         points = np.ascontiguousarray(points[used])
-        return Scan(
+        scan = Scan(
             stamp_ns=stamp_ns,
             points=points,
             classes=classes,
@@ -91,8 +91,8 @@ class CloudFiles:
             offsets_s=offsets_s,
             rings=rings_from_order(points) if rings is None else rings[used],
             left_out=len(used) - len(points),
-            intensities=None if intensities is None else intensities[used],
         )
+        return with_intensities(scan, None if intensities is None else intensities[used])
 
     def _labels(
         self, k: int, cloud: Cloud, used: NDArray[np.bool_]

@@ -47,12 +47,12 @@ class KittiCalibration:
     Attributes:
         path: the file, named in errors.
         projections: (3, 4) matrices by number: P0..P3 [px].
-        c0Tl: pose of the LiDAR in the rectified camera 0 (the line ``Tr``).
+        c0Tl: pose of the LiDAR in the rectified camera 0 (the line ``Tr``), or None without that line.
     """
 
     path: Path
     projections: Mapping[int, FloatArray]
-    c0Tl: gtsam.Pose3
+    c0Tl: gtsam.Pose3 | None
 
     def projection(self, camera: str) -> FloatArray:
         """(3, 4) projection matrix [px] of a camera named as its folder ("image_2").
@@ -101,7 +101,13 @@ class KittiCalibration:
         return pose_from(np.column_stack([np.eye(3), shift]), f"{self.path} (shift of {camera})")
 
     def cTl(self, camera: str) -> gtsam.Pose3:
-        """Pose of the LiDAR in ``camera``."""
+        """Pose of the LiDAR in ``camera``.
+
+        Raises:
+            DataError: as :meth:`projection`, or the file has no line Tr.
+        """
+        if self.c0Tl is None:
+            raise DataError(self.path, "no line Tr", "Tr: 12 numbers, the LiDAR in the rectified camera 0")
         return self.cTc0(camera) * self.c0Tl
 
 
@@ -110,7 +116,7 @@ def read_calibration(path: Path) -> KittiCalibration:
 
     Raises:
         DataError: a missing file, a line with the wrong number of values or a value that is no
-            finite number, no line Tr, or a Tr whose rotation is none.
+            finite number, or a Tr whose rotation is none.
     """
     text = read_text(path, CALIB_TXT)
     matrices: dict[str, FloatArray] = {}
@@ -118,10 +124,9 @@ def read_calibration(path: Path) -> KittiCalibration:
         name, colon, values = line.partition(":")
         if colon and re.fullmatch(r"P\d|Tr", name.strip()):
             matrices[name.strip()] = _matrix(values.split(), name.strip(), f"{path}:{number}")
-    if "Tr" not in matrices:
-        raise DataError(path, "no line Tr", "Tr: 12 numbers, the LiDAR in the rectified camera 0")
     projections = {int(name[1:]): matrix for name, matrix in matrices.items() if name != "Tr"}
-    return KittiCalibration(path, projections, pose_from(matrices["Tr"], f"{path} (Tr)"))
+    c0Tl = pose_from(matrices["Tr"], f"{path} (Tr)") if "Tr" in matrices else None
+    return KittiCalibration(path, projections, c0Tl)
 
 
 def _matrix(words: list[str], name: str, place: str) -> FloatArray:

@@ -47,7 +47,7 @@ from sst_graph.errors import ConfigError, printable
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
 from sst_graph.timestamps import read_times
-from sst_graph.types import CameraImage, Frame, GroundTruth, Scan
+from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
@@ -58,8 +58,8 @@ class KittiDrive:
 
     Attributes:
         camera: intrinsics of the chosen camera.
-        nominal: cTl of ``calib.txt``.
-        truth: from ``groundtruth.json``, or else the published calibration as a reference.
+        nominal: cTl of ``calib.txt``, or None where it has no line Tr.
+        truth: from ``groundtruth.json``, or else the published calibration as a reference, if there is one.
         truth_is_reference: the truth is the published calibration: itself good to a tenth of a
             degree or so, not known to hold.
         encoding: of the masks.
@@ -67,8 +67,8 @@ class KittiDrive:
     """
 
     camera: PinholeCamera
-    nominal: gtsam.Pose3
-    truth: GroundTruth
+    nominal: gtsam.Pose3 | None
+    truth: GroundTruth | None
     truth_is_reference: bool
     encoding: MaskEncoding
     timing: SweepTiming | None = None
@@ -101,11 +101,11 @@ class KittiSource:
         return self.drive.camera
 
     @property
-    def nominal(self) -> gtsam.Pose3:
+    def nominal(self) -> gtsam.Pose3 | None:
         return self.drive.nominal
 
     @property
-    def truth(self) -> GroundTruth:
+    def truth(self) -> GroundTruth | None:
         return self.drive.truth
 
     @property
@@ -169,7 +169,7 @@ class KittiSource:
         return SourceFacts(
             scan=SensorFacts(_folder(self.files.scans), self.stamps_ns[with_scan]),
             image=SensorFacts(_folder(images), self.stamps_ns[with_image]),
-            nominal="by calib.txt",
+            nominal="calib.txt has no line Tr" if self.nominal is None else "by calib.txt",
             notes=(
                 "scans and images have the same stamps, those of times.txt",
                 *([missing] if missing else []),
@@ -188,7 +188,7 @@ class KittiSource:
         classes, instances = point_labels(self.files.labels.get(index), used)
         offsets_s = self._offsets(index, points, used)
         points = np.ascontiguousarray(points[used])
-        return Scan(
+        scan = Scan(
             stamp_ns=int(self.stamps_ns[index]),
             points=points,
             classes=classes,
@@ -196,8 +196,8 @@ class KittiSource:
             offsets_s=None if offsets_s is None else offsets_s[used],
             rings=rings_from_order(points),
             left_out=len(used) - len(points),
-            intensities=intensities[used],
         )
+        return with_intensities(scan, intensities[used])
 
     def _offsets(
         self, index: int, points: NDArray[np.float32], used: NDArray[np.bool_]
@@ -235,7 +235,7 @@ def open_kitti(path: Path, options: SourceOptions) -> KittiSource | TwoClockSour
     folder = find_sequence(path, options.sequence)
     check_camera(folder, options.camera)
     calibration = read_calibration(folder / "calib.txt")
-    nominal = calibration.cTl(options.camera)
+    nominal = None if calibration.c0Tl is None else calibration.cTl(options.camera)
     stamps_ns = read_times(folder / "times.txt")
     image_times = image_times_path(folder, options.camera)
     image_stamps_ns = None if image_times is None else read_times(image_times)
@@ -307,9 +307,11 @@ def _select(files: KittiFiles, options: SourceOptions, count: int) -> tuple[int,
     return indices
 
 
-def _shifted(truth: GroundTruth, stamps_ns: NDArray[np.int64], pairs: list[int], shift: int) -> GroundTruth:
+def _shifted(
+    truth: GroundTruth | None, stamps_ns: NDArray[np.int64], pairs: list[int], shift: int
+) -> GroundTruth | None:
     """Truth after images are stamped as those ``shift`` before: the mean stamp difference is added."""
-    if truth.time_offset_s is None:
+    if truth is None or truth.time_offset_s is None:
         return truth
     ks = np.array(pairs)
     seconds = float(np.mean(stamps_ns[ks + shift] - stamps_ns[ks])) * 1e-9

@@ -43,7 +43,7 @@ from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.files.reading import FileKind, read_text
 from sst_graph.sweep_timing import SweepStamp, SweepTiming
-from sst_graph.types import CameraImage, GroundTruth, Scan, Source
+from sst_graph.types import CameraImage, GroundTruth, Scan, Source, with_intensities
 
 TEXT_SCAN = FileKind("a cloud of lines x y z r", 64 * 1024 * 1024)
 
@@ -103,7 +103,8 @@ class RawScans:
         offsets_s = None if self.turn is None else self.turn.offsets_s(number, stamp_ns, points)
         left_out = len(used) - len(points)
         rings = rings_from_order(points)
-        return Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out, intensities[used])
+        scan = Scan(stamp_ns, points, classes, instances, offsets_s, rings, left_out)
+        return with_intensities(scan, intensities[used])
 
 
 def read_text_points(path: Path) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

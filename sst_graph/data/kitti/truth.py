@@ -16,17 +16,19 @@ _FILE = "groundtruth.json"
 _EXPECTED = '{"T_camera_lidar": 4x4, "time_offset_s": number or null, "camera": "image_2"}'
 
 
-def drive_truth(folder: Path, calibration: KittiCalibration, camera: str) -> tuple[GroundTruth, bool]:
+def drive_truth(folder: Path, calibration: KittiCalibration, camera: str) -> tuple[GroundTruth | None, bool]:
     """Truth of a drive for ``camera``, and whether it is a reference only.
 
     ``groundtruth.json`` holds ``T_camera_lidar`` of its ``camera`` (default image_2); for another one the
     shift between the rectified cameras is applied. Without that file the published
-    calibration and equal stamps stand in, as a reference.
+    calibration and equal stamps stand in, as a reference; None where there is none.
 
     Raises:
         DataError: a file that is no such JSON.
     """
     stored = read_truth(folder / _FILE)
+    if stored is None and calibration.c0Tl is None:
+        return None, True
     if stored is None:
         return GroundTruth(calibration.cTl(camera), 0.0), True
     truth = stored.truth

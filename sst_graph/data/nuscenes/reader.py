@@ -30,7 +30,7 @@ from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.files.reading import FileKind, read_file
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, GroundTruth, Scan, SemanticClass, Source, with_intensities
 
 LAYOUT = "nuScenes: PATH with v1.0-* (tables), samples and sweeps"
 _LIDAR, _CAMERA = "LIDAR_TOP", "CAM_FRONT"
@@ -89,15 +89,15 @@ class LidarFiles:
             raise DataError(path, "rings that are no whole numbers of 0 to 255", _PCD_BIN.name)
         points = np.ascontiguousarray(points[used])
         offsets_s = None if self.timing is None else self.timing.offsets_s(points)
-        return Scan(
+        scan = Scan(
             stamp_ns=int(self.stamps_ns[k]),
             points=points,
             classes=self._classes(k, used),
             offsets_s=offsets_s,
             rings=rings.astype(np.uint16),
             left_out=len(used) - len(points),
-            intensities=np.ascontiguousarray(values[used, 3]),
         )
+        return with_intensities(scan, np.ascontiguousarray(values[used, 3]))
 
     def _classes(self, k: int, used: NDArray[np.bool_]) -> NDArray[np.uint8]:
         path = self.labels.get(k)

@@ -47,7 +47,8 @@ def image_geometry(message: Any, image_topic: str, size: Size, place: str) -> Im
         raise DataError(place, f"{calibrated[0]}x{calibrated[1]} px", expected)
     table |= {"width": size[0], "height": size[1]}
     rectified = "rect" in image_topic and "unrect" not in image_topic
-    if not len(table.get("D", table.get("d", ()))):
+    D = table["D"] if "D" in table else table["d"]
+    if not len(D):
         # Drivers without a calibrated lens name a model and leave D empty.
         table["distortion_model"] = "none"
     model = camera_from_camera_info(table, rectified, place)

@@ -27,7 +27,7 @@ from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, Scan, SemanticClass, Source
+from sst_graph.types import CameraImage, Scan, SemanticClass, Source, with_intensities
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class BagMessages:
             classes, instances = classes_of_points(cloud.labels, place)
         offsets_s = cloud.offsets_s if self.timing is None else self.timing.offsets_s(cloud.points)
         rings = rings_from_order(cloud.points) if cloud.rings is None else cloud.rings
-        return Scan(
+        scan = Scan(
             stamped.stamp_ns,
             cloud.points,
             classes,
@@ -84,8 +84,8 @@ class BagMessages:
             offsets_s,
             rings,
             cloud.left_out,
-            cloud.intensities,
         )
+        return with_intensities(scan, cloud.intensities)
 
     def image(self, k: int) -> CameraImage:
         """Image k of the topic, with the mask of its stamp; errors as of a scan."""

@@ -1,0 +1,97 @@
+"""Whether the share of close points tells a right calibration from one that is 0.3 deg off.
+
+Simulated streets are solved from the truth. The share of close points, and what the labels are said to allow,
+are evaluated at the estimate, at the truth, and at calibrations turned about each axis of the LiDAR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import gtsam
+import numpy as np
+
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.config import Settings, setting
+from sst_graph.drive.preparation import Progress
+from sst_graph.fit import FitQuality
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.quality.fit_of_solution import FitOfDrives
+from sst_graph.simulator import SimulationConfig, simulate
+
+_HEAD = (
+    "| label noise | street | points | at the estimate | at the truth | allowed, at the estimate | turned about x "
+    "| about y | about z | allowed, turned |\n" + "|---" * 10 + "|"
+)
+
+
+@dataclass(frozen=True)
+class FitTableConfig(Settings):
+    """Streets of the table.
+
+    Attributes:
+        seeds: of the streets.
+        label_noises: scales of the errors of their labels.
+        turn_deg: how far calibrations are turned [deg].
+        street: the rest of them.
+        calibration: how they are solved.
+    """
+
+    seeds: tuple[int, ...] = (21, 22, 23, 24)
+    label_noises: tuple[float, ...] = (0.5, 1.0, 2.0)
+    turn_deg: float = setting(0.3, at_least=0.0, at_most=10.0)
+    street: SimulationConfig = field(
+        default_factory=lambda: SimulationConfig(frames=16, azimuth_limit_deg=50.0, time_offset_s=0.1)
+    )
+    calibration: CalibrationConfig = field(default_factory=lambda: CalibrationConfig(use_motion="never"))
+
+
+def run(config: FitTableConfig, progress: Progress | None = None) -> str:
+    """The table, in Markdown."""
+    rows, total = [_HEAD], len(config.seeds) * len(config.label_noises)
+    for noise in config.label_noises:
+        for seed in config.seeds:
+            rows.append(_row(config, seed, noise))
+            if progress is not None:
+                progress("streets", len(rows) - 1, total)
+    return "\n".join(rows) + "\n"
+
+
+def _row(config: FitTableConfig, seed: int, noise: float) -> str:
+    street = simulate(replace(config.street, seed=seed, label_noise=noise))
+    truth = street.truth
+    drives = prepare_drives([street], config.calibration)
+    offset_s = truth.time_offset_s or 0.0
+    problem = CalibrationProblem.of(drives, Guess(truth.cTl, offset_s), config.calibration)
+    state = solve_joint(problem.joint(), State(truth.cTl, (offset_s,)), NARROW_KERNELS_PX).state
+    fit = FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
+
+    def quality(at: State) -> FitQuality:
+        measured = fit.measured(at)
+        return FitQuality(0, 0.0, None, 0.0) if measured is None else fit.quality(measured, None)
+
+    here = quality(state)
+    there = quality(replace(state, cTl=truth.cTl, time_offsets_s=(offset_s,)))
+    turned = [[quality(at) for at in _turned(state, axis, config.turn_deg)] for axis in range(3)]
+    lowest = min(one.attainable for pair in turned for one in pair)
+    cells = [f"{noise:g}", str(seed), str(here.points)]
+    cells += map(_percent, (here.share, there.share, here.attainable))
+    cells += [_percent(float(np.mean([one.share for one in pair]))) for pair in turned]
+    return "| " + " | ".join([*cells, f"{_percent(lowest)} or more"]) + " |"
+
+
+def _turned(state: State, axis: int, degrees: float) -> Iterator[State]:
+    """Both ways about an axis of the LiDAR."""
+    for sign in (-1.0, 1.0):
+        step = np.zeros(6)
+        step[axis] = sign * np.radians(degrees)
+        yield replace(state, cTl=state.cTl.compose(gtsam.Pose3.Expmap(step)))
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"

@@ -1,0 +1,127 @@
+"""The verdict, and reasons in one line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from sst_graph.factors.camera import PinholeCamera
+from sst_graph.fit import FitQuality
+from sst_graph.inspect.reasons import MOST_LETTERS, short_reason, short_reasons
+from sst_graph.inspect.verdict import largest_sigmas, misfits, quality_line, verdict
+from sst_graph.result import CalibrationResult
+
+CAMERA = PinholeCamera(700.0, 700.0, 620.0, 187.0, 1241, 375)
+OPTICAL = gtsam.Pose3(gtsam.Rot3(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])), np.zeros(3))
+DEG = np.radians(1.0)
+
+
+def _result(sigmas: list[float], **values: object) -> CalibrationResult:
+    given = {"status": "ok", "camera": CAMERA, **values}
+    return CalibrationResult(OPTICAL, 0.1, np.diag(np.square(sigmas)), **given)  # type: ignore[arg-type]
+
+
+def test_a_sideways_shift_in_pixels_and_centimetres() -> None:
+    """1 cm along the LiDAR's y is 700 * 0.01 / depth pixels everywhere; the other sigmas are nothing."""
+    tiny = 1e-9
+    for one in misfits(_result([tiny] * 4 + [0.01, tiny, tiny])):
+        assert one.pixels == pytest.approx(7.0 / one.depth_m, rel=1e-4)
+        assert one.cm == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_turn_is_the_same_at_every_depth_and_largest_at_the_border() -> None:
+    """A yaw of 0.1 deg: f (1 + x^2) times the angle at the border's x = 620 / 700."""
+    tiny = 1e-9
+    near, _, far = misfits(_result([tiny, tiny, 0.1 * DEG] + [tiny] * 4))
+    ratio = 1.0 + (620.0 / 700.0) ** 2
+    # The vertical part at the corner adds x y.
+    expected = 0.1 * DEG * 700.0 * np.hypot(ratio, 620.0 / 700.0 * 187.0 / 700.0)
+    assert near.pixels == pytest.approx(expected, rel=1e-3) and far.pixels == pytest.approx(near.pixels)
+    assert far.cm == pytest.approx(6.0 * near.cm)
+
+
+def test_the_time_offset_counts_while_driving_only() -> None:
+    """10 ms at 10 m/s are 10 cm ahead: f x dz / z^2 and the same in y, at the corner."""
+    tiny = 1e-9
+    one = misfits(_result([tiny] * 6 + [0.010]))[0]
+    assert one.pixels < 1e-3
+    corner = np.hypot(620.0, 188.0)
+    assert one.driving_pixels == pytest.approx(0.1 / 10.0 * corner, rel=5e-3)
+
+
+def test_a_correlation_of_shift_and_time_offset_is_kept() -> None:
+    """What cannot be told apart while driving cancels while driving."""
+    direction = np.zeros(7)
+    direction[3], direction[6] = 0.1, 0.01
+    covariance = np.outer(direction, direction) + 1e-18 * np.eye(7)
+    one = misfits(replace(_result([1.0] * 7), covariance=covariance))[0]
+    assert one.pixels > 1.0 and one.driving_pixels < 1e-3
+
+
+def test_largest_sigmas_are_those_of_the_worst_direction() -> None:
+    degrees, cm, ms = largest_sigmas(_result([0.1 * DEG, 0.2 * DEG, 0.1 * DEG, 0.01, 0.03, 0.02, 0.002]))
+    assert (degrees, cm, ms) == pytest.approx((0.2, 3.0, 2.0))
+
+
+def test_verdicts_of_the_three_statuses() -> None:
+    sigmas = [0.05 * DEG] * 3 + [0.004] * 3 + [0.0008]
+    good = verdict(_result(sigmas))
+    assert good.startswith("Good to 0.050° and 0.40 cm: at 30 m the cloud sits within ")
+    assert good.endswith("The time offset is known to 0.80 ms.")
+    open_ = verdict(
+        _result(sigmas, status="unobservable", reasons=("the shift (1 cm) is open: record a stop",))
+    )
+    assert open_.startswith("Not finished: the shift is open: record a stop. Of the rest: 0.050°")
+    bad = verdict(_result(sigmas, status="not_converged", reasons=("stamps are late: check the clock",)))
+    assert bad == "Do not use this calibration: stamps are late: check the clock."
+
+
+@pytest.mark.parametrize(
+    ("reason", "short"),
+    [
+        (
+            "the LiDAR shifted forward cannot be distinguished from the image taken later: 1 m equals "
+            "91 ms of "
+            "time offset (one sigma: 13.9 cm, 12.7 ms): record a stop, a change of speed or a turn",
+            "the LiDAR shifted forward cannot be distinguished from the image taken later: record a stop, a "
+            "change of speed or a turn",
+        ),
+        (
+            "only 15 % of the boundary points in view meet a contour (expected 20 % or more): the pose "
+            "may be "
+            "wrong altogether",
+            "only 15 % of the boundary points in view meet a contour: the pose may be wrong altogether",
+        ),
+        (
+            "a/00: the clock jumps by 0.2 s at frame 12: calibrate the frames before it and those after "
+            "it apart",
+            "a/00: the clock jumps by 0.2 s at frame 12: calibrate the frames before it and those after "
+            "it apart",
+        ),
+        ("the outer loop still moved after 40 iterations", "the outer loop still moved after 40 iterations"),
+        ("Only one speed was seen.", "Only one speed was seen"),
+    ],
+)
+def test_a_reason_is_what_and_remedy(reason: str, short: str) -> None:
+    assert short_reason(reason) == short
+
+
+def test_long_reasons_are_cut_at_a_word() -> None:
+    short = short_reason("word " * 100 + ": do this " + "and that " * 50)
+    assert len(short) <= MOST_LETTERS and short.endswith("…") and "word…: do this and that" in short
+
+
+def test_reasons_that_shorten_alike_are_one() -> None:
+    result = _result([1.0] * 7, status="not_converged", reasons=("a (1 cm): b", "a (2 cm): b", "c"))
+    assert short_reasons(result) == ("a: b", "c")
+
+
+def test_quality_in_one_line() -> None:
+    assert quality_line(FitQuality(3412, 0.842, 0.03, 0.851)) == (
+        "84 % of 3412 boundary points within 1.5 px of the contour (at the start 3 %); labels like "
+        "these allow 85 %"
+    )
+    assert "start" not in quality_line(FitQuality(3412, 0.842, None, 0.851))

@@ -1,0 +1,150 @@
+"""The fit of a solution on a simulated street."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import gtsam
+import numpy as np
+import pytest
+from stored import stored
+from streets import CROWDED_STREET, crowded_street
+
+from sst_graph.batch import CalibrationConfig
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.method_estimate import Guess
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.drive.preparation import Drive
+from sst_graph.fit import Fit, FitQuality
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, JointSolution, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.quality import fit_of_solution
+from sst_graph.quality.fit_of_solution import FitOfDrives
+from sst_graph.quality.profiles import profiles
+from sst_graph.quality.residuals import measure_points
+
+CONFIG = CalibrationConfig(use_motion="never")
+
+
+@cache
+def _drives() -> list[Drive]:
+    street = crowded_street()
+    return stored((CROWDED_STREET, "drives of the fit"), lambda: prepare_drives([street], CONFIG))
+
+
+@cache
+def _solved() -> tuple[CalibrationProblem, JointSolution]:
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    problem = CalibrationProblem.of(_drives(), Guess(truth.cTl, truth.time_offset_s), CONFIG)
+    start = State(truth.cTl, (truth.time_offset_s,))
+    return problem, solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
+
+
+def _of_drives() -> FitOfDrives:
+    problem, _ = _solved()
+    return FitOfDrives(problem.drives, problem.tracks, problem.objects, problem.config.joint.graph)
+
+
+def _quality(state: State) -> FitQuality:
+    drives = _of_drives()
+    measured = drives.measured(state)
+    assert measured is not None
+    return drives.quality(measured, None)
+
+
+def _turned(axis: int, degrees: float) -> State:
+    state = _solved()[1].state
+    step = np.zeros(6)
+    step[axis] = np.radians(degrees)
+    return replace(state, cTl=state.cTl.compose(gtsam.Pose3.Expmap(step)))
+
+
+@cache
+def _fit() -> Fit:
+    _, solution = _solved()
+    sigmas = np.array([5e-4] * 3 + [0.005] * 3 + [0.001])
+    fit = _of_drives().fit(solution, sigmas, None, solution.iterations)
+    assert fit is not None
+    return fit
+
+
+def test_what_labels_allow_is_what_the_truth_gives() -> None:
+    truth = crowded_street().truth
+    assert truth is not None and truth.time_offset_s is not None
+    at_truth = replace(_solved()[1].state, cTl=truth.cTl, time_offsets_s=(truth.time_offset_s,))
+    assert _quality(_solved()[1].state).attainable == pytest.approx(_quality(at_truth).share, abs=0.03)
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("degrees", [-0.3, 0.3])
+def test_three_tenths_of_a_degree_are_visible(axis: int, degrees: float) -> None:
+    """At half the usual size, where they are 1.9 px; what the labels allow stays."""
+    right, wrong = _quality(_solved()[1].state), _quality(_turned(axis, degrees))
+    assert wrong.share < 0.92 * wrong.attainable
+    assert wrong.attainable == pytest.approx(right.attainable, abs=0.05)
+
+
+def test_share_at_the_start_is_of_the_same_points() -> None:
+    drives, state = _of_drives(), _solved()[1].state
+    measured = drives.measured(state)
+    assert measured is not None
+    same = drives.quality(measured, state)
+    assert same.share_at_start == same.share
+    far = drives.quality(measured, _turned(1, 5.0)).share_at_start
+    assert far is not None and far < 0.3 * same.share
+
+
+def test_derivatives_are_those_of_the_residuals() -> None:
+    """Of points that keep their contour's tangent: the residual after a small turn."""
+    problem, solution = _solved()
+    inputs = problem.drives, problem.tracks, problem.objects
+    graph = problem.config.joint.graph
+    here = measure_points(*inputs, solution.state, graph)
+    there = measure_points(*inputs, _turned(2, 0.01), graph)
+    assert here is not None and there is not None
+    places = {tuple(key): k for k, key in enumerate(there.keys.tolist())}
+    both = [(k, places[tuple(key)]) for k, key in enumerate(here.keys.tolist()) if tuple(key) in places]
+    a, b = np.array(both).T
+    change = there.points.residuals_px[b] - here.points.residuals_px[a]
+    predicted = here.points.J[a, 2] * np.radians(0.01)
+    assert np.median(np.abs(change - predicted)) < 0.05 * np.median(np.abs(predicted))
+
+
+def test_profiles_have_their_least_cost_at_the_result_and_its_curvature() -> None:
+    for profile in _fit().profiles:
+        k = int(np.argmin(profile.costs))
+        assert profile.steps[k] == 0.0 and profile.costs[k] == 0.0
+        inner = np.abs(profile.steps) <= 1.5 * np.sort(np.abs(profile.steps))[1]
+        gauss = 0.5 * (profile.steps[inner] / profile.sigma) ** 2
+        assert profile.costs[inner] == pytest.approx(gauss, rel=0.25, abs=0.05)
+
+
+def test_a_profile_is_below_every_cost_with_the_others_held() -> None:
+    """Letting the others follow can only lower the cost."""
+    _, solution = _solved()
+    frozen, optimum = solution.frozen, solution.optimum
+    best = frozen.linearized(optimum).cost
+    for profile in profiles(frozen, optimum, np.array([5e-4] * 3 + [0.005] * 3 + [0.001]), 0):
+        x = np.zeros(len(optimum.scalars) + 6)
+        x[profile.unknown] = profile.steps[-1]
+        held = frozen.linearized(frozen.moved(optimum, x, np.zeros_like(optimum.twists))).cost - best
+        assert profile.costs[-1] <= held + 1e-6
+
+
+def test_the_sample_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = _fit()
+    monkeypatch.setattr(fit_of_solution, "MOST_POINTS", 100)
+    _, solution = _solved()
+    small = _of_drives().fit(solution, np.full(7, 1e-3), None, ())
+    assert small is not None
+    assert len(small.points) <= 100 < len(whole.points) and small.quality == whole.quality
+
+
+def test_quality_is_read_back_and_nonsense_is_not() -> None:
+    quality = FitQuality(120, 0.8, None, 0.85)
+    assert FitQuality.from_diagnostics({"fit_quality": quality.to_dict()}) == quality
+    for wrong in ({"share": 1.2}, {"points": True}, {"attainable": "0.8"}, {"share_at_start": -1.0}):
+        assert FitQuality.from_diagnostics({"fit_quality": {**quality.to_dict(), **wrong}}) is None
+    assert FitQuality.from_diagnostics({"fit_quality": 3}) is None
