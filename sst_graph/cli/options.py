@@ -390,8 +390,8 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument(
         "name",
         metavar="NAME",
-        help="accuracy, assumptions, consistency, drives, motion, paper-table, rigs, slam or windows; any "
-        "other name prints what each of them shows; drives and windows need real drives: "
+        help="accuracy, assumptions, consistency, drives, fit, motion, paper-table, rigs, slam or windows; "
+        "any other name prints what each of them shows; drives and windows need real drives: "
         "--set 'data=[\"DATA\"]'",
     )
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")

@@ -25,8 +25,8 @@ from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.simulator import SimulationConfig, simulate
 
 _HEAD = (
-    "| label noise | street | points | at the estimate | at the truth | allowed, at the estimate | turned about x "
-    "| about y | about z | allowed, turned |\n" + "|---" * 10 + "|"
+    "| label noise | street | points | at the estimate | at the truth | allowed, at the estimate "
+    "| turned about x | about y | about z | allowed, turned |\n" + "|---" * 10 + "|"
 )
 
 
@@ -42,8 +42,8 @@ class FitTableConfig(Settings):
         calibration: how they are solved.
     """
 
-    seeds: tuple[int, ...] = (21, 22, 23, 24)
-    label_noises: tuple[float, ...] = (0.5, 1.0, 2.0)
+    seeds: tuple[int, ...] = setting((21, 22, 23, 24), at_least=0, at_most=2**63 - 1, length=(1, 1000))
+    label_noises: tuple[float, ...] = setting((0.5, 1.0, 2.0), at_least=0.0, at_most=2.0, length=(1, 100))
     turn_deg: float = setting(0.3, at_least=0.0, at_most=10.0)
     street: SimulationConfig = field(
         default_factory=lambda: SimulationConfig(frames=16, azimuth_limit_deg=50.0, time_offset_s=0.1)

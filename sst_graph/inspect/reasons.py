@@ -23,7 +23,9 @@ def short_reasons(result: CalibrationResult) -> tuple[str, ...]:
 
 def short_reason(reason: str) -> str:
     """What is wrong and what to do, without figures in parentheses and what stands between."""
-    clauses = [clause.strip() for clause in _BREAK.split(_PARENTHESES.sub("", reason.strip().rstrip(".")))]
+    clauses = [
+        clause.strip() for clause in _BREAK.split(_PARENTHESES.sub("", " ".join(reason.split()).rstrip(".")))
+    ]
     name = clauses.pop(0) + ": " if len(clauses) > 1 and " " not in clauses[0] else ""
     what, *rest = clauses
     what = what.split(";")[0].strip()

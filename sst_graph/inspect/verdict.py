@@ -63,7 +63,7 @@ def verdict(result: CalibrationResult) -> str:
         return f"Do not use this calibration: {first}."
     if result.status == "unobservable":
         first = next(iter(short_reasons(result)), "the data leave a direction open")
-        return f"Not finished: {first}. Of the rest: {_known(result)}"
+        return f"Not finished: {first}. As it is: {_known(result)}"
     return f"Good to {_known(result)}"
 
 

@@ -72,7 +72,8 @@ def telling_detections(points: PointResiduals, covariance: FloatArray) -> list[D
         if len(own) >= _LEAST_POINTS and (key not in best or found.share > best[key].share):
             best[key] = found
     seen: set[int] = set()
-    firsts, again = [], []
+    firsts: list[Detection] = []
+    again: list[Detection] = []
     for (track, _), found in sorted(best.items(), key=lambda item: -item[1].share):
         (again if track in seen else firsts).append(found)
         seen.add(track)
@@ -209,7 +210,7 @@ class _Crop:
         many."""
         rows, columns = pixels.shape[:2]
         room = 0.5 * np.array([_WIDTH, _HEIGHT]) / _LEAST_ZOOM - _MARGIN_PX
-        near = (np.abs(uvs[:, None] - uvs[None]) <= room).all(axis=2)
+        near = np.asarray((np.abs(uvs[:, None] - uvs[None]) <= room).all(axis=2))
         if not near.all():
             uvs = uvs[near[int(np.argmax(near @ importance))]]
         low, high = np.nanmin(uvs, axis=0) - _MARGIN_PX, np.nanmax(uvs, axis=0) + _MARGIN_PX
@@ -251,7 +252,7 @@ def _contour_path(drawn: DrawnFrame, semantic_class: SemanticClass, crop: _Crop)
     found = []
     for outline in outlines:
         at = outline[:, 0]
-        cut = ((at <= 1) | (at >= np.array(fine.shape[1::-1]) - 2)).any(axis=1)
+        cut = np.asarray(((at <= 1) | (at >= np.array(fine.shape[1::-1]) - 2)).any(axis=1))
         found.append(_path((at + 0.5) / times - 0.5 + [left + contour.left, top + contour.top], crop, cut))
     return "".join(found)
 

@@ -130,7 +130,7 @@ def _fitted(pixels: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
 def _pixels(uvs: FloatArray, scale: float, size: tuple[int, int]) -> str:
     """Columns, then rows, as fractions of the picture's size in 16 bit."""
     places = (scale * (uvs + 0.5)) / size
-    inside: NDArray[np.bool_] = ((places >= 0.0) & (places <= 1.0)).all(axis=1)
+    inside = np.asarray(((places >= 0.0) & (places <= 1.0)).all(axis=1))
     stored = np.where(inside[:, None], np.round(np.nan_to_num(places) * 65534.0), _HIDDEN)
     return packed(stored.astype(np.uint16).T.copy())
 

@@ -58,7 +58,7 @@ def calibrate_rig(
         cameras: by name, the drives of each camera: sources of the same scans (:func:`sst_graph.open_source`
             with another ``camera``), several in the same order. The LiDAR is read from those of the first.
         initial: rough guess of each cTl; a camera that is missing, or None, has none.
-        config: settings of method joint, for all cameras.
+        config: settings of all cameras; method auto is joint here.
         known: poses of cameras in one another, and a common trigger.
         initial_time_offsets_s: rough guess of each time offset; 0 for a camera that is missing [s].
         progress: called with (stage, steps done, steps in all).
@@ -67,7 +67,7 @@ def calibrate_rig(
         DataError: the frames cannot be used, or two cameras have different scans.
         ConfigError: the settings contradict each other or the data.
     """
-    config, known = config or CalibrationConfig(), known or KnownRig()
+    config, known = _by_labels(config or CalibrationConfig()), known or KnownRig()
     sources = {name: as_sources(own) for name, own in cameras.items()}
     _check(sources, config)
     known.check(list(sources))
@@ -81,6 +81,7 @@ def prepare_rig(
     sources: Mapping[str, Sequence[Source]], config: CalibrationConfig, progress: Progress | None = None
 ) -> dict[str, list[Drive]]:
     """The drives of each camera; scans, odometry and sweep are those of the first, prepared once."""
+    config = _by_labels(config)
     (first, own), *others = sources.items()
     drives = {first: prepare_drives(own, config, progress)}
     for name, theirs in others:
@@ -103,6 +104,7 @@ def calibrate_rig_prepared(
     Args:
         guesses: of every camera.
     """
+    config = _by_labels(config)
     # 1. Each camera by itself, on the same LiDAR features, odometry and object tracks.
     problems = _problems(drives, guesses, config, progress)
     cameras = {name: _solved(problem) for name, problem in problems.items()}
@@ -115,6 +117,11 @@ def calibrate_rig_prepared(
     # 4. What is known of the rig, where the estimates do not contradict it.
     after = adjusted(rig.marginal, rig.agreed)
     return rig.result(after, config)
+
+
+def _by_labels(config: CalibrationConfig) -> CalibrationConfig:
+    """The settings with method joint for auto: only its estimates have their errors by name."""
+    return replace(config, method="joint") if config.method == "auto" else config
 
 
 def _check(sources: Mapping[str, Sequence[Source]], config: CalibrationConfig) -> None:

@@ -38,7 +38,7 @@ def test_summary_carries_every_number_with_its_sigma() -> None:
     assert "0.020 0.030 0.040 deg" in text and "1.0 2.0 3.0 cm" in text
     assert "+103.60 ms +- 4.0 ms   (t_lidar = t_camera_stamp + offset)" in text
     assert "by 5.00 deg" in text and "+3.6 ms" in text
-    assert "Only one speed was seen." in text
+    assert "Only one speed was seen" in text
     assert "1 m ahead equals 118 ms." in text and "Record a stop." in text
 
 

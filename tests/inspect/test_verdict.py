@@ -74,7 +74,7 @@ def test_verdicts_of_the_three_statuses() -> None:
     open_ = verdict(
         _result(sigmas, status="unobservable", reasons=("the shift (1 cm) is open: record a stop",))
     )
-    assert open_.startswith("Not finished: the shift is open: record a stop. Of the rest: 0.050°")
+    assert open_.startswith("Not finished: the shift is open: record a stop. As it is: 0.050°")
     bad = verdict(_result(sigmas, status="not_converged", reasons=("stamps are late: check the clock",)))
     assert bad == "Do not use this calibration: stamps are late: check the clock."
 

@@ -22,7 +22,6 @@ from sst_graph.graph.state import State
 from sst_graph.quality import fit_of_solution
 from sst_graph.quality.fit_of_solution import FitOfDrives
 from sst_graph.quality.profiles import profiles
-from sst_graph.quality.residuals import measure_points
 
 CONFIG = CalibrationConfig(use_motion="never")
 
@@ -94,22 +93,6 @@ def test_share_at_the_start_is_of_the_same_points() -> None:
     assert same.share_at_start == same.share
     far = drives.quality(measured, _turned(1, 5.0)).share_at_start
     assert far is not None and far < 0.3 * same.share
-
-
-def test_derivatives_are_those_of_the_residuals() -> None:
-    """Of points that keep their contour's tangent: the residual after a small turn."""
-    problem, solution = _solved()
-    inputs = problem.drives, problem.tracks, problem.objects
-    graph = problem.config.joint.graph
-    here = measure_points(*inputs, solution.state, graph)
-    there = measure_points(*inputs, _turned(2, 0.01), graph)
-    assert here is not None and there is not None
-    places = {tuple(key): k for k, key in enumerate(there.keys.tolist())}
-    both = [(k, places[tuple(key)]) for k, key in enumerate(here.keys.tolist()) if tuple(key) in places]
-    a, b = np.array(both).T
-    change = there.points.residuals_px[b] - here.points.residuals_px[a]
-    predicted = here.points.J[a, 2] * np.radians(0.01)
-    assert np.median(np.abs(change - predicted)) < 0.05 * np.median(np.abs(predicted))
 
 
 def test_profiles_have_their_least_cost_at_the_result_and_its_curvature() -> None:

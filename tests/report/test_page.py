@@ -201,6 +201,11 @@ def test_points_are_drawn_where_their_residuals_say() -> None:
     across = ((uvs - points.pixels) * points.normals).sum(axis=1)
     assert np.ptp(points.residuals_px - across) < 0.05  # the mask bias, the same for all
     assert (depths > 0.0).all()
+    # And so do their derivatives.
+    step = np.array([2e-6, -1e-6, 3e-6, 1e-5, 2e-5, -1e-5, 1e-5])
+    cTl = result.T_camera_lidar.compose(gtsam.Pose3.Expmap(step[:6]))
+    moved, _ = project_points(drawn, points, (cTl, result.time_offset_s + step[6]))
+    assert ((moved - uvs) * points.normals).sum(axis=1) == pytest.approx(points.J @ step, abs=1e-5)
 
 
 def test_the_telling_objects_are_different_ones_first() -> None:

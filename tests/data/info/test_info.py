@@ -30,9 +30,8 @@ def test_what_is_missing_for_which_method() -> None:
     assert missing_for(EVERYTHING) == {method: () for method in METHODS}
     nothing = Content(20, 20, True, frozenset(), frozenset(), True)
     labels = ("labels of points", "semantic masks of images")
-    assert missing_for(nothing) == {
-        method: () if method in ("edges", "motion") else labels for method in METHODS
-    }
+    without = ("edges", "motion")
+    assert missing_for(nothing) == {method: () if method in without else labels for method in METHODS}
     blind = Content(1, 20, False, frozenset({"pole"}), frozenset({"vehicle"}), False)
     found = missing_for(blind)
     assert found["motion"] == ("scans", "pictures", "a nominal extrinsic (--init none does without)")
