@@ -194,6 +194,8 @@ def _binned(points: PointResiduals, values: FloatArray, label: str, title: str, 
         if len(own) >= _LEAST_POINTS:
             quartiles.append(np.quantile(points.residuals_px[own], (0.25, 0.5, 0.75)))
             middles.append(float(np.median(values[own])))
+    if not middles:
+        return ""
     low, middle, high = np.array(quartiles).T
     most = min(_MOST_PX, max(2.0, 1.1 * float(np.abs([low, high]).max())))
     chart = Chart(

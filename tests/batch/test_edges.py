@@ -107,7 +107,7 @@ def test_without_a_guess_and_without_motion_nothing_is_claimed() -> None:
 @pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(
     ("name", "shift", "deg", "metres", "seconds"),
-    [("stop", 1, 0.2, 0.03, 0.01), ("parked", 1, 0.2, 0.05, 0.012)],
+    [("stop", 1, 0.2, 0.03, 0.015), ("parked", 1, 0.2, 0.05, 0.012)],
 )
 def test_real_drives_without_label_files(
     name: str, shift: int, deg: float, metres: float, seconds: float, tmp_path: Path

@@ -140,7 +140,7 @@ BROKEN: list[tuple[str, Change, str]] = [
     (
         "nuscenes",
         edit("v1.0-mini/calibrated_sensor.json", '"camera_intrinsic": [\n[', '"camera_intrinsic": [\n[1,'),
-        "shape",
+        "camera_intrinsic",
     ),
     ("nuscenes", edit("v1.0-mini/sample_data.json", '"timestamp": 1', '"timestamp": -1', -1), "timestamp"),
 ]

@@ -148,11 +148,15 @@ def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], 
 
 
 def test_a_frame_may_be_anything(running: Path) -> None:
+    """Only what was answered to it is remembered."""
     tracker = Tracker.load(running)
+    tracker.last_update = None
     before = stored(tracker)
     for thing in (None, "frame", 3, np.zeros(3), Frame(0, None, None), Frame(0, "scan", {}), object()):
         update = tracker.add(thing)  # type: ignore[arg-type]
         assert not update.accepted and update.reason
+    assert tracker.last_update is not None and tracker.last_update.frame == 0
+    tracker.last_update = None
     assert stored(tracker) == before
 
 
