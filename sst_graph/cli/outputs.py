@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sst_graph.cli.messages import complain
-from sst_graph.cli.pictures import drawn_frames, overlay, png, telling_positions
+from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
@@ -65,21 +65,23 @@ def write_calibration(
     Args:
         with_report: write the page with pictures and charts, too.
     """
-    pictures = []
-    for source in sources:
-        drive = RecentReader(with_sweep_of(source, result.diagnostics))
+    pictures, frames = [], []
+    read = [with_sweep_of(source, result.diagnostics) for source in sources]
+    for source, swept in zip(sources, read, strict=True):
+        drive = RecentReader(swept)
         for position in telling_positions(drive, result, max(1, PICTURES // len(sources))):
             name = f"overlay_{_file_name(source.name)}_{drive.number(position):06d}.png"
-            picture = overlay(drive, position, result, _before(result, source))
-            (folder / name).write_bytes(png(picture))
+            shown = ShownFrame.of(drive, position, result)
+            (folder / name).write_bytes(png(overlay(shown, result, _before(result, source))))
+            if with_report and result.fit is None:  # else the report chooses by the fit
+                frames.append(shown.drawn())
             pictures.append(name)
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     (folder / "report.md").write_text(markdown_report(result, against, pictures), encoding="utf-8")
     if not with_report:
         return [RESULT_NAME, "report.md", *pictures]
-    read = [with_sweep_of(source, result.diagnostics) for source in sources]
-    frames = [] if result.fit else drawn_frames(read, result, PICTURES)
-    page = report_html(ReportInputs(result, read, against, frames))
+    drawn = [one for one in frames if one is not None]
+    page = report_html(ReportInputs(result, read, against, drawn))
     (folder / REPORT_NAME).write_text(page, encoding="utf-8")
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 

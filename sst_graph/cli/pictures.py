@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import cv2
@@ -40,44 +40,60 @@ def position_of(drive: RecentReader, index: int) -> int:
     raise DataError(drive.source.name, f"no frame {index}", f"one of its {len(drive)} frames")
 
 
-def overlay(
-    drive: RecentReader, position: int, result: CalibrationResult, before: Placement | None
-) -> NDArray[np.uint8]:
+@dataclass(frozen=True)
+class ShownFrame:
+    """A frame to be drawn under a result.
+
+    Attributes:
+        source: that it is of.
+        own: with its own image.
+        frame: with the image that shows the instant of its scan best.
+        other_image: whether that is another one.
+        c_twist: (6,) of the camera [rad/s, m/s]; None where the motion is unknown.
+        time_offset_s: the result's, of this drive [s].
+    """
+
+    source: Source
+    own: Frame
+    frame: Frame
+    other_image: bool
+    c_twist: FloatArray | None
+    time_offset_s: float
+
+    @classmethod
+    def of(cls, drive: RecentReader, position: int, result: CalibrationResult) -> ShownFrame:
+        """The frame at a position of the drive."""
+        time_offset_s = _offset_of(result, drive.source)
+        c_twist = camera_twist(drive, position, result.T_camera_lidar)
+        frame, other_image = _at_true_time(drive, position, time_offset_s)
+        own = _whole(drive, drive.frame(position), 0.0)
+        return cls(drive.source, own, frame, other_image, c_twist, time_offset_s)
+
+    def drawn(self) -> DrawnFrame | None:
+        """For the report of a result without a fit; None without scan or picture."""
+        frame = self.frame
+        if frame.scan is None or frame.image is None or not frame.image.has_picture:
+            return None
+        base_tau_s = (frame.image.stamp_ns - frame.scan.stamp_ns) * 1e-9
+        twist = np.zeros(6) if self.c_twist is None else self.c_twist
+        names = self.source.name, frame.index, frame.index
+        pair = MatchedFrame(*names, base_tau_s, twist, np.zeros(6))
+        return DrawnFrame(pair, frame.scan, frame.image, self.source.camera)
+
+
+def overlay(shown: ShownFrame, result: CalibrationResult, before: Placement | None) -> NDArray[np.uint8]:
     """Picture of one frame with the result, below ``before`` where there is one -> (h, w, 3) BGR.
 
     Raises:
         DataError: the frame lacks its scan or its image.
     """
-    camera = drive.source.camera
-    time_offset_s = _offset_of(result, drive.source)
-    c_twist = camera_twist(drive, position, result.T_camera_lidar)
-    frame, other_image = _at_true_time(drive, position, time_offset_s)
-    caption = "after (image closest in time)" if other_image else "after"
-    own = _whole(drive, drive.frame(position), 0.0)
-    after = draw_overlay(frame, camera, result.T_camera_lidar, time_offset_s, c_twist, caption)
+    camera, c_twist = shown.source.camera, shown.c_twist
+    caption = "after (image closest in time)" if shown.other_image else "after"
+    after = draw_overlay(shown.frame, camera, result.T_camera_lidar, shown.time_offset_s, c_twist, caption)
     if before is None:
         return after
-    start = own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
+    start = shown.own, camera, before.cTl, before.time_offset_s, c_twist, before.caption
     return stacked(draw_overlay(*start), after)
-
-
-def drawn_frames(sources: Sequence[Source], result: CalibrationResult, count: int) -> list[DrawnFrame]:
-    """Frames for the report of a result without a fit, over all drives: each with the image closest in
-    time."""
-    found = []
-    for source in sources:
-        drive = RecentReader(source)
-        for position in telling_positions(drive, result, max(1, count // len(sources))):
-            frame, _ = _at_true_time(drive, position, _offset_of(result, source))
-            if frame.scan is None or frame.image is None or not frame.image.has_picture:
-                continue
-            c_twist = camera_twist(drive, position, result.T_camera_lidar)
-            base_tau_s = (frame.image.stamp_ns - frame.scan.stamp_ns) * 1e-9
-            twist = np.zeros(6) if c_twist is None else c_twist
-            names = source.name, frame.index, frame.index
-            pair = MatchedFrame(*names, base_tau_s, twist, np.zeros(6))
-            found.append(DrawnFrame(pair, frame.scan, frame.image, source.camera))
-    return found
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -91,18 +90,8 @@ class OnnxImageSegmenter:
     def identity(self) -> str:
         """Of the network and of what is done with it."""
         model = self.model
-        numbers = sorted((k, int(c)) for k, c in model.numbers.classes.items())
-        parts = (
-            VERSION,
-            self._network.digest,
-            numbers,
-            model.numbers.others,
-            self._input,
-            model.output,
-            sorted(model.outputs.items()),
-            model.min_score,
-        )
-        return hashlib.sha256(repr(parts).encode()).hexdigest()
+        use = self._input, model.output, sorted(model.outputs.items()), model.min_score
+        return self._network.identity(VERSION, model.numbers, use)
 
     @property
     def known(self) -> frozenset[SemanticClass]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sst_graph.errors import DataError, MissingDependencyError
 from sst_graph.files.reading import FileKind, digest_of_file
+from sst_graph.segmentation.label_numbers import LabelNumbers
 
 NETWORK = FileKind("an ONNX network", 2**31)
 """Larger networks keep their weights in files of their own, for protobuf ends there."""
@@ -67,6 +68,18 @@ class OnnxNetwork:
             size if isinstance(size, int) and size > 0 else None for size in inputs[0].shape or ()
         )
         self.outputs = tuple(one.name for one in self._session.get_outputs())
+
+    def identity(self, version: int, numbers: LabelNumbers, use: tuple[object, ...]) -> str:
+        """Digest of the network and of what is done with it: labels are stored under it.
+
+        Args:
+            version: of the code that uses it.
+            numbers: what its outputs mean.
+            use: all else that the labels depend on.
+        """
+        classes = sorted((k, int(c)) for k, c in numbers.classes.items())
+        parts = (version, self.digest, classes, numbers.others, *use)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
 
     def check_input(self, expected: tuple[int | None, ...], layout: str) -> tuple[int | None, ...]:
         """The shape of the input, if it is the expected one where both know it.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -68,18 +67,8 @@ class OnnxScanSegmenter:
     def identity(self) -> str:
         """Of the network and of what is done with it."""
         model = self.model
-        numbers = sorted((k, int(c)) for k, c in model.numbers.classes.items())
-        parts = (
-            VERSION,
-            self._network.digest,
-            numbers,
-            model.numbers.others,
-            model.view,
-            model.neighbours,
-            model.output,
-            model.output_name,
-        )
-        return hashlib.sha256(repr(parts).encode()).hexdigest()
+        use = model.view, model.neighbours, model.output, model.output_name
+        return self._network.identity(VERSION, model.numbers, use)
 
     @property
     def known(self) -> frozenset[SemanticClass]:

@@ -156,7 +156,7 @@ def test_pictures_read_what_they_show(street: Path, tmp_path: Path) -> None:
         frames_used=tuple(FrameId(source.name, k) for k in range(10)),
     )
     with opened_files() as opened:
-        names = write_calibration(tmp_path, result, [source], None, with_report=False)
+        names = write_calibration(tmp_path, result, [source], None)
     assert sum(name.startswith("overlay") for name in names) == 3
     assert set(of_folders(opened, "velodyne", "labels").values()) == {1}
     images = of_folders(opened, "image_2", "semantic_2")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import gtsam
@@ -87,6 +88,11 @@ class _Problem:
     centre: State
     motion: MotionSolution | None
 
+    @cached_property
+    def some_edges(self) -> list[DriveEdges]:
+        """Boundary points of the few scans."""
+        return edges_of(self.some.drives, self.some.tracks, self.some.config.graph)
+
 
 def edges_method(
     drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
@@ -110,7 +116,9 @@ def edges_method(
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
-    contrast = edge_contrast(problem.some, solution.state, [one.state for _, one in candidates], config.seed)
+    contrast = edge_contrast(
+        problem.some_edges, solution.state, [one.state for _, one in candidates], config.seed
+    )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
     return MethodEstimate(
         solution.state.cTl,
@@ -251,10 +259,9 @@ def _starts(problem: _Problem) -> list[State]:
     Raises:
         EstimationError: none.
     """
-    edges = edges_of(problem.some.drives, problem.some.tracks, problem.some.config.graph)
-    if not edges:
+    if not problem.some_edges:
         raise EstimationError("no LiDAR edge in any scan")
-    richest: DriveEdges = max(edges, key=len)
+    richest = max(problem.some_edges, key=len)
     found = edge_starts(richest, problem.region)
     if not found:
         raise EstimationError("no LiDAR edge in any picture")
@@ -267,7 +274,6 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
     Raises:
         EstimationError: none leads anywhere.
     """
-    edges = edges_of(problem.some.drives, problem.some.tracks, problem.some.config.graph)
     found, failures = [], []
     for start in starts:
         try:
@@ -275,7 +281,7 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
         except EstimationError as error:
             failures.append(error)
             continue
-        found.append((score(edges, solution.state, SCORE_PX), solution))
+        found.append((score(problem.some_edges, solution.state, SCORE_PX), solution))
     if not found:
         raise failures[0]
     return sorted(found, key=lambda pair: -pair[0])

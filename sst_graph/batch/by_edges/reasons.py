@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from sst_graph.edges.agreement import score
 from sst_graph.edges.search import angle_deg, turned
-from sst_graph.graph.matching import edges_of
-from sst_graph.graph.outer_loop import JointProblem, JointSolution
+from sst_graph.graph.matching import DriveEdges
+from sst_graph.graph.outer_loop import JointSolution
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, difference
 
@@ -61,9 +61,10 @@ class EdgeContrast:
         return asdict(self)
 
 
-def edge_contrast(problem: JointProblem, state: State, others: Sequence[State], seed: int) -> EdgeContrast:
+def edge_contrast(
+    edges: Sequence[DriveEdges], state: State, others: Sequence[State], seed: int
+) -> EdgeContrast:
     """Scores at the estimate, at random rotations around it, and at other solutions."""
-    edges = edges_of(problem.drives, problem.tracks, problem.config.graph)
     rng = np.random.default_rng(seed)
     axes = rng.normal(size=(_TURNS, 3))
     axes /= np.linalg.norm(axes, axis=1)[:, None]

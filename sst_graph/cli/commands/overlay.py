@@ -8,7 +8,7 @@ from pathlib import Path
 from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import PNG_FILE, check_apart
-from sst_graph.cli.pictures import overlay, png, position_of
+from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
@@ -32,7 +32,8 @@ def run(args: argparse.Namespace) -> int:
         drive = RecentReader(source)
         position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
         before = _before(args.before, result, source)
-        out.write_bytes(png(overlay(drive, position, result, before)))
+        shown = ShownFrame.of(drive, position, result)
+        out.write_bytes(png(overlay(shown, result, before)))
     mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
     return 0
 
