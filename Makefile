@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test lint demo bench mutate docs lock clean
+.PHONY: setup test test-slow lint demo bench mutate docs lock clean
 
 setup: $(INSTALLED)
 
@@ -26,7 +26,11 @@ lint: $(INSTALLED)
 	$(BIN)/mypy
 
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m 'not slow'
+
+# Whole drives, kills, notebooks: what takes more than about ten seconds a test.
+test-slow: $(INSTALLED)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal -m slow
 
 demo: $(INSTALLED)
 	$(BIN)/sst-graph demo --out out/demo --overwrite

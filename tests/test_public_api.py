@@ -59,5 +59,4 @@ def test_constructors_need_few_arguments(package: ModuleType) -> None:
             parameters = inspect.signature(cls).parameters.values()
             needed = [one.name for one in parameters if one.default is one.empty]
             assert len(needed) <= 6, f"{name}: {needed}"
-            most = 8 if name == "Scan" else 7  # what a PointCloud2 has for a point, each in its own array
-            assert package is not sst_graph or len(parameters) <= most, name
+            assert package is not sst_graph or len(parameters) <= 7, name

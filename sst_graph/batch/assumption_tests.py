@@ -17,8 +17,7 @@ from typing import Any
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
-from scipy.stats import t as student_t
+from scipy.special import ndtr, stdtrit
 
 from sst_graph.assumptions import ASSUMPTIONS, Assumption, named_sigmas
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -269,8 +268,8 @@ def few_objects_factor(objects: int, threshold: float) -> float:
     objects, and the estimate over its deviation follows Student's t rather than the normal distribution
     (Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015).
     """
-    tail = float(norm.sf(threshold))
-    return float(student_t.isf(tail, max(objects - 1, _LEAST_FREEDOM))) / threshold
+    tail = float(ndtr(-threshold))
+    return -float(stdtrit(max(objects - 1, _LEAST_FREEDOM), tail)) / threshold
 
 
 def with_test_results(considered: Considered, findings: Sequence[ParameterTest]) -> Considered:
