@@ -45,10 +45,12 @@ mutate: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[mutation]'
 	$(BIN)/python benchmarks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
 
-# Pages that programs write.
+# Pages that programs write, then the site in build/site. A warning is an error.
 docs: $(INSTALLED)
-	$(BIN)/sst-graph settings --markdown > docs/settings.md
-	$(BIN)/python docs/make_api.py > docs/api.md
+	$(BIN)/sst-graph settings --markdown > docs/reference/settings.md
+	$(BIN)/python docs/make_api.py > docs/reference/api.md
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees docs build/site
+	@echo 'open build/site/index.html'
 
 # Fresh versions of everything, in a throw-away environment.
 lock:

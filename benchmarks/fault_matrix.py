@@ -5,8 +5,8 @@
 
 Prints one Markdown table; exit code 1 if a row has a failure. A run fails if an output is neither what it was
 nor what a run to its end makes of it (byte for byte), if something is left behind that the next run does not
-remove, if there is a traceback, or if the exit code is another than docs/faults.md says. Moments are uniform
-over the time that the command takes.
+remove, if there is a traceback, or if the exit code is another than docs/reference/faults.md says. Moments
+are uniform over the time that the command takes.
 
 A signal that comes before the interpreter has run the program's first line is the interpreter's: it ends the
 process as Python does (``early`` counts them; they fail only if something is left behind).

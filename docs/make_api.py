@@ -1,4 +1,8 @@
-"""Prints docs/api.md from the signatures and docstrings: ``python docs/make_api.py > docs/api.md``."""
+"""Makes the pages of the API from signatures and docstrings.
+
+``python docs/make_api.py > docs/reference/api.md`` prints the list of names; the build of the site
+adds a page for each section, with the whole docstrings.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,7 @@ import enum
 import importlib
 import inspect
 import re
+from pathlib import Path
 from typing import Any
 
 import sst_graph
@@ -58,8 +63,10 @@ SECTIONS: dict[str, list[str]] = {
 def main() -> None:
     """Print the page."""
     print("# Public API\n")
-    print("Made by `python docs/make_api.py > docs/api.md`. Conventions: [factors](../factors/__init__.py);")
-    print("terms: [glossary](glossary.md); settings: [settings](settings.md).")
+    print("Made by `python docs/make_api.py > docs/reference/api.md`. Signs, frames and units:")
+    print("[conventions](../understand/conventions.md); terms: [glossary](glossary.md);")
+    print("settings: [settings](settings.md).")
+    print("On the site, the pages below *API by section* have the whole docstrings.")
     for title, names in SECTIONS.items():
         print(f"\n## {title}\n")
         for name in names:
@@ -68,6 +75,33 @@ def main() -> None:
             print("\n".join(listed("sst_graph.export", {"CalibrationMarginal"})))
     print("\n## Factors (`sst_graph.factors`)\n")
     print("\n".join(listed("sst_graph.factors", {"PinholeCamera"})))
+
+
+def write_section_pages(folder: Path) -> None:
+    """A page of docstrings for each section, read by Sphinx's autodoc."""
+    folder.mkdir(exist_ok=True)
+    sections = {title: names for title, names in SECTIONS.items() if title != "Marginals and formats"}
+    sections["Marginals and formats"] = [f"sst_graph.export.{name}" for name in public("sst_graph.export")]
+    factors = [name for name in public("sst_graph.factors") if name != "PinholeCamera"]  # it stands in Data
+    sections["Factors"] = [f"sst_graph.factors.{name}" for name in factors]
+    for title, names in sections.items():
+        text = "\n".join([f"# {title}\n", "```{eval-rst}", *(directive(name) for name in names), "```", ""])
+        page = folder / f"{title.lower().replace(' ', '-')}.md"
+        if not page.is_file() or page.read_text(encoding="utf-8") != text:
+            page.write_text(text, encoding="utf-8")
+
+
+def public(package: str) -> list[str]:
+    """The public functions and classes of a package."""
+    names = sorted(importlib.import_module(package).__all__, key=str.lower)
+    things = {name: found(f"{package}.{name}") for name in names}
+    return [name for name, thing in things.items() if inspect.isclass(thing) or inspect.isfunction(thing)]
+
+
+def directive(path: str) -> str:
+    """Autodoc's directive for a class or a function."""
+    kind = "class" if inspect.isclass(found(path)) else "function"
+    return f".. auto{kind}:: {path}\n"
 
 
 def entry(path: str) -> list[str]:
@@ -83,10 +117,8 @@ def entry(path: str) -> list[str]:
 
 def listed(package: str, but: set[str]) -> list[str]:
     """The public functions and classes of a package, each with its first line."""
-    names = sorted(set(importlib.import_module(package).__all__) - but, key=str.lower)
-    things = [(name, found(f"{package}.{name}")) for name in names]
-    public = [(name, thing) for name, thing in things if inspect.isclass(thing) or inspect.isfunction(thing)]
-    return [f"- `{name}`: {first_line(thing)}" for name, thing in public]
+    names = [name for name in public(package) if name not in but]
+    return [f"- `{name}`: {first_line(found(f'{package}.{name}'))}" for name in names]
 
 
 def found(path: str) -> Any:

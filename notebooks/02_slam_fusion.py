@@ -139,7 +139,7 @@ print(alone.status, alone.sigmas())
 #
 # This is the loop by hand, for the biases of single vehicles and for visual odometry at the same places.
 # Without these, `sst_graph.AlignmentTerm` with `solve_with_terms` or `IncrementalTerms` does it
-# (docs/slam.md).
+# (docs/graph/slam.md).
 
 # %%
 
@@ -270,5 +270,6 @@ for name, errors in table.items():
     print(f"{name:18s}", "  ".join(f"{key} {value:.3g}" for key, value in errors.items()))
 
 # %% [markdown]
-# One street proves little: `sst-graph experiment slam` makes the table of docs/slam.md over several, in fog
-# and in clear air, where LiDAR odometry is good to two millimetres a frame and the camera adds nothing to it.
+# One street proves little: `sst-graph experiment slam` makes the table of docs/measured/slam.md over several,
+# in fog and in clear air, where LiDAR odometry is good to two millimetres a frame and the camera adds
+# nothing to it.

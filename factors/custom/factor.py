@@ -107,7 +107,7 @@ def custom_factor(
     rows: int,
     name: str = "a factor",
 ) -> gtsam.CustomFactor:
-    """error = function(*values, jacobians=...), checked at every call.
+    """``error = function(*values, jacobians=...)``, checked at every call.
 
     Args:
         noise: noise model of dimension ``rows``.

@@ -31,7 +31,7 @@ from sst_graph.types import SemanticClass
 
 MIN_CONCENTRATION = 0.7
 """Share of the support under a kernel five times as wide that must remain under the last one: labels that
-agree leave 0.67 to 0.83 (simulated streets), others 0.45 to 0.68 (real drives; docs/accuracy.md)."""
+agree leave 0.67 to 0.83 (simulated streets), others 0.45 to 0.68 (real drives; docs/results/accuracy.md)."""
 MIN_SUPPORT = 30.0
 """Least matches under the last kernel, each counted by its robust weight: a share of fewer says little."""
 _KERNELS_PX = (5.0, 4.0, 3.0)

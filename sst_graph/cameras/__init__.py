@@ -1,4 +1,4 @@
-"""Cameras with distortion, read from the formats of others, and rectified to a pinhole (docs/cameras.md)."""
+"""Cameras with distortion, read from others' formats, and rectified to a pinhole (docs/how-to/cameras.md)."""
 
 from __future__ import annotations
 

@@ -180,7 +180,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
 
 def _add_rig(command: _Parser) -> None:
     """What is known of several cameras."""
-    rig = command.add_argument_group("several cameras (docs/rigs.md)")
+    rig = command.add_argument_group("several cameras (docs/how-to/rigs.md)")
     rig.add_argument(
         "--rig",
         metavar="dataset|FILE",
@@ -203,7 +203,7 @@ def _add_estimate(command: _Parser) -> None:
         metavar="NAMES",
         help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
         "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the "
-        "standard deviation of its prior about 0 (docs/assumptions.md)",
+        "standard deviation of its prior about 0 (docs/understand/assumptions.md)",
     )
 
 
@@ -260,7 +260,9 @@ def _add_evaluate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Arg
 def _add_inspect(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "how far a result can be trusted: sigmas, correlations, weak directions, what to record next"
     inspect = commands.add_parser(
-        "inspect", help=text, description=f"{text[0].upper()}{text[1:]}; docs/inspect.md explains each line."
+        "inspect",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}; docs/how-to/inspect.md explains each line.",
     )
     inspect.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     inspect.add_argument("--all-frames", action="store_true", help="every frame in the table")
@@ -307,7 +309,7 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     export = commands.add_parser(
         "export",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}; docs/export.md states frames and signs.",
+        description=f"{text[0].upper()}{text[1:]}; docs/how-to/export.md states frames and signs.",
     )
     export.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
     export.add_argument(
@@ -353,11 +355,13 @@ def _add_info(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argumen
 def _add_segment(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
     text = "label a drive by networks ahead of its calibration, and keep the labels"
     segment = commands.add_parser(
-        "segment", help=text, description=f"{text[0].upper()}{text[1:]}; docs/networks.md has examples."
+        "segment",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}; docs/how-to/networks.md has examples.",
     )
     segment.add_argument("data", metavar="DATA", type=Path, help="dataset or sequence folder, or a bag")
     _add_source_options(segment)
-    _add_networks(segment.add_argument_group("networks (docs/networks.md)"))
+    _add_networks(segment.add_argument_group("networks (docs/how-to/networks.md)"))
     segment.add_argument(
         "--out",
         type=Path,
@@ -380,7 +384,7 @@ def _add_settings_command(commands: argparse._SubParsersAction[_Parser]) -> argp
     )
     form = settings.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true", help="print JSON")
-    form.add_argument("--markdown", action="store_true", help="print Markdown (docs/settings.md)")
+    form.add_argument("--markdown", action="store_true", help="print Markdown (docs/reference/settings.md)")
     return settings
 
 
@@ -474,7 +478,7 @@ def _add_source_options(command: argparse.ArgumentParser, several_cameras: bool 
         help="instant of a turn that a scan's stamp names, where times follow from azimuths: the laser faces "
         "forward (default), the turn begins or ends; no data separate it from a time offset",
     )
-    bag = command.add_argument_group("bags (docs/ros.md)")
+    bag = command.add_argument_group("bags (docs/how-to/ros.md)")
     bag.add_argument(
         "--image-topic", metavar="TOPIC", help="Image or CompressedImage, where there are several"
     )
@@ -496,7 +500,7 @@ def _add_source_options(command: argparse.ArgumentParser, several_cameras: bool 
 
 def _add_label_options(command: argparse.ArgumentParser) -> None:
     """Labels in the place of the data's own."""
-    networks = command.add_argument_group("labels by networks (docs/networks.md)")
+    networks = command.add_argument_group("labels by networks (docs/how-to/networks.md)")
     _add_networks(networks)
     networks.add_argument(
         "--labels",

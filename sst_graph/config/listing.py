@@ -1,4 +1,4 @@
-"""All settings below a class, one entry each: for ``sst-graph settings`` and docs/settings.md."""
+"""All settings below a class, one entry each: for ``sst-graph settings`` and docs/reference/settings.md."""
 
 from __future__ import annotations
 

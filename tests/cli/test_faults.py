@@ -1,4 +1,4 @@
-"""Small versions of the rows of docs/faults.md: what a fault leaves, and what the exit code says of it."""
+"""Small versions of the rows of docs/reference/faults.md: what a fault leaves, and what the exit code is."""
 
 from __future__ import annotations
 

@@ -76,5 +76,5 @@ def test_a_filter_by_name(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_page_is_what_the_command_prints(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["settings", "--markdown"]) == 0
-    page = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
+    page = Path(__file__).resolve().parents[2] / "docs" / "reference" / "settings.md"
     assert capsys.readouterr().out == page.read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ SHARED = "calibration."
 
 _INTRODUCTION = """# Settings
 
-Made by `sst-graph settings --markdown > docs/settings.md`.
+Made by `sst-graph settings --markdown > docs/reference/settings.md`.
 
 `calibrate` has {calibrate} settings. `track` takes them as `calibration.NAME`, and has {track} of its own.
 Give them with `--set NAME=VALUE`, or with `--config FILE` in JSON or TOML. An unknown name is refused with

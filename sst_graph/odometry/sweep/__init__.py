@@ -1,5 +1,5 @@
 """When each point of a scan was measured, where the data do not have it: decided from the scans
-(docs/sweep.md)."""
+(docs/understand/sweep.md)."""
 
 from __future__ import annotations
 
