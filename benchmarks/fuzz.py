@@ -40,11 +40,14 @@ from benchmarks import fuzz_layouts
 from benchmarks import fuzz_mutations as m
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig, calibrate, open_source
 from sst_graph.cli import main as command
+from sst_graph.cli.options import EXPORTS
 from sst_graph.config import read_config, with_overrides
 from sst_graph.config import to_dict as config_to_dict
 from sst_graph.drive.preparation import prepare_drive
 from sst_graph.errors import SstGraphError
+from sst_graph.export import ExportOptions, export_text
 from sst_graph.export.marginal import fuse_marginals, marginal_of_result, read_marginal
+from sst_graph.imports import ImportOptions, import_calibration, read_tree
 from sst_graph.reference import read_reference
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.types import Frame, SemanticClass
@@ -140,6 +143,11 @@ def prepare(folder: Path, started: bool = False) -> None:
     result = dataclasses.replace(result, status="ok", camera_name="image_2")
     (folder / "calibration.json").write_text(result.to_json())
     (folder / "marginal.json").write_text(marginal_of_result(result).to_json())
+    (folder / "exports").mkdir()
+    for target in EXPORTS:
+        # Formats with named frames, with the camera's link and its optical frame below it.
+        options = ExportOptions(child="camera_link") if target in ROBOTS else ExportOptions()
+        (folder / "exports" / target).write_text(export_text(result, target, options))
     truth = street.truth
     document = {"T_camera_lidar": truth.cTl.matrix().tolist(), "time_offset_s": 0.0, "camera": "image_2"}
     (folder / "truth.json").write_text(json.dumps(document))
@@ -253,7 +261,6 @@ def _calibration(ground: Ground, rng: Rng) -> None:
 
 def _words_about(ground: Ground, rng: Rng, result: str) -> list[str]:
     """A command on a result."""
-    formats = ("kitti", "ros-tf", "urdf", "kalibr", "autoware", "opencv", "gtsam")
     frame, ahead = (m.pick(rng, words) for words in (("0", "2", "99"), ("1", "10", "1000000000000000000")))
     picture = str(ground.folder / "o.png")
     return list(
@@ -263,7 +270,7 @@ def _words_about(ground: Ground, rng: Rng, result: str) -> list[str]:
                 ["inspect", result],
                 ["inspect", result, "--json"],
                 ["inspect", result, "--all-frames", "--next", ahead],
-                ["export", result, "--to", m.pick(rng, formats), "--force"],
+                ["export", result, "--to", m.pick(rng, EXPORTS), "--force"],
                 ["export", result, "--to", "kitti", "--calib", str(ground.folder / "calib.txt"), "--force"],
                 ["evaluate", result, "--truth", str(ground.folder / "truth.json")],
                 ["evaluate", result, "--json", "--truth", result],
@@ -290,6 +297,28 @@ def _marginal(ground: Ground, rng: Rng) -> None:
         marginal = read_marginal(path)
     marginal.factor().error(marginal.point())
     fuse_marginals([good, marginal]).best()
+
+
+def _imports(target: str) -> Callable[[Ground, Rng], None]:
+    """A file that an export wrote, as a start, as a vehicle, and by the command."""
+
+    def attempt(ground: Ground, rng: Rng) -> None:
+        mutation = m.json_text if target in ("nuscenes", "gtsam") and rng.random() < 0.6 else m.text
+        with ground.mutated(rng, ground.folder / "exports" / target, mutation) as path:
+            draw = rng.random()
+            if draw < 0.5:
+                import_calibration(path, ImportOptions(camera=m.pick(rng, (None, "image_2", "\x1b"))))
+            elif draw < 0.6:
+                import_calibration(path, form=target)
+            elif draw < 0.7:
+                read_tree(path)
+            elif draw < 0.85:
+                _command(ground, rng, ["import", str(path), *m.pick(rng, IMPORT_OPTIONS)])
+            else:
+                result = str(ground.folder / "calibration.json")
+                _command(ground, rng, ["export", result, "--to", m.pick(rng, ROBOTS), "--tree", str(path)])
+
+    return attempt
 
 
 def _settings(ground: Ground, rng: Rng) -> None:
@@ -382,6 +411,17 @@ DRIVE_FILES: tuple[tuple[str, m.Mutation], ...] = (
     ("velodyne_times/*.bin", m.array("<f4", m.FLOATS)),
 )
 
+ROBOTS = ("ros-tf", "ros1-launch", "ros2-launch", "ros2-launch-xml", "urdf", "xacro")
+IMPORT_OPTIONS = (
+    [],
+    ["--camera-frame", "camera_optical_frame", "--lidar-frame", "lidar"],
+    ["--camera-link", "camera_link"],
+    ["--from", "kalibr"],
+    ["--from", "opencv", "--camera", "a\nb"],
+    ["--lidar-frame", "\x1b[2J"],
+    ["--parent", "\u2028"],
+)
+
 Kinds = Mapping[str, tuple[Callable[[Ground, Rng], None], float]]
 
 KINDS: Kinds = {
@@ -398,6 +438,7 @@ KINDS: Kinds = {
     "calibration": (_calibration, 2.0),
     "reference": (_reference, 0.7),
     "marginal": (_marginal, 1.0),
+    **{f"import {target}": (_imports(target), 0.15) for target in EXPORTS},
     "settings": (_settings, 1.0),
     "overrides": (_overrides, 1.0),
     "checkpoint": (_checkpoint, 0.5),

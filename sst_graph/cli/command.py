@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib
+import keyword
 import logging
 import os
 import sys
@@ -39,7 +40,8 @@ def run(argv: Sequence[str]) -> int:
 def _run(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     _set_up_logging(args.verbose)
-    command = importlib.import_module(f"sst_graph.cli.commands.{args.command}")
+    name = f"{args.command}_" if keyword.iskeyword(args.command) else args.command
+    command = importlib.import_module(f"sst_graph.cli.commands.{name}")
     code: int = command.run(args)
     return code
 

@@ -11,14 +11,18 @@ from typing import Any, TypeVar
 import gtsam
 
 from sst_graph.batch import CalibrationConfig
+from sst_graph.cli.messages import complain
 from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
 from sst_graph.errors import ConfigError
-from sst_graph.reference import load_initial
+from sst_graph.imports import ImportOptions, import_calibration
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.types import SemanticClass, Source
 
 T = TypeVar("T")
+
+_SAID_BY_THEMSELVES = ("calibration", "kitti", "gtsam")
+"""Formats of starts that leave no doubt about what is the camera, the LiDAR, and the direction."""
 
 
 def open_drives(args: argparse.Namespace) -> list[Source]:
@@ -52,7 +56,10 @@ def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose
     if choice == "none":
         return None, 0.0
     if choice != "dataset":
-        return load_initial(Path(choice), camera)
+        start = import_calibration(Path(choice), ImportOptions(camera=camera))
+        if start.format not in _SAID_BY_THEMSELVES:
+            complain(f"note: --init {choice}: {start.words()}")
+        return start.cTl, start.time_offset_s or 0.0
     if source.nominal is None:
         raise ConfigError(f"{source.name} brings no nominal calibration: give --init none or --init FILE")
     return source.nominal, 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sst_graph.export.formats import FORMATS, ExportOptions, export_text
+from sst_graph.export.formats import FORMATS, export_text
 from sst_graph.export.marginal import (
     EXTRINSIC,
     TIME_OFFSET,
@@ -13,6 +13,7 @@ from sst_graph.export.marginal import (
     marginal_of_result,
     read_marginal,
 )
+from sst_graph.export.options import ExportOptions
 
 __all__ = [
     "EXTRINSIC",

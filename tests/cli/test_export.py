@@ -9,8 +9,11 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from rigs import marginal_of
+from rigs import result_of as rig_of
 
 from sst_graph.cli import main
+from sst_graph.cli.options import EXPORTS
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.reference import read_reference
 from sst_graph.result import CalibrationResult
@@ -34,7 +37,7 @@ def result_file(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("target", ["kitti", "ros-tf", "urdf", "kalibr", "autoware", "opencv", "gtsam"])
+@pytest.mark.parametrize("target", EXPORTS)
 def test_to_stdout_and_to_a_file(
     target: str, result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -88,6 +91,10 @@ def test_replaces_only_with_overwrite(
         (["--to", "urdf", "--calib", "calib.txt"], "--calib goes with --to kitti"),
         (["--to", "kitti", "--calib", "nowhere.txt"], "nowhere.txt: found no such file"),
         (["--to", "urdf", "--camera-frame", "a b"], "frame name 'a b'"),
+        (["--to", "kitti", "--parent", "lidar"], "--parent goes with --to ros-tf, ros1-launch"),
+        (["--to", "opencv", "--child", "lidar"], "--child goes with --to ros-tf, ros1-launch"),
+        (["--to", "urdf", "--parent", "base_link"], "expected a pose of 'lidar' in it, by --tree FILE"),
+        (["--to", "urdf", "--tree", "nowhere.urdf"], "nowhere.urdf: found no such file"),
     ],
 )
 def test_bad_usage(
@@ -105,3 +112,38 @@ def test_the_gtsam_export_is_the_results_covariance(
     document = json.loads(capsys.readouterr().out)
     found = np.linalg.inv(np.array(document["information"]))
     np.testing.assert_allclose(found, RESULT.covariance, rtol=1e-9, atol=1e-15)
+
+
+VEHICLE = """<robot name="v"><joint name="j" type="fixed"><parent link="base_link"/><child link="velodyne"/>
+<origin xyz="1 0 2" rpy="0 0 0"/></joint></robot>"""
+
+
+def test_into_the_tree_of_a_vehicle(
+    result_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "robot.urdf").write_text(VEHICLE)
+    tree = ["--tree", str(tmp_path / "robot.urdf"), "--lidar-frame", "velodyne"]
+    assert main(["export", str(result_file), "--to", "ros2-launch-xml", *tree]) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "" and "--frame-id base_link --child-frame-id camera_optical_frame" in printed.out
+    # 1 m ahead and 2 m up, and by T_camera_lidar 27 cm ahead, 6 cm left, 8 cm down
+    words = printed.out.split('args="')[1].split()
+    assert [float(word) for word in words[1:6:2]] == pytest.approx([1.27, 0.06, 1.92])
+    assert main(["export", str(result_file), "--to", "urdf", *tree[:2]]) == 2
+    assert "found no frame 'lidar' among base_link, velodyne" in capsys.readouterr().err
+
+
+def test_a_rig_by_its_folder_and_by_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = rig_of(marginal_of(2))
+    for name, result in rig.cameras.items():
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "calibration.json").write_text(result.to_json())
+    (tmp_path / "rig.json").write_text(rig.to_json())
+    assert main(["export", str(tmp_path), "--to", "urdf"]) == 0
+    by_folder = capsys.readouterr().out
+    assert 'child link="cam1_optical_frame"' in by_folder
+    assert main(["export", str(tmp_path / "rig.json"), "--to", "urdf"]) == 0
+    assert capsys.readouterr().out == by_folder
+    assert main(["export", str(tmp_path), "--to", "kitti"]) == 2
+    assert "expected the folder of one of its cameras" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "cam0"), "--to", "kitti"]) == 0

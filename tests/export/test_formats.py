@@ -2,43 +2,30 @@
 
 from __future__ import annotations
 
-import dataclasses
+import json
 import xml.etree.ElementTree as ET
 from pathlib import Path
+from typing import Any
 
 import cv2
-import gtsam
 import numpy as np
+import pykitti
 import pytest
 import yaml
+from calibrations import CAMERA, FORWARD, OPTICAL_FROM_LINK, matrix_of, result_of, turned
+from pyquaternion import Quaternion
 from scipy.spatial.transform import Rotation
 
+from sst_graph.cli.options import EXPORTS
 from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import FORMATS, ExportOptions, export_text
-from sst_graph.export.formats import fixed_axis_rpy, quaternion_xyzw
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.result import CalibrationResult, DriveOffset
-
-FORWARD = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
-CAMERA = PinholeCamera(700.0, 710.0, 600.0, 180.0, 1242, 375)
-
-
-def result_of(R: np.ndarray, t: list[float], **changes: object) -> CalibrationResult:
-    sigmas = np.array([0.002, 0.002, 0.002, 0.01, 0.02, 0.03, 0.004])
-    result = CalibrationResult(
-        gtsam.Pose3(gtsam.Rot3(R), np.array(t)), -0.0375, np.diag(sigmas**2), "ok", CAMERA, "image_2"
-    )
-    return dataclasses.replace(result, **changes)
 
 
 @pytest.fixture(params=range(8))
 def result(request: pytest.FixtureRequest) -> CalibrationResult:
-    """By hand, near the gimbal lock that a LiDAR in an optical frame has, and anywhere."""
-    rng = np.random.default_rng(request.param)
-    sizes = [0.0, 1e-9, 1e-5, 0.02, 0.02, 1.0, 1.0, 3.0]
-    R = FORWARD @ Rotation.from_rotvec(sizes[request.param] * rng.normal(size=3)).as_matrix()
-    return result_of(R, [0.06, -0.08, -1e-5])
+    return turned(request.param)
 
 
 def test_kitti_reads_back_through_the_shift_of_p2(result: CalibrationResult, tmp_path: Path) -> None:
@@ -50,10 +37,25 @@ def test_kitti_reads_back_through_the_shift_of_p2(result: CalibrationResult, tmp
     calibration = read_calibration(original)
     exported = tmp_path / "calib.txt"
     exported.write_text(export_text(result, "kitti", ExportOptions(kitti=calibration)))
+    # pykitti, as its odometry class does: T_cam2_velo is Tr shifted by K^-1 P2's fourth column
+    by_pykitti = pykitti.utils.read_calib_file(exported)
+    P2, Tr = by_pykitti["P2"].reshape(3, 4), by_pykitti["Tr"].reshape(3, 4)
+    shifted = Tr + np.outer(np.linalg.solve(P2[:, :3], P2[:, 3]), [0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(shifted, result.T_camera_lidar.matrix()[:3], atol=1e-12)
     again = read_calibration(exported)
-    assert np.allclose(again.cTl("image_2").matrix(), result.T_camera_lidar.matrix(), atol=1e-12)
     for number in (0, 2):
         np.testing.assert_array_equal(again.projections[number], calibration.projections[number])
+
+
+def test_kitti_by_the_odometry_class_of_pykitti(kitti_drive: Path) -> None:
+    """A whole data set with our calib.txt; the class wants P0 to P3 and the shift along x alone."""
+    calib = kitti_drive / "calib.txt"
+    calib.write_text(calib.read_text() + "P1: 700 0 4 -200 0 700 3 0 0 0 1 0\n")
+    result = result_of(FORWARD, [0.01, -0.08, -0.27])
+    text = export_text(result, "kitti", ExportOptions(kitti=read_calibration(calib)))
+    calib.write_text(text)
+    found = pykitti.odometry(str(kitti_drive.parents[1]), "00").calib
+    np.testing.assert_allclose(found.T_cam2_velo, result.T_camera_lidar.matrix(), atol=1e-12)
 
 
 def test_kitti_by_hand(tmp_path: Path) -> None:
@@ -75,46 +77,6 @@ def test_kitti_without_calib_takes_the_camera_for_camera_0(result: CalibrationRe
         assert again.camera(name, 1242, 375) == CAMERA
 
 
-def test_ros_transform(result: CalibrationResult) -> None:
-    text = export_text(result, "ros-tf", ExportOptions("cam_optical", "velodyne"))
-    message = yaml.safe_load(text)
-    assert message["header"]["frame_id"] == "cam_optical" and message["child_frame_id"] == "velodyne"
-    t, q = (message["transform"][name] for name in ("translation", "rotation"))
-    R = Rotation.from_quat([q["x"], q["y"], q["z"], q["w"]]).as_matrix()
-    T = result.T_camera_lidar.matrix()
-    np.testing.assert_allclose(R, T[:3, :3], atol=1e-9)
-    np.testing.assert_array_equal([t["x"], t["y"], t["z"]], T[:3, 3])
-    words = next(line for line in text.splitlines() if "static_transform_publisher" in line).split()
-    flags = {name: words[words.index(f"--{name}") + 1] for name in ("x", "qw", "frame-id", "child-frame-id")}
-    assert float(flags["x"]) == t["x"] and float(flags["qw"]) == q["w"]
-    assert (flags["frame-id"], flags["child-frame-id"]) == ("cam_optical", "velodyne")
-
-
-def test_quaternion_by_hand() -> None:
-    assert quaternion_xyzw(gtsam.Rot3.Rz(np.pi / 2)) == pytest.approx([0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-    assert quaternion_xyzw(gtsam.Rot3.Rx(-1.5 * np.pi))[3] >= 0.0
-
-
-def test_urdf(result: CalibrationResult) -> None:
-    root = ET.fromstring(export_text(result, "urdf", ExportOptions("cam", "front/lidar")))
-    joint = root.find("joint")
-    assert joint is not None and joint.get("type") == "fixed"
-    assert joint.find("parent").get("link") == "cam" and joint.find("child").get("link") == "front/lidar"
-    assert {link.get("name") for link in root.findall("link")} == {"cam", "front/lidar"}
-    origin = joint.find("origin")
-    rpy = [float(x) for x in origin.get("rpy").split()]
-    T = result.T_camera_lidar.matrix()
-    # scipy's lower-case xyz: fixed axes
-    np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), T[:3, :3], atol=1e-9)
-    np.testing.assert_array_equal([float(x) for x in origin.get("xyz").split()], T[:3, 3])
-
-
-def test_fixed_axes_by_hand() -> None:
-    # roll 90 deg about x, then yaw 90 deg about the fixed z: y -> z -> z, x -> y, z -> -y -> x
-    R = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    assert fixed_axis_rpy(gtsam.Rot3(R)) == pytest.approx([np.pi / 2, 0.0, np.pi / 2])
-
-
 def test_kalibr(result: CalibrationResult) -> None:
     cam = yaml.safe_load(export_text(result, "kalibr"))["cam0"]
     np.testing.assert_allclose(np.array(cam["T_cam_imu"]), result.T_camera_lidar.matrix(), atol=1e-15)
@@ -123,26 +85,51 @@ def test_kalibr(result: CalibrationResult) -> None:
     assert cam["timeshift_cam_imu"] == result.time_offset_s
 
 
+def _nodes(node: Any) -> list[list[float]]:
+    """Rows of a matrix in a file of OpenCV's, read as OpenVINS and MINS do it: entry by entry."""
+    return [[node.at(r).at(c).real() for c in range(node.at(r).size())] for r in range(node.size())]
+
+
+@pytest.mark.parametrize(("target", "shift"), [("openvins", "timeshift_cam_imu"), ("mins", "timeoffset")])
+def test_openvins_and_mins_by_the_storage_that_they_read(
+    result: CalibrationResult, tmp_path: Path, target: str, shift: str
+) -> None:
+    path = tmp_path / "chain.yaml"
+    path.write_text(export_text(result, target))
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    cam = storage.getNode("cam0")
+    iTc = np.array(_nodes(cam.getNode("T_imu_cam")))
+    np.testing.assert_allclose(np.linalg.inv(iTc), result.T_camera_lidar.matrix(), atol=1e-12)
+    assert cam.getNode(shift).real() == result.time_offset_s  # both: t_imu = t_cam + shift
+    values = [cam.getNode("intrinsics").at(k).real() for k in range(4)]
+    assert values == [700.0, 710.0, 600.0, 180.0]
+    assert cam.getNode("distortion_model").string() == "radtan"
+    if target == "mins":
+        lidar = storage.getNode("lidar0")
+        np.testing.assert_array_equal(_nodes(lidar.getNode("T_imu_lidar")), np.eye(4))
+        assert lidar.getNode("timeoffset").real() == 0.0 and lidar.getNode("topic").string() == "/lidar"
+
+
 def test_autoware(result: CalibrationResult) -> None:
     kit = yaml.safe_load(export_text(result, "autoware"))["sensor_kit_base_link"]
     assert kit["lidar"] == dict.fromkeys(("x", "y", "z", "roll", "pitch", "yaw"), 0.0)
     pose = kit["camera0/camera_link"]
-    link = np.eye(4)
     angles = [pose["roll"], pose["pitch"], pose["yaw"]]
-    link[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
-    link[:3, 3] = pose["x"], pose["y"], pose["z"]
-    optical = np.eye(4)  # as Autoware's camera xacro has it
-    optical[:3, :3] = Rotation.from_euler("xyz", [-np.pi / 2, 0.0, -np.pi / 2]).as_matrix()
+    link = matrix_of([pose["x"], pose["y"], pose["z"]], Rotation.from_euler("xyz", angles))
+    # as Autoware's camera xacro has it
+    optical = matrix_of(np.zeros(3), Rotation.from_euler("xyz", [-np.pi / 2, 0.0, -np.pi / 2]))
     found = np.linalg.inv(link @ optical)
     np.testing.assert_allclose(found, result.T_camera_lidar.matrix(), atol=1e-9)
 
 
 def test_autoware_by_hand() -> None:
     # the camera 30 cm in front of the LiDAR, 20 cm below it and 10 cm to its left, looking ahead
-    text = export_text(result_of(FORWARD, [0.1, -0.2, -0.3]), "autoware")
-    pose = yaml.safe_load(text)["sensor_kit_base_link"]["camera0/camera_link"]
+    options = ExportOptions(lidar_frame="velodyne_top", camera_link="front/camera_link", parent=None)
+    text = export_text(result_of(FORWARD, [0.1, -0.2, -0.3]), "autoware", options)
+    kit = yaml.safe_load(text)["sensor_kit_base_link"]
     expected = {"x": 0.3, "y": 0.1, "z": -0.2, "roll": 0.0, "pitch": 0.0, "yaw": 0.0}
-    assert pose == pytest.approx(expected, abs=1e-12)
+    assert kit["front/camera_link"] == pytest.approx(expected, abs=1e-12)
+    assert set(kit) == {"velodyne_top", "front/camera_link"}
 
 
 def test_opencv(result: CalibrationResult) -> None:
@@ -160,27 +147,80 @@ def test_opencv(result: CalibrationResult) -> None:
     np.testing.assert_allclose(values["covariance"], result.covariance)
 
 
-@pytest.mark.parametrize("target", ["ros-tf", "urdf", "kalibr", "autoware", "opencv"])
-def test_every_commented_format_states_frames_and_sign(target: str) -> None:
+def _transform_matrix(record: dict[str, Any]) -> np.ndarray:
+    """nuscenes-devkit's ``transform_matrix`` from sensor to ego (the devkit itself needs NumPy 1)."""
+    T = np.eye(4)
+    T[:3, :3] = Quaternion(record["rotation"]).rotation_matrix
+    T[:3, 3] = np.transpose(np.array(record["translation"]))
+    return T
+
+
+def test_nuscenes(result: CalibrationResult) -> None:
+    records = {one["channel"]: one for one in json.loads(export_text(result, "nuscenes"))}
+    camera, lidar = (_transform_matrix(records[name]) for name in ("image_2", "lidar"))
+    found = np.linalg.inv(camera) @ lidar
+    np.testing.assert_allclose(found, result.T_camera_lidar.matrix(), atol=1e-12)
+    np.testing.assert_array_equal(records["image_2"]["camera_intrinsic"], CAMERA.matrix)
+    assert records["lidar"]["camera_intrinsic"] == []
+    assert records["image_2"]["time_offset_s"] == result.time_offset_s
+    tokens = [one[key] for one in records.values() for key in ("token", "sensor_token")]
+    assert len(set(tokens)) == 4 and all(len(token) == 32 for token in tokens)
+
+
+@pytest.mark.parametrize("target", sorted(set(FORMATS) - {"kitti", "gtsam"}))
+def test_every_format_with_comments_states_axes_direction_and_sign(target: str) -> None:
     result = result_of(
         FORWARD,
         [0.0, 0.0, 0.0],
         status="unobservable",
         drive_offsets=(DriveOffset("a--b", 0.1, 0.01),),
     )
-    text = export_text(result, target, ExportOptions("cam", "lid"))
-    assert "parent cam" in text and "child lid" in text
+    text = export_text(result, target, ExportOptions("cam", None, "lid"))
     assert "t_lidar = t_camera_stamp + time_offset_s, time_offset_s = -0.0375" in text
     assert "STATUS unobservable" in text and "+0.100000 s" in text
-    if target == "urdf":
-        assert ET.fromstring(text).tag == "robot"
+    assert "z forward" in text or "x forward" in text
+    direction = {
+        "kalibr": "T_cam_imu: p_camera = T_cam_imu * p_imu",
+        "openvins": "T_imu_cam: p_imu = T_imu_cam * p_camera",
+        "mins": "T_imu_cam: p_imu = T_imu_cam * p_camera; T_imu_lidar: p_imu = T_imu_lidar * p_lidar",
+        "opencv": "p_camera = T_camera_lidar * p_lidar",
+        "nuscenes": "p_lid = T * p_sensor",
+    }
+    assert direction.get(target, "p_parent = T * p_child") in text
+    if text.startswith("<"):
+        assert ET.fromstring(text).tag in ("robot", "launch")
+
+
+def test_the_axes_of_the_optical_frame() -> None:
+    """By hand: in an optical frame forward is z, left is -x, up is -y."""
+    link = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])  # forward, left, up
+    optical = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    np.testing.assert_array_equal(link @ OPTICAL_FROM_LINK.T, optical)
+
+
+def test_the_command_line_offers_every_format() -> None:
+    assert set(EXPORTS) == set(FORMATS)
 
 
 def test_refuses_what_it_cannot_write() -> None:
     result = result_of(FORWARD, [0.0, 0.0, 0.0])
     with pytest.raises(ConfigError, match="expected one of kitti"):
         export_text(result, "autocad")
-    for name in ("", "a b", 'a"b', "a--b", "a:b"):
+    for name in ("", "a b", 'a"b', "a--b", "a:b", "--x", "${x}", "a\n"):
         with pytest.raises(ConfigError, match="frame name"):
             ExportOptions(camera_frame=name)
-    assert set(FORMATS) == {"kitti", "ros-tf", "urdf", "kalibr", "autoware", "opencv", "gtsam"}
+    with pytest.raises(ConfigError, match="both sensors"):
+        ExportOptions(camera_frame="lidar")
+    for target, options in (
+        ("kitti", ExportOptions(parent="lidar")),
+        ("opencv", ExportOptions(child="lidar")),
+        ("autoware", ExportOptions(child="lidar")),
+    ):
+        with pytest.raises(ConfigError, match="goes with --to ros-tf"):
+            export_text(result, target, options)
+
+
+@pytest.mark.parametrize("name", ["1e5", "yes", "null", "2", "0.5", "_", "/lidar"])
+def test_names_that_yaml_would_take_for_something_else(name: str) -> None:
+    text = export_text(result_of(FORWARD, [0.0, 0.0, 0.0]), "ros-tf", ExportOptions("cam", None, name))
+    assert yaml.safe_load(text)["child_frame_id"] == name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import complain, mention, say
@@ -11,13 +12,18 @@ from sst_graph.data.kitti.calib import read_calibration
 from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text
 from sst_graph.files import output_file
+from sst_graph.imports import read_tree
+from sst_graph.result import CalibrationResult
+from sst_graph.rig import RigResult, read_rig
+from sst_graph.rig.result import RIG_NAME
 
 
 def run(args: argparse.Namespace) -> int:
     """Write ``args.result`` as ``args.to`` to ``args.out``, or to stdout."""
     if args.calib is not None and args.to != "kitti":
         raise ConfigError(f"--calib goes with --to kitti, found --to {args.to}")
-    check_apart({"RESULT": result_file(args.result), "--calib": args.calib}, {"--out": args.out})
+    inputs = {"RESULT": _file(args.result), "--calib": args.calib, "--tree": args.tree}
+    check_apart(inputs, {"--out": args.out})
     if args.out is None:
         say(_text(args), end="")
         return 0
@@ -29,12 +35,30 @@ def run(args: argparse.Namespace) -> int:
 
 def _text(args: argparse.Namespace) -> str:
     """The result in its new format."""
-    result = result_at(args.result)
+    result = _result(args.result)
     if result.status != "ok":
         if not args.force:
             raise ConfigError(f"{args.result}: found status {result.status}, expected ok (or --force)")
         reasons = " ".join("; ".join(result.reasons).split())
         complain(f"warning: {result.status}, exported all the same: {reasons}")
-    calibration = None if args.calib is None else read_calibration(args.calib)
-    options = ExportOptions(args.camera_frame, args.lidar_frame, calibration)
+    options = ExportOptions(
+        args.camera_frame,
+        args.camera_link,
+        args.lidar_frame,
+        args.parent,
+        args.child,
+        None if args.tree is None else read_tree(args.tree),
+        None if args.calib is None else read_calibration(args.calib),
+    )
     return export_text(result, args.to, options)
+
+
+def _result(path: Path) -> CalibrationResult | RigResult:
+    """The result of a camera, or of a rig."""
+    return read_rig(path) if _file(path).name == RIG_NAME else result_at(path)
+
+
+def _file(path: Path) -> Path:
+    """The file that a path or its folder stands for."""
+    rig = path / RIG_NAME
+    return rig if path.is_dir() and rig.is_file() else result_file(path)

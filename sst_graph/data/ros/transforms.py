@@ -22,11 +22,40 @@ class Transforms:
     def add(self, message: Any) -> None:
         """Take the transforms of a TFMessage."""
         for one in message.transforms:
-            edge = _frame(one.header.frame_id), _frame(one.child_frame_id)
-            pose = _pose(one.transform)
-            known = self._poses.setdefault(edge, pose)
-            if not known.equals(pose, _SAME):
-                self._moving.add(edge)
+            self.add_pose(one.header.frame_id, one.child_frame_id, _pose(one.transform))
+
+    def add_pose(self, parent: str, child: str, pose: gtsam.Pose3) -> None:
+        """Take the pose of ``child`` in ``parent``."""
+        edge = _frame(parent), _frame(child)
+        known = self._poses.setdefault(edge, pose)
+        if not known.equals(pose, _SAME):
+            self._moving.add(edge)
+
+    def joined(self, other: Transforms) -> Transforms:
+        """These and the transforms of another file."""
+        both = Transforms()
+        for one in (self, other):
+            for (parent, child), pose in one._poses.items():
+                both.add_pose(parent, child, pose)
+            both._moving |= one._moving
+        return both
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames, each once, in the order in which they came."""
+        return list(dict.fromkeys(frame for edge in self._poses for frame in edge))
+
+    def parents(self, frame: str) -> list[str]:
+        """Names of the frames in which ``frame`` has a pose."""
+        return sorted(parent for parent, child in self._poses if child == frame)
+
+    def root(self, frame: str) -> str:
+        """The frame above all parents of ``frame``; itself where it has none."""
+        seen = {frame}
+        while (above := self.parents(frame)) and above[0] not in seen:
+            frame = above[0]
+            seen.add(frame)
+        return frame
 
     def pose(self, parent: str, child: str) -> tuple[gtsam.Pose3 | None, str]:
         """Pose of ``child`` in ``parent``, or None, and why: missing, moving or ambiguous."""
@@ -40,7 +69,7 @@ class Transforms:
             edge = (first, second) if (first, second) in self._poses else (second, first)
             if edge in self._moving:
                 return None, f"the transform from {edge[0]!r} to {edge[1]!r} is not constant"
-            parents = sorted(p for p, c in self._poses if c == edge[1])
+            parents = self.parents(edge[1])
             if len(parents) > 1:
                 return None, f"{edge[1]!r} has several parents: {', '.join(parents)}"
             step = self._poses[edge]
