@@ -172,9 +172,14 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         help="folder to write (default %(default)s)",
     )
     calibrate.add_argument(
+        "--video", type=Path, metavar="MP4|GIF", help="write the LiDAR in the pictures along the drives, too"
+    )
+    calibrate.add_argument(
         "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
     )
-    calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
+    calibrate.add_argument(
+        "--overwrite", action="store_true", help="replace an earlier result in DIR, and the video"
+    )
     return calibrate
 
 
@@ -291,14 +296,14 @@ def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argu
         default="initial",
         help="what to compare with: the result's own start (default), the data's nominal, or a file",
     )
-    overlay.add_argument(
-        "--out",
-        type=Path,
-        default=Path("overlay.png"),
-        metavar="PNG",
-        help="picture to write (default %(default)s)",
+    written = overlay.add_mutually_exclusive_group()
+    written.add_argument(
+        "--out", type=Path, metavar="PNG", help="picture of one frame to write (default overlay.png)"
     )
-    overlay.add_argument("--overwrite", action="store_true", help="replace the picture")
+    written.add_argument(
+        "--video", type=Path, metavar="MP4|GIF", help="video of all frames to write, instead of a picture"
+    )
+    overlay.add_argument("--overwrite", action="store_true", help="replace the picture or the video")
     return overlay
 
 
