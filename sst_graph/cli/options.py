@@ -66,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_evaluate,
         _add_inspect,
         _add_overlay,
+        _add_view,
         _add_export,
         _add_info,
         _add_segment,
@@ -237,7 +238,9 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
         "it was saved on, and options that are given those it was made with",
     )
     track.add_argument("--out", type=Path, metavar="FILE", help="write the last estimate as calibration.json")
-    track.add_argument("--overwrite", action="store_true", help="replace the checkpoint and the result")
+    track.add_argument("--view", action="store_true", help="show the tracker in the viewer rerun as it runs")
+    track.add_argument("--view-save", type=Path, metavar="RRD", help="write a file for that viewer")
+    track.add_argument("--overwrite", action="store_true", help="replace the files that are written")
     return track
 
 
@@ -305,6 +308,20 @@ def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argu
     )
     overlay.add_argument("--overwrite", action="store_true", help="replace the picture or the video")
     return overlay
+
+
+def _add_view(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "show a result in the viewer rerun: clouds, pictures, matches, trajectory, tracks, sigmas"
+    view = commands.add_parser("view", help=text, description=text)
+    view.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    view.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder, or a bag")
+    _add_source_options(view)
+    _add_label_options(view)
+    view.add_argument(
+        "--save", type=Path, metavar="RRD", help="write a file for the viewer, instead of opening it"
+    )
+    view.add_argument("--overwrite", action="store_true", help="replace the file")
+    return view
 
 
 def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

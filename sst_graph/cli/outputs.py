@@ -28,6 +28,7 @@ REPORT_NAME = "report.html"
 CALIBRATION = OutputKind("calibration")
 RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
 CHECKPOINT_FILE = FileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
+RERUN_FILE = FileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
 PNG_FILE = FileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
 
 _NO_PATHS = ("dataset", "none", "initial")
