@@ -66,6 +66,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_evaluate,
         _add_inspect,
         _add_overlay,
+        _add_view,
         _add_export,
         _add_import,
         _add_info,
@@ -173,9 +174,14 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         help="folder to write (default %(default)s)",
     )
     calibrate.add_argument(
+        "--video", type=Path, metavar="MP4|GIF", help="write the LiDAR in the pictures along the drives, too"
+    )
+    calibrate.add_argument(
         "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
     )
-    calibrate.add_argument("--overwrite", action="store_true", help="replace an earlier result in DIR")
+    calibrate.add_argument(
+        "--overwrite", action="store_true", help="replace an earlier result in DIR, and the video"
+    )
     return calibrate
 
 
@@ -233,7 +239,9 @@ def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
         "it was saved on, and options that are given those it was made with",
     )
     track.add_argument("--out", type=Path, metavar="FILE", help="write the last estimate as calibration.json")
-    track.add_argument("--overwrite", action="store_true", help="replace the checkpoint and the result")
+    track.add_argument("--view", action="store_true", help="show the tracker in the viewer rerun as it runs")
+    track.add_argument("--view-save", type=Path, metavar="RRD", help="write a file for that viewer")
+    track.add_argument("--overwrite", action="store_true", help="replace the files that are written")
     return track
 
 
@@ -294,14 +302,14 @@ def _add_overlay(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argu
         default="initial",
         help="what to compare with: the result's own start (default), the data's nominal, or a file",
     )
-    overlay.add_argument(
-        "--out",
-        type=Path,
-        default=Path("overlay.png"),
-        metavar="PNG",
-        help="picture to write (default %(default)s)",
+    written = overlay.add_mutually_exclusive_group()
+    written.add_argument(
+        "--out", type=Path, metavar="PNG", help="picture of one frame to write (default overlay.png)"
     )
-    overlay.add_argument("--overwrite", action="store_true", help="replace the picture")
+    written.add_argument(
+        "--video", type=Path, metavar="MP4|GIF", help="video of all frames to write, instead of a picture"
+    )
+    overlay.add_argument("--overwrite", action="store_true", help="replace the picture or the video")
     return overlay
 
 
@@ -322,6 +330,20 @@ EXPORTS = (
     "gtsam",
 )
 """Formats of ``sst_graph.export``, which is not imported for the help's sake; a test compares them."""
+
+
+def _add_view(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "show a result in the viewer rerun: clouds, pictures, matches, trajectory, tracks, sigmas"
+    view = commands.add_parser("view", help=text, description=text)
+    view.add_argument("result", metavar="RESULT", type=Path, help="calibration.json, or its folder")
+    view.add_argument("data", metavar="DATA", type=Path, help="drive: dataset or sequence folder, or a bag")
+    _add_source_options(view)
+    _add_label_options(view)
+    view.add_argument(
+        "--save", type=Path, metavar="RRD", help="write a file for the viewer, instead of opening it"
+    )
+    view.add_argument("--overwrite", action="store_true", help="replace the file")
+    return view
 
 
 def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

@@ -28,6 +28,7 @@ REPORT_NAME = "report.html"
 CALIBRATION = OutputKind("calibration")
 RESULT_FILE = FileKind("a calibration.json", lambda head: b'"sst-graph/calibration"' in head)
 CHECKPOINT_FILE = FileKind("a checkpoint of the tracker", lambda head: b"head.npy" in head[:64])
+RERUN_FILE = FileKind("a recording of rerun", lambda head: head.startswith(b"RRF"))
 PNG_FILE = FileKind("a PNG", lambda head: head.startswith(b"\x89PNG\r\n"))
 
 _NO_PATHS = ("dataset", "none", "initial")
@@ -72,7 +73,7 @@ def write_calibration(
         for position in telling_positions(drive, result, max(1, PICTURES // len(sources))):
             name = f"overlay_{_file_name(source.name)}_{drive.number(position):06d}.png"
             shown = ShownFrame.of(drive, position, result)
-            (folder / name).write_bytes(png(overlay(shown, result, _before(result, source))))
+            (folder / name).write_bytes(png(overlay(shown, result, placement_before(result, source))))
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)
@@ -132,7 +133,8 @@ def _same(a: Path, b: Path) -> bool:
         return False
 
 
-def _before(result: CalibrationResult, source: Source) -> Placement | None:
+def placement_before(result: CalibrationResult, source: Source) -> Placement | None:
+    """What a result is compared with: its start, else the data's nominal calibration, else nothing."""
     if result.initial is not None:
         return Placement(result.initial, result.initial_time_offset_s, "before (start)")
     return None if source.nominal is None else Placement(source.nominal, 0.0, "before (nominal)")

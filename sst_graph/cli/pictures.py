@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.cli.drive_motion import DriveMotion
 from sst_graph.data.frame_parts import RecentReader, image_positions, scan_positions
 from sst_graph.errors import DataError
 from sst_graph.fit import MatchedFrame
@@ -61,10 +62,24 @@ class ShownFrame:
     time_offset_s: float
 
     @classmethod
-    def of(cls, drive: RecentReader, position: int, result: CalibrationResult) -> ShownFrame:
-        """The frame at a position of the drive."""
-        time_offset_s = _offset_of(result, drive.source)
-        c_twist = camera_twist(drive, position, result.T_camera_lidar)
+    def of(
+        cls,
+        drive: RecentReader,
+        position: int,
+        result: CalibrationResult,
+        motion: DriveMotion | None = None,
+    ) -> ShownFrame:
+        """The frame at a position of the drive.
+
+        Args:
+            motion: along the drive, where its frames are drawn in turn; else that of its neighbours is found.
+        """
+        time_offset_s, cTl = offset_of(result, drive.source), result.T_camera_lidar
+        if motion is None:
+            c_twist = camera_twist(drive, position, cTl)
+        else:
+            l_twist = motion.l_twist(position)
+            c_twist = None if l_twist is None else np.asarray(cTl.AdjointMap() @ l_twist)
         frame, other_image = _at_true_time(drive, position, time_offset_s)
         own = _whole(drive, drive.frame(position), 0.0)
         return cls(drive.source, own, frame, other_image, c_twist, time_offset_s)
@@ -192,7 +207,7 @@ def _vehicle_points(scan: Scan | None) -> int:
     return 0 if scan is None else int(np.count_nonzero(scan.classes == int(SemanticClass.VEHICLE)))
 
 
-def _offset_of(result: CalibrationResult, source: Source) -> float:
+def offset_of(result: CalibrationResult, source: Source) -> float:
     """The drive's own offset where the result has one for each drive [s]."""
     own = {drive.drive: drive.time_offset_s for drive in result.drive_offsets}
     return own.get(source.name, result.time_offset_s)

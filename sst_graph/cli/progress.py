@@ -31,9 +31,9 @@ class ProgressBar:
             self._bar = tqdm(total=total, desc=stage, file=sys.stderr, disable=None, leave=False)
         self._bar.update(done - self._bar.n)
 
-    def stage(self, name: str) -> _Stage:
+    def stage(self, name: str) -> ProgressStage:
         """Callable ``(done, total)`` for one stage."""
-        return _Stage(self, name)
+        return ProgressStage(self, name)
 
     def _close(self) -> None:
         if self._bar is not None:
@@ -41,7 +41,9 @@ class ProgressBar:
             self._bar = None
 
 
-class _Stage:
+class ProgressStage:
+    """Callable ``(done, total)`` that shows the progress of one stage."""
+
     def __init__(self, bar: ProgressBar, name: str) -> None:
         self._bar, self._name = bar, name
 

@@ -116,12 +116,27 @@ class OutputFile:
         with _named(stage.target, stage.new), uninterrupted():
             stage.new.unlink(missing_ok=True)
             _write_through(stage.new, data)
-            if self._overwrite:
-                os.replace(stage.new, stage.target)
-            elif not _link_free(stage.new, stage.target):
-                raise _taken(self._path, _beside(stage, _link_free))
-            stage.keep_parents = self._overwrite = True
-            _sync_folder(stage.target.parent)
+            self._publish()
+
+    @property
+    def partial(self) -> Path:
+        """Where another program or library may write all of it, before :meth:`publish`."""
+        return self._stage.new
+
+    def publish(self) -> None:
+        """Put what was written at :attr:`partial` in place; errors as of :meth:`write_bytes`."""
+        with _named(self._stage.target, self._stage.new), uninterrupted():
+            _sync(self._stage.new)
+            self._publish()
+
+    def _publish(self) -> None:
+        stage = self._stage
+        if self._overwrite:
+            os.replace(stage.new, stage.target)
+        elif not _link_free(stage.new, stage.target):
+            raise _taken(self._path, _beside(stage, _link_free))
+        stage.keep_parents = self._overwrite = True
+        _sync_folder(stage.target.parent)
 
     def write_text(self, text: str) -> None:
         """As :meth:`write_bytes`, for UTF-8 text."""

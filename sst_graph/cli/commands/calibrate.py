@@ -18,6 +18,7 @@ from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, exit_cod
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
+from sst_graph.cli.video import refuse_video_of_rig, video_beside
 from sst_graph.files import atomic_directory
 from sst_graph.inspect.report import Comparison, summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
@@ -30,27 +31,35 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate ``args.data``, print the summary of the result, write it."""
     cameras = given_cameras(args)
     if len(cameras) > 1:
+        refuse_video_of_rig(args)
         return run_rig(args, cameras)
     args.camera = cameras[0] if cameras else None
     refuse_rig_options(args)
     config = calibration_settings(args)
     inputs = {"DATA": None, "--init": args.init, "--config": args.config}
     for path in args.data:
-        check_apart({**inputs, "DATA": path}, {"--out": args.out})
-    with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
-        read_as = options_of(args)
-        sources = open_drives(args)
-        config = with_method_for(config, sources)
-        if config.method not in ("motion", "edges"):
-            check_classes(sources, config.classes, args.classes)
-        warn_of_other_pairs(args.init, read_as)
-        initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
-        result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
-        result = dataclasses.replace(result, read_as=read_as)
-        # The numbers first: what follows may find the disk full.
-        mention(summary(result, against))
-        names = write_calibration(folder, result, sources, against, not args.no_report)
-    mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
+        check_apart({**inputs, "DATA": path}, {"--out": args.out, "--video": args.video})
+    with video_beside(args) as video:
+        with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
+            read_as = options_of(args)
+            sources = open_drives(args)
+            config = with_method_for(config, sources)
+            if config.method not in ("motion", "edges"):
+                check_classes(sources, config.classes, args.classes)
+            warn_of_other_pairs(args.init, read_as)
+            initial, time_offset_s = starting_point(args.init, sources[0], args.camera)
+            result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
+            result = dataclasses.replace(result, read_as=read_as)
+            # The numbers first: what follows may find the disk full.
+            mention(summary(result, against))
+            names = write_calibration(folder, result, sources, against, not args.no_report)
+            if video is not None and video.inside is not None:
+                names.append(video.write(folder / video.inside, result, sources))
+        mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
+        if video is not None and video.beside is not None:
+            video.write(video.beside.partial, result, sources)
+            video.beside.publish()
+            mention(f"{'wrote':<15} {args.video}")
     return exit_code(result)
 
 

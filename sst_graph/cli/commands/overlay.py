@@ -1,4 +1,4 @@
-"""``sst-graph overlay``: the LiDAR in the image, before and after."""
+"""``sst-graph overlay``: the LiDAR in the image, before and after: one frame, or a video of all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import PNG_FILE, check_apart
 from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
+from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import open_drive_of
+from sst_graph.cli.video import VIDEO_FILE, write_drive_video
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
@@ -18,10 +20,17 @@ from sst_graph.reference import load_initial
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Source
 from sst_graph.viz import Placement
+from sst_graph.viz.video import check_video_name
+
+PICTURE = Path("overlay.png")
+"""Written where neither ``--out`` nor ``--video`` says another name."""
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the picture of one frame to ``args.out``."""
+    """Write the picture of one frame to ``args.out``, or a video of all to ``args.video``."""
+    if args.video is not None:
+        return _write_video(args)
+    args.out = PICTURE if args.out is None else args.out
     if args.out.suffix.lower() != ".png":
         raise ConfigError(f"--out {args.out}: expected a name that ends in .png")
     inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
@@ -35,6 +44,23 @@ def run(args: argparse.Namespace) -> int:
         shown = ShownFrame.of(drive, position, result)
         out.write_bytes(png(overlay(shown, result, before)))
     mention(f"wrote {args.out}: frame {drive.number(position)} of {source.name}")
+    return 0
+
+
+def _write_video(args: argparse.Namespace) -> int:
+    if args.frame is not None:
+        raise ConfigError("--frame: expected with --out PNG, for a video has all frames")
+    check_video_name(args.video, "--video")
+    inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
+    check_apart(inputs, {"--video": args.video})
+    with output_file(args.video, args.overwrite, VIDEO_FILE) as out:
+        result = result_at(args.result)
+        source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
+        drives = [(source, _before(args.before, result, source))]
+        with ProgressBar() as progress:
+            count = write_drive_video(out.partial, args.video, result, drives, progress.stage("video"))
+        out.publish()
+    mention(f"wrote {args.video}: {count} frames of {source.name}")
     return 0
 
 

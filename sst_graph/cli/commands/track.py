@@ -6,12 +6,14 @@ import argparse
 import dataclasses
 import json
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sst_graph.cli.inputs import chosen_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
-from sst_graph.cli.outputs import CHECKPOINT_FILE, RESULT_FILE, check_apart
+from sst_graph.cli.outputs import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
@@ -23,6 +25,9 @@ from sst_graph.tracker.storage.resume import Setup, check_setup, frames_to_come
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.tracker.tracker import Tracker
 from sst_graph.types import Frame, Source
+
+if TYPE_CHECKING:
+    from sst_graph.viewer import TrackerView
 
 _OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be decided from the scans: {REMEDY}"
 
@@ -38,9 +43,17 @@ def run(args: argparse.Namespace) -> int:
             # Locked for the whole run: no other tracker may save there.
             replace = args.resume or args.overwrite
             outputs.enter_context(output_file(args.checkpoint, replace, CHECKPOINT_FILE))
+        recorded = None
+        if args.view_save is not None:
+            recorded = outputs.enter_context(output_file(args.view_save, args.overwrite, RERUN_FILE))
         read_as = options_of(args)
         tracker, source, frames = _begun(args, open_drive(args, args.data))
-        tracker, last = _track(args, source, tracker, frames)
+        with _viewed(args, tracker, None if recorded is None else recorded.partial) as view:
+            tracker, last = _track(args, source, tracker, frames, view)
+            if view is not None:
+                view.finish(last)
+        if recorded is not None:
+            recorded.publish()
         result = _with_decision(tracker.result(source.name, args.camera), source)
         result = dataclasses.replace(result, read_as=read_as)
         if out is not None:
@@ -49,7 +62,11 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _track(
-    args: argparse.Namespace, source: SweptSource, tracker: Tracker, frames: Iterator[Frame]
+    args: argparse.Namespace,
+    source: SweptSource,
+    tracker: Tracker,
+    frames: Iterator[Frame],
+    view: TrackerView | None,
 ) -> tuple[Tracker, TrackUpdate]:
     """Add the frames, and save the tracker as it goes; solve the window as a whole after the last.
 
@@ -67,7 +84,7 @@ def _track(
         for number, (frame, is_last) in enumerate(_with_last(frames), 1):
             if saver is not None:
                 saver.follow(tracker)
-            update = tracker.add(frame)
+            update = tracker.add(frame) if view is None else view.add(frame)
             if saver is not None and (is_last or number % args.checkpoint_every == 0):
                 saver.save(tracker)
             if is_last:
@@ -82,6 +99,18 @@ def _track(
         if update.frame is not None:
             _say_line(update)
         return tracker, update
+
+
+@contextmanager
+def _viewed(args: argparse.Namespace, tracker: Tracker, save: Path | None) -> Iterator[TrackerView | None]:
+    """What logs the tracker for a viewer; None where neither ``--view`` nor ``--view-save`` asks for it."""
+    if not args.view and save is None:
+        yield None
+        return
+    from sst_graph.viewer import Recording, TrackerView
+
+    with Recording(tracker.setup.camera, live=args.view, save=save, tracked=True) as recording:
+        yield TrackerView(tracker, recording)
 
 
 def _say_line(update: TrackUpdate) -> None:
@@ -102,6 +131,10 @@ def _optimized(
 
 
 def _check(args: argparse.Namespace) -> None:
+    if args.view or args.view_save is not None:
+        from sst_graph.viewer import rerun
+
+        rerun()
     if args.resume and args.checkpoint is None:
         raise ConfigError("--resume needs --checkpoint FILE")
     if args.checkpoint_every < 1:
@@ -110,7 +143,7 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(f"{args.checkpoint}: found a file, expected none (or --resume, or --overwrite)")
     check_apart(
         {"DATA": args.data, "--init": args.init, "--config": args.config},
-        {"--out": args.out, "--checkpoint": args.checkpoint},
+        {"--out": args.out, "--checkpoint": args.checkpoint, "--view-save": args.view_save},
     )
 
 

@@ -101,7 +101,7 @@ class Bag:
             stack.close()
             raise _unreadable(self.path, error) from error
         weakref.finalize(self, stack.close)
-        self._types = _types(self.is_ros1)
+        self._types = message_types(self.is_ros1)
         self._connections: dict[str, list[Any]] = {}
         for connection in connections:
             self._connections.setdefault(connection.topic, []).append(connection)
@@ -219,8 +219,8 @@ class Bag:
             raise _unreadable(self.path, error) from error
 
 
-def _types(is_ros1: bool) -> Any:
-    """Definitions of the messages."""
+def message_types(is_ros1: bool = False) -> Any:
+    """Definitions of the messages, a typestore of rosbags."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)

@@ -14,20 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.cameras import Rectification
-from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, guess_mask_encoding
+from sst_graph.classes import MaskEncoding, guess_mask_encoding
 from sst_graph.data.rectified import RectifiedSource
 from sst_graph.data.ros.bag import Bag
 from sst_graph.data.ros.camera_info import image_geometry
-from sst_graph.data.ros.clouds import cloud_of
+from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
 from sst_graph.data.ros.images import mask_of, picture_of
 from sst_graph.data.ros.index import BagIndex, Stamped, read_index
 from sst_graph.data.ros.topics import Topics, choose_topics
-from sst_graph.data.scan_order import rings_from_order
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
 from sst_graph.sweep_timing import SweepTiming
-from sst_graph.types import CameraImage, Scan, SemanticClass, Source, with_intensities
+from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 _LOG = logging.getLogger(__name__)
 
@@ -69,30 +68,14 @@ class BagMessages:
         stamped = self.index.clouds[k]
         place, labels = _place(self.bag, stamped), self.topics.mask is not None
         message = self._message(stamped, self.topics.cloud.type)
-        cloud = cloud_of(message, stamped.stamp_ns, place, self.stored_times, labels)
-        count = len(cloud.points)
-        classes, instances = np.full(count, SemanticClass.IGNORE, np.uint8), np.zeros(count, np.uint16)
-        if cloud.labels is not None:
-            classes, instances = classes_of_points(cloud.labels, place)
-        offsets_s = cloud.offsets_s if self.timing is None else self.timing.offsets_s(cloud.points)
-        rings = rings_from_order(cloud.points) if cloud.rings is None else cloud.rings
-        scan = Scan(
-            stamped.stamp_ns,
-            cloud.points,
-            classes,
-            instances,
-            offsets_s,
-            rings,
-            cloud.left_out,
-        )
-        return with_intensities(scan, cloud.intensities)
+        return scan_of(message, stamped.stamp_ns, place, CloudReading(self.timing, self.stored_times, labels))
 
     def image(self, k: int) -> CameraImage:
         """Image k of the topic, with the mask of its stamp; errors as of a scan."""
         stamped, topic = self.index.images[k], self.topics.image
         place = _place(self.bag, stamped)
         pixels = picture_of(self._message(stamped, topic.type), topic.type, place)
-        self._check_size(pixels, place)
+        check_size(pixels, self.size, place)
         return CameraImage(stamped.stamp_ns, self._mask(self._masks.get(stamped.stamp_ns)), pixels)
 
     @cached_property
@@ -106,18 +89,10 @@ class BagMessages:
         if stamped is None or topic is None or encoding is None:
             return np.full(self.size[::-1], SemanticClass.IGNORE, np.uint8)
         place = _place(self.bag, stamped)
-        numbers = mask_of(self._message(stamped, topic.type), topic.type, place)
-        self._check_size(numbers, place)
-        return classes_of_mask(numbers, encoding, place)
+        return mask_classes(self._message(stamped, topic.type), topic.type, encoding, self.size, place)
 
     def _message(self, stamped: Stamped, type_name: str) -> Any:
         return _read(self.bag, self.topics, self.index, stamped, type_name)
-
-    def _check_size(self, array: NDArray[np.uint8], place: str) -> None:
-        width, height = self.size
-        if array.shape[:2] != (height, width):
-            found = f"{array.shape[1]}x{array.shape[0]} px"
-            raise DataError(place, found, f"{width}x{height} px, as the first image")
 
 
 def is_ros(path: Path) -> bool:

@@ -1,0 +1,305 @@
+"""The tracker fed with ROS messages; what it publishes comes back as messages."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from sst_graph.cameras import Rectification
+from sst_graph.classes import MaskEncoding
+from sst_graph.data.ros.camera_info import ImageGeometry, image_geometry
+from sst_graph.data.ros.frames import CloudReading, check_size, mask_classes, scan_of
+from sst_graph.data.ros.images import picture_of
+from sst_graph.data.ros.topics import COMPRESSED, IMAGE
+from sst_graph.data.ros.transforms import Transforms
+from sst_graph.data.source import TURNS
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.reference import load_initial
+from sst_graph.ros_node.published import WARN, Diagnosis, MessageMaker, Published, diagnosis_of
+from sst_graph.ros_node.sensor import SensorRecord
+from sst_graph.ros_node.settings import INIT_NONE, INIT_TF, NodeSettings
+from sst_graph.ros_node.stamp_queue import StampQueue, Waiting
+from sst_graph.sweep_timing import SweepTiming
+from sst_graph.tracker.config import TrackerConfig
+from sst_graph.tracker.track_update import TrackUpdate
+from sst_graph.tracker.tracker import Tracker
+from sst_graph.types import CameraImage, Frame, SemanticClass
+
+_LOG = logging.getLogger(__name__)
+
+
+class CalibrationNode:
+    """Takes messages as rosbags decodes them, in the order in which they come; never raises for one.
+
+    Each method gives what is to be published. ``now_ns`` is the node's clock [ns].
+
+    Attributes:
+        camera, lidar, masks: what came of each sensor.
+        tracker: None until camera, first image and start are known.
+        update: the tracker's last.
+    """
+
+    def __init__(self, settings: NodeSettings, config: TrackerConfig | None = None) -> None:
+        """config: of the tracker.
+
+        Raises:
+            ConfigError, DataError: a parameter that cannot be used.
+        """
+        self.settings, self._config = settings, config or TrackerConfig()
+        if settings.label_encoding not in set(MaskEncoding):
+            names = ", ".join(MaskEncoding)
+            raise ConfigError(f"label_encoding: found {settings.label_encoding!r}, expected one of {names}")
+        self._encoding = MaskEncoding(settings.label_encoding)
+        self._reading = _reading(settings)
+        given = settings.init not in (INIT_TF, INIT_NONE)
+        self._given = load_initial(Path(settings.init)) if given else None
+        self.camera = SensorRecord("camera", settings.image_topic)
+        self.lidar = SensorRecord("lidar", settings.cloud_topic)
+        self.masks = SensorRecord("masks", settings.mask_topic)
+        self.tracker: Tracker | None = None
+        self.update: TrackUpdate | None = None
+        self._make = MessageMaker()
+        self._queue = StampQueue(settings.hold_s, settings.queue)
+        self._halves: dict[int, dict[str, tuple[Any, str]]] = {}
+        self._unpaired = 0
+        self._info: Any = None
+        self._geometry: ImageGeometry | None = None
+        self._rectification: Rectification | None = None
+        self._transforms = Transforms()
+        self._waiting_for = "no camera_info yet"
+
+    # ------------------------------------------------------------------ messages
+
+    def add_image(self, message: Any, now_ns: int, type_name: str = IMAGE) -> list[Published]:
+        """An Image or CompressedImage."""
+
+        def take() -> None:
+            stamp_ns = self._stamp_ns(message, self.camera)
+            if not self.settings.mask_topic:
+                self._queue.add(stamp_ns, False, {"image": (message, type_name)})
+            else:
+                self._add_half(stamp_ns, "image", message, type_name)
+
+        return self._received(self.camera, now_ns, take)
+
+    def add_mask(self, message: Any, now_ns: int, type_name: str = IMAGE) -> list[Published]:
+        """A mask with the stamp of its image."""
+
+        def take() -> None:
+            self._add_half(self._stamp_ns(message, self.masks), "mask", message, type_name)
+
+        return self._received(self.masks, now_ns, take)
+
+    def add_cloud(self, message: Any, now_ns: int) -> list[Published]:
+        """A PointCloud2."""
+
+        def take() -> None:
+            self._queue.add(self._stamp_ns(message, self.lidar), True, message)
+
+        return self._received(self.lidar, now_ns, take)
+
+    def add_info(self, message: Any, now_ns: int) -> None:
+        """A CameraInfo; the first one that can be used counts."""
+        if self._geometry is None:
+            self._info = message
+
+    def add_transforms(self, message: Any, now_ns: int) -> None:
+        """A TFMessage of /tf_static."""
+        try:
+            self._transforms.add(message)
+        except Exception as error:
+            self.lidar.refuse(f"a message of transforms that cannot be used: {error}", now_ns)
+
+    def tick(self, now_ns: int) -> Published:
+        """Diagnostics; to be called once a second or so."""
+        sensors = [self.camera, self.lidar, *([self.masks] if self.settings.mask_topic else [])]
+        found = [one.diagnosis(now_ns, self.settings.silent_s) for one in sensors]
+        if self.update is None:
+            found.insert(0, Diagnosis("calibration", WARN, self._waiting_for, {}))
+        else:
+            found.insert(0, diagnosis_of(self.update))
+        waiting = {
+            "waiting": len(self._queue),
+            "dropped": self._queue.dropped,
+            "without_partner": self._unpaired,
+        }
+        level = WARN if self._queue.dropped else 0
+        found.append(Diagnosis("queue", level, f"{self._queue.dropped} messages dropped", waiting))
+        return Published(diagnostics=self._make.diagnostics(found, now_ns))
+
+    def finish(self, now_ns: int) -> list[Published]:
+        """Use all that waits, and solve the whole window, as at the end of a drive."""
+        published = self._work(now_ns, at_end=True)
+        if self.tracker is not None and self.update is not None:
+            published.append(self._published(self.tracker.optimize()))
+        return published
+
+    # ------------------------------------------------------------------ steps
+
+    def _received(self, sensor: SensorRecord, now_ns: int, take: Callable[[], None]) -> list[Published]:
+        """Put a message into the queue, and do the work that is due."""
+        sensor.received += 1
+        sensor.last_ns = now_ns
+        try:
+            take()
+        except Exception as error:
+            sensor.refuse(_reason(error), now_ns)
+        return self._work(now_ns)
+
+    def _stamp_ns(self, message: Any, sensor: SensorRecord) -> int:
+        """Stamp of a message's header; its frame is noted.
+
+        Raises:
+            DataError: the stamp is 0.
+        """
+        header = message.header
+        stamp_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+        if stamp_ns == 0:
+            raise DataError(sensor.topic, "a message with stamp 0", "stamps of the sensor's driver")
+        sensor.frame = sensor.frame or str(header.frame_id).lstrip("/")
+        return stamp_ns
+
+    def _add_half(self, stamp_ns: int, what: str, message: Any, type_name: str) -> None:
+        """Keep an image or a mask until the other of its stamp is there; then both wait as one."""
+        halves = self._halves.setdefault(stamp_ns, {})
+        halves[what] = (message, type_name)
+        if len(halves) == 2:
+            self._queue.add(stamp_ns, False, self._halves.pop(stamp_ns))
+        while len(self._halves) > self.settings.queue:
+            del self._halves[min(self._halves)]
+            self._unpaired += 1
+
+    def _work(self, now_ns: int, at_end: bool = False) -> list[Published]:
+        """Give the tracker what is due, once it can be made."""
+        if self.tracker is None and not self._begun(now_ns):
+            self._queue.drop_oldest()
+            return []
+        published = []
+        for one in self._queue.due(at_end):
+            update = self._use(one, now_ns)
+            if update is not None and (one.is_scan or not update.accepted):
+                published.append(self._published(update))
+        return published
+
+    def _begun(self, now_ns: int) -> bool:
+        """Make the tracker, as soon as the camera, the first image and the start are known."""
+        first = next((one for one in self._queue.peek() if not one.is_scan), None)
+        if self._info is None or first is None:
+            self._waiting_for = "no camera_info yet" if self._info is None else "no image yet"
+            return False
+        try:
+            if self._geometry is None:
+                self._geometry = self._geometry_of(first)
+            initial, time_offset_s, why = self._start(self._geometry)
+        except Exception as error:
+            self._waiting_for = _reason(error)
+            self.camera.refuse(self._waiting_for, now_ns)
+            self._queue.drop(first)
+            return False
+        if initial is None and self.settings.init != INIT_NONE:
+            self._waiting_for = f"no start yet: {why} (or set init to none or a file)"
+            return False
+        model = self._geometry.model
+        self._rectification = None if model.is_pinhole else Rectification.of(model)
+        camera = model.intrinsics if self._rectification is None else self._rectification.camera
+        self.tracker = Tracker(camera, self._config, initial, time_offset_s)
+        return True
+
+    def _geometry_of(self, first: Waiting) -> ImageGeometry:
+        message, type_name = first.content["image"]
+        height, width = picture_of(message, type_name, self.camera.topic).shape[:2]
+        place = self.settings.info_topic
+        return image_geometry(self._info, self.camera.topic, (width, height), place)
+
+    def _start(self, geometry: ImageGeometry) -> tuple[gtsam.Pose3 | None, float, str]:
+        """cTl, time offset [s], and why there is none."""
+        if self._given is not None:
+            return *self._given, ""
+        if self.settings.init == INIT_NONE:
+            return None, 0.0, ""
+        if not self.lidar.frame:
+            return None, 0.0, "no cloud yet"
+        oTl, why = self._transforms.pose(self.camera.frame, self.lidar.frame)
+        return (None if oTl is None else gtsam.Pose3(geometry.cRo, np.zeros(3)) * oTl), 0.0, why
+
+    def _use(self, one: Waiting, now_ns: int) -> TrackUpdate | None:
+        """Decode a message and give it to the tracker; its update, or None where it cannot be decoded."""
+        assert self.tracker is not None
+        sensor = self.lidar if one.is_scan else self.camera
+        try:
+            update = self.tracker.add(self._frame(one))
+        except Exception as error:
+            sensor.refuse(_reason(error), now_ns)
+            return None
+        if update.refused:
+            sensor.refuse(update.reason, now_ns)
+        else:
+            sensor.used += 1
+        return update
+
+    def _frame(self, one: Waiting) -> Frame:
+        """A message as a frame with one sensor, numbered as it came."""
+        if not one.is_scan:
+            return Frame(one.number, None, self._image(one))
+        scan = scan_of(one.content, one.stamp_ns, self.lidar.topic, self._reading)
+        return Frame(one.number, scan, None)
+
+    def _image(self, one: Waiting) -> CameraImage:
+        assert self._geometry is not None
+        message, type_name = one.content["image"]
+        model = self._geometry.model
+        size = model.width, model.height
+        pixels = picture_of(message, type_name, self.camera.topic)
+        check_size(pixels, size, self.camera.topic)
+        mask = np.full(pixels.shape[:2], SemanticClass.IGNORE, np.uint8)
+        if "mask" in one.content:
+            labels, labels_type = one.content["mask"]
+            mask = mask_classes(labels, labels_type, self._encoding, size, self.masks.topic)
+            self.masks.used += 1
+        image = CameraImage(one.stamp_ns, mask, pixels)
+        return image if self._rectification is None else self._rectification.image(image)
+
+    def _published(self, update: TrackUpdate) -> Published:
+        self.update = update
+        return Published(self._make.status(update), self._transform(update))
+
+    def _transform(self, update: TrackUpdate) -> Any:
+        """The calibration for /tf; None where there is none to publish."""
+        assert self.tracker is not None
+        if self.settings.publish == "none":
+            return None
+        if self.settings.publish == "latest":
+            cTl = None if update.covariance is None else update.T_camera_lidar
+        else:
+            adopted = self.tracker.monitor.adoption.adopted
+            cTl = None if adopted is None else adopted.cTl
+        if cTl is None:
+            return None
+        camera, lidar = self.camera.frame, self.lidar.frame
+        # The frame of the images, which may be turned against that of the camera model.
+        assert self._geometry is not None
+        oTl = gtsam.Pose3(self._geometry.cRo, np.zeros(3)).inverse() * cTl
+        if self.settings.parent == "lidar":
+            return self._make.transform(oTl.inverse(), lidar, camera, update.stamp_ns)
+        return self._make.transform(oTl, camera, lidar, update.stamp_ns)
+
+
+def image_type(topic: str) -> str:
+    """Type of the messages of a topic of images, by its name."""
+    return COMPRESSED if topic.endswith("/compressed") else IMAGE
+
+
+def _reading(settings: NodeSettings) -> CloudReading:
+    timing = None
+    if settings.sweep in TURNS:
+        timing = SweepTiming(TURNS[settings.sweep], np.pi, settings.sweep_period_s)
+    return CloudReading(timing, settings.sweep == "auto", bool(settings.mask_topic))
+
+
+def _reason(error: Exception) -> str:
+    return str(error) if isinstance(error, DataError) else f"{type(error).__name__}: {error}"

@@ -1,0 +1,126 @@
+"""What the node publishes, as messages of rosbags."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+
+from sst_graph.data.ros.bag import TF_MESSAGE, message_types
+from sst_graph.tracker.track_update import TrackUpdate
+
+DIAGNOSTICS, STRING = "diagnostic_msgs/msg/DiagnosticArray", "std_msgs/msg/String"
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of a DiagnosticStatus."""
+
+_LEVELS = {"ok": OK, "contradicted": ERROR, "alarm": ERROR}
+"""Of the tracker's status; all others are warnings."""
+
+
+@dataclass(frozen=True)
+class Published:
+    """Messages that are due; None where there is nothing to say.
+
+    Attributes:
+        status: std_msgs/String with the line of JSON that ``sst-graph track`` prints for a frame.
+        transforms: tf2_msgs/TFMessage with the calibration.
+        diagnostics: diagnostic_msgs/DiagnosticArray.
+    """
+
+    status: Any = None
+    transforms: Any = None
+    diagnostics: Any = None
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """A DiagnosticStatus without its name's prefix."""
+
+    name: str
+    level: int
+    message: str
+    values: Mapping[str, object]
+
+
+class MessageMaker:
+    """Makes messages, and their bytes for ROS 2."""
+
+    def __init__(self) -> None:
+        self._types = message_types()
+
+    def decoded(self, data: bytes, type_name: str) -> Any:
+        """A message from its CDR bytes; raises what rosbags raises."""
+        return self._types.deserialize_cdr(data, type_name)
+
+    def encoded(self, message: Any) -> bytes:
+        """CDR bytes of a message."""
+        return bytes(self._types.serialize_cdr(message, message.__msgtype__))
+
+    def status(self, update: TrackUpdate) -> Any:
+        """String of an update."""
+        return self._make(STRING, data=json.dumps(update.to_dict(), allow_nan=False))
+
+    def transform(self, pose: gtsam.Pose3, parent: str, child: str, stamp_ns: int) -> Any:
+        """TFMessage with the pose of ``child`` in ``parent``."""
+        q: Any = pose.rotation().toQuaternion()
+        t = pose.translation()
+        transform = self._make(
+            "geometry_msgs/msg/Transform",
+            translation=self._make("geometry_msgs/msg/Vector3", x=float(t[0]), y=float(t[1]), z=float(t[2])),
+            rotation=self._make("geometry_msgs/msg/Quaternion", x=q.x(), y=q.y(), z=q.z(), w=q.w()),
+        )
+        stamped = self._make(
+            "geometry_msgs/msg/TransformStamped",
+            header=self._header(stamp_ns, parent),
+            child_frame_id=child,
+            transform=transform,
+        )
+        return self._make(TF_MESSAGE, transforms=[stamped])
+
+    def diagnostics(self, found: list[Diagnosis], stamp_ns: int) -> Any:
+        """DiagnosticArray; hardware_id is left empty."""
+        statuses = [
+            self._make(
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=one.level,
+                name=f"sst_graph: {one.name}",
+                message=one.message,
+                hardware_id="",
+                values=[
+                    self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+                    for key, value in one.values.items()
+                ],
+            )
+            for one in found
+        ]
+        return self._make(DIAGNOSTICS, header=self._header(stamp_ns, ""), status=statuses)
+
+    def _header(self, stamp_ns: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+        time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+    def _make(self, type_name: str, **fields: Any) -> Any:
+        return self._types.types[type_name](**fields)
+
+
+def diagnosis_of(update: TrackUpdate) -> Diagnosis:
+    """The calibration's diagnosis: status, sigmas, offset."""
+    words = [update.status, update.reason, update.suspected_change, *update.contradictions]
+    words += [weak.sentence for weak in update.weak_directions[:1]]
+    sigmas = update.sigmas
+    values: dict[str, object] = {
+        "status": update.status,
+        "time_offset_s": f"{update.time_offset_s:.6f}",
+        "sigma_rotation_rad": " ".join(f"{value:.3g}" for value in sigmas[:3]),
+        "sigma_translation_m": " ".join(f"{value:.3g}" for value in sigmas[3:6]),
+        "sigma_time_offset_s": f"{sigmas[6]:.3g}",
+        "matches": update.matches,
+        "chi2": "" if update.chi2 is None else f"{update.chi2:.3g}",
+        "unconfirmed_s": f"{update.unconfirmed_s:.2f}",
+    }
+    message = "; ".join(word for word in words if word)
+    return Diagnosis("calibration", _LEVELS.get(update.status, WARN), message, values)

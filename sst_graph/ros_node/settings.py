@@ -1,0 +1,60 @@
+"""Parameters of the ROS 2 node."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sst_graph.config import Settings, setting
+from sst_graph.data.source import TURNS
+from sst_graph.errors import ConfigError
+
+INIT_TF, INIT_NONE = "tf", "none"
+
+
+@dataclass(frozen=True)
+class NodeSettings(Settings):
+    """Topics, and how the tracker is run on them; each is a ROS parameter of the same name."""
+
+    image_topic: str = setting("image", doc="Image or CompressedImage (a name that ends in /compressed).")
+    info_topic: str = setting("camera_info", doc="CameraInfo of these images.")
+    cloud_topic: str = setting("points", doc="PointCloud2.")
+    mask_topic: str = setting(
+        "", doc="Masks with the stamps of their images; the field label of the clouds is then read, too."
+    )
+    label_encoding: str = setting("ids", doc="Numbers of the masks; as --label-encoding, but for auto.")
+    init: str = setting(
+        INIT_TF,
+        doc="Start: tf (the transforms on /tf_static), none, or a KITTI calib.txt or calibration.json.",
+    )
+    sweep: str = setting(
+        "auto",
+        doc="Times of the points: auto (those in the clouds), compensated, clockwise, counterclockwise.",
+    )
+    sweep_period_s: float = setting(0.1, at_least=0.001, at_most=60.0, doc="Duration of a turn.")
+    publish: str = setting(
+        "adopted", doc="On /tf: the adopted calibration, the latest estimate (latest), or nothing (none)."
+    )
+    parent: str = setting(
+        "camera", doc="Parent on /tf: camera or lidar. The child must have no other parent."
+    )
+    hold_s: float = setting(
+        0.2, at_least=0.0, at_most=10.0, doc="Messages wait so long to be put in the order of their stamps."
+    )
+    queue: int = setting(
+        60, at_least=2, at_most=10000, doc="Most messages that wait; the oldest are dropped."
+    )
+    silent_s: float = setting(1.0, at_least=0.01, at_most=3600.0, doc="A sensor without a message is silent.")
+
+    def __post_init__(self) -> None:
+        _one_of("sweep", self.sweep, ("auto", "compensated", *TURNS))
+        _one_of("publish", self.publish, ("adopted", "latest", "none"))
+        _one_of("parent", self.parent, ("camera", "lidar"))
+        for name in ("image_topic", "info_topic", "cloud_topic", "init"):
+            if not getattr(self, name):
+                raise ConfigError(f"{name}: found an empty name, expected one")
+
+
+def _one_of(name: str, value: Any, names: tuple[str, ...]) -> None:
+    if value not in names:
+        raise ConfigError(f"{name}: found {value!r}, expected one of {', '.join(names)}")

@@ -1,0 +1,69 @@
+"""Messages of several sensors put in the order of their stamps."""
+
+from __future__ import annotations
+
+import bisect
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, order=True)
+class Waiting:
+    """A message that waits: by stamp [ns], then the image before the scan, then as it came."""
+
+    stamp_ns: int
+    is_scan: bool
+    number: int
+    content: Any = field(compare=False)
+
+
+class StampQueue:
+    """Holds messages until later ones are there, and gives them back in the order of their stamps.
+
+    Attributes:
+        dropped: messages that were given up because too many waited.
+    """
+
+    def __init__(self, hold_s: float, most: int) -> None:
+        self._hold_ns, self._most = round(1e9 * hold_s), most
+        self._waiting: list[Waiting] = []
+        self._count = 0
+        self._newest_ns: int | None = None
+        self.dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def add(self, stamp_ns: int, is_scan: bool, content: Any) -> None:
+        """Put a message in its place."""
+        bisect.insort(self._waiting, Waiting(stamp_ns, is_scan, self._count, content))
+        self._count += 1
+        self._newest_ns = stamp_ns if self._newest_ns is None else max(self._newest_ns, stamp_ns)
+
+    def peek(self) -> tuple[Waiting, ...]:
+        """All that waits, the oldest first."""
+        return tuple(self._waiting)
+
+    def drop(self, one: Waiting) -> None:
+        """Give up a message."""
+        self._waiting.remove(one)
+        self.dropped += 1
+
+    def drop_oldest(self) -> None:
+        """Give up the oldest where too many wait."""
+        while len(self._waiting) > self._most:
+            self._waiting.pop(0)
+            self.dropped += 1
+
+    def due(self, at_end: bool = False) -> list[Waiting]:
+        """Messages that have waited long enough by the newest stamp, or are too many; all ``at_end``."""
+        due = 0
+        if self._newest_ns is not None and self._waiting:
+            until_ns = self._newest_ns - self._hold_ns
+            due = sum(one.stamp_ns <= until_ns for one in self._waiting)
+        due = len(self._waiting) if at_end else max(due, len(self._waiting) - self._most)
+        ready, self._waiting = self._waiting[:due], self._waiting[due:]
+        # A clock that was set back goes on from there.
+        if at_end or not self._waiting:
+            self._newest_ns = ready[-1].stamp_ns if ready else self._newest_ns
+        return ready

@@ -1,0 +1,104 @@
+"""``sst-graph view`` and ``track --view-save`` as a user calls them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+from stored import written
+from streets import TRACKED_STREET
+
+from sst_graph.cli import main
+from sst_graph.data import open_source
+from sst_graph.result import CalibrationResult
+
+FEW = ["--frames", "0:5"]
+
+
+@pytest.fixture(scope="module")
+def street() -> Path:
+    return written(TRACKED_STREET)
+
+
+@pytest.fixture(scope="module")
+def result(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The street's true calibration."""
+    source = open_source(street)
+    truth = source.truth
+    assert truth is not None and truth.time_offset_s is not None
+    path = tmp_path_factory.mktemp("result") / "calibration.json"
+    calibration = CalibrationResult(
+        truth.cTl, truth.time_offset_s, 1e-6 * np.eye(7), "ok", source.camera, initial=gtsam.Pose3()
+    )
+    path.write_text(calibration.to_json())
+    return path
+
+
+def _entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def test_view_writes_a_file(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "new" / "drive.rrd"
+    command = ["view", str(result), str(street), *FEW, "--save", str(out)]
+    assert main(command) == 0
+    assert "5 frames" in capsys.readouterr().out
+    assert {"/world/lidar/cloud", "/world/lidar/camera/image/matches/residuals"} <= _entities(out)
+    assert main(command) == 2 and "--overwrite" in capsys.readouterr().err
+    assert main([*command, "--overwrite"]) == 0
+    assert [path.name for path in out.parent.iterdir()] == ["drive.rrd"]
+
+
+def test_track_writes_one_beside_its_lines(
+    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = [
+        "track",
+        str(street),
+        *FEW,
+        "--set",
+        "start_scans=3",
+        "--set",
+        "calibration.search.enabled=false",
+    ]
+    code = main(command)
+    lines = capsys.readouterr().out
+    out = tmp_path / "track.rrd"
+    assert main([*command, "--view-save", str(out)]) == code
+    assert capsys.readouterr().out == lines
+    assert {"/estimate/time_offset/offset", "/tracker/log", "/sigma/rotation/x"} <= _entities(out)
+
+
+@pytest.mark.parametrize("command", ["view", "track"])
+def test_nothing_of_another_kind_is_replaced(
+    street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    out = tmp_path / "a.rrd"
+    out.write_text("mine")
+    options = [str(result), str(street), "--save"] if command == "view" else [str(street), "--view-save"]
+    assert main([command, *options, str(out), "--overwrite"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("\n") == 1 and out.read_text() == "mine"
+    assert "another kind of file, expected a recording of rerun" in captured.err
+
+
+def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_path: Path) -> None:
+    (tmp_path / "rerun.py").write_text("raise ImportError('not here')")
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    for command in (["view", result, street], ["track", street, "--view"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "sst_graph.cli", *command],
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr.count("\n") == 1 and "pip install 'sst-graph[rerun]'" in done.stderr

@@ -1,0 +1,284 @@
+"""The node's core on messages of a simulated street, made and read with rosbags."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from functools import cache
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from stored import written
+
+pytest.importorskip("rosbags")
+
+from bags import CAMERA_FRAME, CLOUD, EPOCH_NS, IMAGE, INFO, LIDAR_FRAME, MASK, Messages, bag_of
+from rosbags.highlevel import AnyReader
+
+from sst_graph.cli import main
+from sst_graph.data import KittiSource, open_source
+from sst_graph.errors import ConfigError
+from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
+from sst_graph.simulator import SimulationConfig
+from sst_graph.tracker.config import TrackerConfig
+
+STREET = SimulationConfig(
+    seed=4,
+    frames=20,
+    width=414,
+    height=125,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.35,
+    vehicle_density=0.3,
+    time_offset_s=0.0,
+    rotation_error_deg=0.3,
+    translation_error_m=0.02,
+    motion="no_stop",
+    speed_mps=6.0,
+)
+SETTINGS = NodeSettings(
+    image_topic=IMAGE, info_topic=INFO, cloud_topic=CLOUD, mask_topic=MASK, sweep="compensated"
+)
+FEW = 44
+"""Messages of the first 14 frames."""
+SOON = ["start_scans=8", "calibration.search.enabled=false"]
+
+
+@pytest.fixture(scope="module")
+def config() -> TrackerConfig:
+    from sst_graph.config import with_overrides
+
+    return with_overrides(TrackerConfig(), SOON)
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """The street as a bag: images are received 25 ms after the clouds of the same stamp."""
+    source = open_source(written(STREET))
+    assert isinstance(source, KittiSource)
+    return bag_of(source, tmp_path_factory.mktemp("bag") / "mcap")
+
+
+@cache
+def _messages(bag: Any) -> tuple[tuple[str, str, int, Any], ...]:
+    """Topic, type, time of receipt [ns] and message, in the order of receipt."""
+    with AnyReader([bag]) as reader:
+        return tuple(
+            (one.topic, one.msgtype, received_ns, reader.deserialize(data, one.msgtype))
+            for one, received_ns, data in reader.messages()
+        )
+
+
+@pytest.fixture(scope="module")
+def plain(bag: Any, config: TrackerConfig) -> list[Published]:
+    """What the node publishes on the bag, with the solution at its end."""
+    node = CalibrationNode(SETTINGS, config)
+    return _play(node, _messages(bag)) + node.finish(EPOCH_NS)
+
+
+def _play(node: CalibrationNode, messages: Any) -> list[Published]:
+    """Give the node messages; what it publishes."""
+    published = []
+    for topic, type_name, now_ns, message in messages:
+        if topic == IMAGE:
+            published += node.add_image(message, now_ns, type_name)
+        elif topic == MASK:
+            published += node.add_mask(message, now_ns, type_name)
+        elif topic == CLOUD:
+            published += node.add_cloud(message, now_ns)
+        elif topic == INFO:
+            node.add_info(message, now_ns)
+        else:
+            node.add_transforms(message, now_ns)
+    return published
+
+
+def _line(published: Published) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(published.status.data)
+    return found
+
+
+def _diagnostics(node: CalibrationNode, now_ns: int) -> dict[str, Any]:
+    """The node's statuses by name."""
+    array = node.tick(now_ns).diagnostics
+    return {one.name.removeprefix("sst_graph: "): one for one in array.status}
+
+
+def test_it_ends_where_track_ends(
+    bag: Any, plain: list[Published], capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--mask-topic", MASK, "--sweep", "compensated"]
+    main(["track", str(bag), *options, *(word for one in SOON for word in ("--set", one))])
+    expected = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    lines = [_line(one) for one in plain]
+    # A line for each scan, and one for the solution of the whole window, which is track's last.
+    assert len(lines) == len(expected) + 1 == 21
+    for line in (*lines, *expected):
+        line.pop("frame", None)
+    assert lines[:19] == expected[:19]
+    assert lines[-1] == expected[-1] and lines[-1]["matches"] > 100
+
+
+def test_the_transform_is_the_calibration(bag: Any, config: TrackerConfig, plain: list[Published]) -> None:
+    latest = dataclasses.replace(SETTINGS, publish="latest")
+    node = CalibrationNode(latest, config)
+    last = _play(node, _messages(bag)[:FEW])[-1]
+    (one,) = last.transforms.transforms
+    assert (one.header.frame_id, one.child_frame_id) == (CAMERA_FRAME, LIDAR_FRAME)
+    stamp_ns = one.header.stamp.sec * 10**9 + one.header.stamp.nanosec
+    assert stamp_ns == _line(last)["stamp_ns"] > EPOCH_NS
+    q, t = one.transform.rotation, one.transform.translation
+    pose = gtsam.Pose3(gtsam.Rot3.Quaternion(q.w, q.x, q.y, q.z), [t.x, t.y, t.z])
+    np.testing.assert_allclose(pose.matrix(), _line(last)["T_camera_lidar"], atol=1e-9)
+    node.settings = dataclasses.replace(latest, parent="lidar")
+    (back,) = node.finish(EPOCH_NS)[-1].transforms.transforms
+    assert (back.header.frame_id, back.child_frame_id) == (LIDAR_FRAME, CAMERA_FRAME)
+    t = back.transform.translation
+    assert node.update is not None
+    expected = node.update.T_camera_lidar.inverse().translation()
+    np.testing.assert_allclose([t.x, t.y, t.z], expected, atol=1e-9)
+    # What is adopted is published by default: nothing before the estimate is confirmed.
+    assert plain[3].transforms is None
+
+
+def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:
+    from sst_graph.ros_node.published import MessageMaker
+
+    node, make = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config), MessageMaker()
+    last = _play(node, _messages(bag)[:FEW])[-1]
+    for message in (last.status, last.transforms, node.tick(EPOCH_NS).diagnostics):
+        again = make.decoded(make.encoded(message), message.__msgtype__)
+        assert again == message
+
+
+def test_diagnostics_say_what_is_missing(bag: Any, config: TrackerConfig) -> None:
+    node = CalibrationNode(SETTINGS, config)
+    empty = _diagnostics(node, EPOCH_NS)
+    assert empty["camera"].level == empty["lidar"].level == empty["masks"].level == 3
+    assert empty["calibration"].message == "no camera_info yet"
+    messages = _messages(bag)
+    _play(node, [one for one in messages if one[0] not in ("/tf_static", INFO)][:12])
+    assert _diagnostics(node, EPOCH_NS)["calibration"].message == "no camera_info yet"
+    _play(node, [one for one in messages if one[0] == INFO])
+    assert node.tracker is None
+    _play(node, [one for one in messages if one[0] == CLOUD][:5])
+    assert "no chain of transforms" in _diagnostics(node, EPOCH_NS)["calibration"].message
+    _play(node, [one for one in messages if one[0] == "/tf_static"])
+    _play(node, [one for one in messages if one[0] == CLOUD][5:6])
+    assert node.tracker is not None
+    well = _diagnostics(node, EPOCH_NS)
+    assert well["calibration"].message.startswith("starting")
+    values = {one.key: one.value for one in well["lidar"].values}
+    assert values["topic"] == CLOUD and values["refused"] == "4"  # the first scans again
+
+
+def test_a_silent_sensor_is_named_and_the_tracker_goes_on(bag: Any, config: TrackerConfig) -> None:
+    node = CalibrationNode(SETTINGS, config)
+    messages = _messages(bag)
+    middle = messages[len(messages) // 2][2]
+    # No image and no mask for a second in the middle of the drive.
+    gap = [one for one in messages if one[0] == CLOUD or not middle - 4e8 < one[2] < middle + 6e8]
+    half = [one for one in gap if one[2] <= middle + 5e8]
+    published = _play(node, half)
+    now_ns = half[-1][2] + 1_500_000_000
+    silent = _diagnostics(node, now_ns)
+    assert silent["camera"].level == 3 and "for 2." in silent["camera"].message
+    assert silent["lidar"].level == 3 and "for 1.5 s" in silent["lidar"].message
+    published += _play(node, gap[len(half) :]) + node.finish(now_ns)
+    assert len([one for one in published if _line(one)["accepted"]]) > 5
+    assert _line(published[-1])["matches"] > 50
+
+
+def test_wrong_contents_are_reported_and_change_nothing(
+    bag: Any, config: TrackerConfig, plain: list[Published]
+) -> None:
+    messages = _messages(bag)[:FEW]
+    make = Messages()
+    nothing = make.image(EPOCH_NS + 5, np.zeros((4, 4), np.uint8), "mono8")
+    cloud = next(one[3] for one in messages if one[0] == CLOUD)
+    image = next(one[3] for one in messages if one[0] == IMAGE)
+    mask = next(one[3] for one in messages if one[0] == MASK)
+    late = make.header(EPOCH_NS + 300_000_123, "front_optical")
+    bad = [
+        (CLOUD, "", dataclasses.replace(cloud, point_step=3)),
+        (CLOUD, "", dataclasses.replace(cloud, data=cloud.data[:10], header=late)),
+        (CLOUD, "", dataclasses.replace(cloud, header=make.header(0, "lidar"))),
+        (CLOUD, "", object()),
+        (IMAGE, image.__msgtype__, object()),
+        (IMAGE, image.__msgtype__, dataclasses.replace(image, encoding="16UC1", header=late)),
+        (MASK, mask.__msgtype__, dataclasses.replace(mask, header=late)),
+        (MASK, nothing.__msgtype__, nothing),
+        (INFO, "", object()),
+        ("/tf_static", "", object()),
+    ]
+    disturbed = CalibrationNode(SETTINGS, config)
+    at = len(messages) // 3
+    now_ns = messages[at][2]
+    played = _play(disturbed, messages[:at])
+    played += _play(disturbed, [(topic, kind, now_ns, message) for topic, kind, message in bad])
+    found = _diagnostics(disturbed, now_ns)
+    played += _play(disturbed, messages[at:])
+    lines, expected = [_line(one) for one in played], [_line(one) for one in plain[: len(played)]]
+    for line in (*lines, *expected):
+        line.pop("frame", None)
+    assert len(lines) == 12 and lines == expected and lines[-1]["matches"] > 50
+    assert found["lidar"].level == 1 and found["camera"].level == 1
+    refused = {one.key: one.value for one in _diagnostics(disturbed, now_ns)["lidar"].values}
+    assert int(refused["refused"]) == 5  # four clouds and one message of transforms
+    assert CLOUD in refused["last_error"] or "transforms" in refused["last_error"]
+
+
+def test_wrong_first_messages_do_not_keep_it_from_starting(bag: Any, config: TrackerConfig) -> None:
+    messages = list(_messages(bag))
+    image = next(one[3] for one in messages if one[0] == IMAGE)
+    mask = next(one[3] for one in messages if one[0] == MASK)
+    early = Messages().header(EPOCH_NS - 100_000_000, CAMERA_FRAME)
+    node = CalibrationNode(SETTINGS, config)
+    _play(node, [one for one in messages if one[0] in (INFO, "/tf_static")])
+    broken = dataclasses.replace(image, data=image.data[:9], header=early)
+    node.add_image(broken, EPOCH_NS)
+    node.add_mask(dataclasses.replace(mask, header=early), EPOCH_NS)
+    assert "bytes" in _diagnostics(node, EPOCH_NS)["calibration"].message
+    assert _line(_play(node, messages)[-1])["matches"] > 50
+
+
+def test_queues_are_bounded(bag: Any, config: TrackerConfig) -> None:
+    settings = dataclasses.replace(SETTINGS, queue=4)
+    node = CalibrationNode(settings, config)
+    messages = _messages(bag)
+    _play(node, [one for one in messages if one[0] in (CLOUD, IMAGE)])
+    values = {one.key: one.value for one in _diagnostics(node, EPOCH_NS)["queue"].values}
+    # Without camera_info nothing is used; images wait for masks.
+    assert values == {"waiting": "4", "dropped": "16", "without_partner": "16"}
+    # Too many to wait for hold_s: the oldest are used before that.
+    hasty = CalibrationNode(dataclasses.replace(settings, hold_s=10.0), config)
+    assert len(_play(hasty, messages)) == 18
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"sweep": "sideways"},
+        {"publish": "all"},
+        {"parent": "map"},
+        {"label_encoding": "auto"},
+        {"hold_s": -1.0},
+        {"queue": 1},
+        {"cloud_topic": ""},
+    ],
+)
+def test_wrong_parameters_are_refused(changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(changes)).replace("_", ".")):
+        CalibrationNode(dataclasses.replace(SETTINGS, **changes))
+
+
+def test_the_wrapper_is_short_and_needs_rclpy_only_to_run() -> None:
+    import sst_graph.ros_node.__main__ as wrapper
+
+    assert wrapper.__file__ is not None
+    with open(wrapper.__file__, encoding="utf-8") as file:
+        assert len(file.readlines()) < 80
+    with pytest.raises(ModuleNotFoundError, match="rclpy"):
+        wrapper.main()
