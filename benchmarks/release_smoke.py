@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parent.parent
 UV = (sys.executable, "-m", "uv")
 PYTHONS = ("3.11", "3.12", "3.13")
 RESOLUTIONS = ("highest", "lowest-direct")
+IMAGE, MASK = "/camera/image_rect", "/camera/mask"  # of write_bag
 EXTRAS = "plot,ros,yaml,onnx"
 IN_SDIST = (
     "docs/layout.md",
@@ -154,7 +155,7 @@ def use(wheel: Path, python: Path, resolution: str, folder: Path) -> str:
     run([*install, f"{wheel}[{EXTRAS}]"], folder)
     run([*command, "inspect", "result", "--plots", "plots"], folder)
     run([binaries / "python", "-c", WRITE_BAG], folder)
-    run([*command, "info", "bag"], folder)
+    run([*command, "info", "bag", "--image-topic", IMAGE, "--mask-topic", MASK], folder)
     lines = run([*UV, "pip", "freeze", "-q", "--python", binaries / "python"], folder).split()
     kept = (
         "gtsam",
