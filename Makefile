@@ -10,14 +10,14 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test test-slow lint demo bench mutate docs lock clean
+.PHONY: setup test test-slow lint demo bench mutate release-check image docs lock clean
 
 setup: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; v = sys.version_info; sys.exit(v < (3, 11) and "Python 3.11 or newer is needed, found %d.%d (try make PYTHON=python3.12)" % v[:2])'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) install -c constraints.txt setuptools
+	$(PIP) install -c constraints.txt setuptools setuptools-scm
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[test]'
 	@touch $@
 
@@ -45,6 +45,15 @@ mutate: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[mutation]'
 	$(BIN)/python benchmarks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
 
+# Builds sdist and wheel and uses them in empty environments, with the newest and the oldest dependencies
+# that pyproject.toml allows, on every Python 3.11 to 3.13 that is found. Takes some minutes.
+release-check: $(INSTALLED)
+	$(PIP) install -c constraints.txt --no-build-isolation -e '.[release]'
+	$(BIN)/python benchmarks/release_smoke.py
+
+image: $(INSTALLED)
+	docker build --build-arg VERSION=$$($(BIN)/python -m setuptools_scm) -t sst-graph .
+
 # Pages that programs write, then the site in build/site. A warning is an error.
 docs: $(INSTALLED)
 	$(BIN)/sst-graph settings --markdown > docs/reference/settings.md
@@ -55,7 +64,7 @@ docs: $(INSTALLED)
 # Fresh versions of everything, in a throw-away environment.
 lock:
 	rm -rf build/lock && $(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip --disable-pip-version-check -q install 'setuptools>=77' -e '.[test]'
+	build/lock/bin/python -m pip --disable-pip-version-check -q install 'setuptools>=77' 'setuptools-scm>=8.1' -e '.[test]'
 	(sed -n '/^#/p' constraints.txt; build/lock/bin/python -m pip freeze --all --exclude-editable | grep -v '^pip==' | sort -f) > build/constraints.txt
 	mv build/constraints.txt constraints.txt && rm -rf build/lock
 

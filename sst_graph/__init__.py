@@ -93,9 +93,21 @@ _HOMES = {
 
 def __getattr__(name: str) -> Any:
     """Import what is asked for when it is asked for: the command's ``--help`` must not wait for OpenCV."""
+    if name == "__version__":
+        return _version()
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_HOMES[name]), name)
+
+
+def _version() -> str:
+    """Of the installed distribution; a checkout on the path has none."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("sst-graph")
+    except PackageNotFoundError:
+        return "(not installed)"
 
 
 def __dir__() -> list[str]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+import sst_graph
 from sst_graph.cli.messages import complain, say
 from sst_graph.errors import ConfigError
 
@@ -54,7 +54,7 @@ def build_parser() -> argparse.ArgumentParser:
         "finished, but the result is not to be trusted (the reason is on stderr, the files are written); "
         "130, 143, 129 ended by Ctrl-C, SIGTERM, SIGHUP; 141 the reader of stdout has gone.",
     )
-    parser.add_argument("--version", action="version", version=f"sst-graph {_version()}")
+    parser.add_argument("--version", action="version", version=f"sst-graph {sst_graph.__version__}")
     commands = parser.add_subparsers(
         dest="command", metavar="COMMAND", required=True, parser_class=_Parser, title="commands"
     )
@@ -77,14 +77,6 @@ def build_parser() -> argparse.ArgumentParser:
         command = add(commands)
         command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
     return parser
-
-
-def _version() -> str:
-    """Of the installed distribution; a checkout on the path has none."""
-    try:
-        return version("sst-graph")
-    except PackageNotFoundError:
-        return "(not installed)"
 
 
 def _add_demo(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sst_graph.simulator.bag import write_bag
 from sst_graph.simulator.config import Motion, SimulationConfig
 from sst_graph.simulator.drive import SimulatedDrive, simulate
 from sst_graph.simulator.write import DRIVE, fill_drive, write_drive
@@ -13,5 +14,6 @@ __all__ = [
     "SimulationConfig",
     "fill_drive",
     "simulate",
+    "write_bag",
     "write_drive",
 ]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import sst_graph
 from sst_graph.cli import main
 from sst_graph.cli.options import build_parser
 
@@ -23,6 +24,7 @@ def _run(*arguments: str) -> subprocess.CompletedProcess[str]:
 def test_version() -> None:
     done = _run("--version")
     assert (done.returncode, done.stdout) == (0, f"sst-graph {version('sst-graph')}\n")
+    assert sst_graph.__version__ == version("sst-graph")
 
 
 def test_help_imports_nothing_heavy() -> None:
