@@ -6,6 +6,10 @@ makes the drives (kept in OUT/drives, so a second run starts at once), calibrate
 ``sst-graph calibrate``, then by ``sst-graph batch`` while processes of drives are killed at random and the
 batch itself is killed once and resumed, and compares: every result there, each byte-equal to the sequential
 one, the changed vehicles found, no other accused. Prints one Markdown table.
+
+    python benchmarks/fleet.py --empty 100000 --out out/empty
+
+runs drives of no work through the scheduler's own code: what it adds to each, its memory, the summary.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date, timedelta
@@ -29,6 +33,11 @@ from pathlib import Path
 
 import numpy as np
 
+from sst_graph.files import MANIFEST
+from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
+from sst_graph.fleet import batch as fleet_batch
+from sst_graph.fleet.attempt import Job
+from sst_graph.fleet.record import Cost, Numbers
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate, write_drive
 from sst_graph.simulator.drive import NOMINAL_CTL, mounting_error
 from sst_graph.types import GroundTruth
@@ -228,6 +237,53 @@ def environment() -> dict[str, str]:
     return {**os.environ, "OMP_NUM_THREADS": "1"}
 
 
+def empty_drive(job: Job) -> Record:
+    """The scheduler's work for a drive and none of the calibration's: a result, and its record on the disk."""
+    number = int(job.drive.name[1:])
+    rng = np.random.default_rng(number)
+    sigmas = np.array([2e-3] * 3 + [0.02] * 3 + [0.005])
+    cTl = NOMINAL_CTL.retract(rng.normal(size=6) * sigmas[:6])
+    numbers = Numbers(
+        cTl.matrix().tolist(), float(rng.normal() * 0.005), np.diag(sigmas**2).tolist(), [], 8, "c"
+    )
+    record = Record(job.drive.name, job.drive.place.url, "ok", "", Cost(1, 1.0, 1.0, 10**8, 10**6), numbers)
+    folder = job.result.path
+    folder.mkdir(parents=True)
+    (folder / MANIFEST).write_text("{}")
+    job.record.write(record.to_json().encode())
+    return record
+
+
+def measure_scheduler(count: int, folder: Path, workers: int, dask: str) -> None:
+    """Drives that take no time, through the batch's own code; prints what it adds to each."""
+    drives = [
+        Drive(
+            f"d{k:06d}", Place(f"/data/d{k:06d}"), f"v{k % (count // 100):05d}", f"2026-01-{1 + k % 28:02d}"
+        )
+        for k in range(count)
+    ]
+    out, config = Place(str(folder)), BatchConfig(workers=workers, dask=dask)
+    print("| step | seconds | a drive |\n|---|---|---|")
+
+    def timed(name: str, work: Callable[[], object]) -> object:
+        started = time.monotonic()
+        found = work()
+        seconds = time.monotonic() - started
+        print(f"| {name} | {seconds:.1f} | {1e3 * seconds / count:.2f} ms |", flush=True)
+        return found
+
+    def run() -> dict[str, Record]:
+        return fleet_batch.run_batch(drives, out, config, lambda progress: None, empty_drive)
+
+    timed(f"{count} empty drives on {workers} {'Dask ' if dask else ''}workers, records written", run)
+    records = run()
+    timed("the same again: all found done", run)
+    timed("vehicles fused, summary written", lambda: write_summary(drives, records, out, config))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    size = (folder / "summary.html").stat().st_size / 1e6
+    print(f"| largest memory of the batch | {peak:.0f} MB | |\n| summary.html | {size:.1f} MB | |")
+
+
 def main() -> None:
     """Make the fleet, run it both ways, print the table."""
     parser = argparse.ArgumentParser(
@@ -240,7 +296,12 @@ def main() -> None:
     parser.add_argument("--timed", type=int, default=20, help="drives whose batch is timed without kills")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/fleet"))
+    parser.add_argument("--empty", type=int, metavar="N", help="only the scheduler, with N drives of no work")
+    parser.add_argument("--dask", default="", help="with --empty: on Dask")
     given = parser.parse_args()
+    if given.empty:
+        measure_scheduler(given.empty, given.out, 2, given.dask)
+        return
     folder, alone, batch = given.out / "drives", given.out / "one_by_one", given.out / "batch"
     drives = make_fleet(folder, given.vehicles, given.drives)
     bad = add_bad_drives(folder)

@@ -145,11 +145,18 @@ def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
         yield
 
 
-def run_batch(drives: Sequence[Drive], out: Place, config: BatchConfig, told: Told) -> dict[str, Record]:
+def run_batch(
+    drives: Sequence[Drive],
+    out: Place,
+    config: BatchConfig,
+    told: Told,
+    run: Callable[[Job], Record] = run_drive,
+) -> dict[str, Record]:
     """Run all drives that have no result yet; the records of all, by name.
 
     Args:
         told: is called after every drive, and now and then between.
+        run: what is done for a drive; it does not raise, and Dask can send it to its workers.
 
     Raises:
         ConfigError: an earlier run calibrated other data under the name of a drive.
@@ -162,9 +169,9 @@ def run_batch(drives: Sequence[Drive], out: Place, config: BatchConfig, told: To
     failed = 0
     told(Progress(earlier, len(jobs), earlier, failed, 0.0))
     if config.dask and left:
-        coming = run_on_dask(left, Cluster(config.dask, config.workers), run_drive)
+        coming = run_on_dask(left, Cluster(config.dask, config.workers), run)
     else:
-        coming = run_locally(left, config.workers, run_drive)
+        coming = run_locally(left, config.workers, run)
     for record in coming:
         if record is not None:
             records[record.drive] = record

@@ -17,7 +17,7 @@ from sst_graph.fleet.record import Record
 
 LOCAL = "local"
 """In the place of an address: a cluster on this machine, started for the batch."""
-_PATIENCE_S = 0.5
+_PATIENCE_S, _CONNECT_S = 0.5, 20.0
 _AHEAD = 4
 """Tasks at the scheduler for each that can run: enough that none waits, few enough for its memory."""
 
@@ -84,7 +84,7 @@ def _client(distributed: Any, cluster: Cluster) -> Any:
                 n_workers=cluster.workers, threads_per_worker=1, processes=True, dashboard_address=None
             )
             return _OwnCluster(distributed, local)
-        return distributed.Client(cluster.address, timeout="20s")
+        return distributed.Client(cluster.address, timeout=_CONNECT_S)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(f"--dask {cluster.address}: found no scheduler ({error})") from error
 

@@ -2,8 +2,10 @@
 
 Every drive k has an extrinsic E(k) and a time offset D(k), and on them the marginal of its result as one
 factor (:func:`sst_graph.export.marginal_of_result`). Consecutive drives are tied by random walks
-(:func:`sst_graph.factors.extrinsic_drift`, :func:`sst_graph.factors.time_offset_drift`) over the days between
-them. Where a step is, that tie is left out.
+(:func:`sst_graph.factors.extrinsic_drift`, :func:`sst_graph.factors.time_offset_drift`) over the days
+between them. Where a step is, that tie is left out. The chain is solved by eliminating each drive's variables
+in turn, once forward and once back: the two marginals at a drive together are the smoothed one, and each
+alone is what a step is tested with.
 """
 
 from __future__ import annotations
@@ -16,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, setting
-from sst_graph.errors import EstimationError
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal, marginal_of_graph
 from sst_graph.factors import extrinsic_drift, time_offset_drift
 from sst_graph.marginal import carried
@@ -39,9 +40,9 @@ class WalkConfig(Settings):
         false_alarm_rate: probability that anything is named of a vehicle whose calibration only walks.
     """
 
-    rotation_deg: float = setting(0.005, at_least=1e-5, at_most=10.0)
-    translation_m: float = setting(0.0005, at_least=1e-6, at_most=10.0)
-    time_offset_s: float = setting(0.0001, at_least=1e-8, at_most=10.0)
+    rotation_deg: float = setting(0.005, at_least=1e-4, at_most=10.0)
+    translation_m: float = setting(0.0005, at_least=1e-5, at_most=10.0)
+    time_offset_s: float = setting(0.0001, at_least=1e-6, at_most=10.0)
     false_alarm_rate: float = setting(1e-3, at_least=1e-9, at_most=0.5)
 
 
@@ -75,7 +76,7 @@ class Smoothed:
 
 
 def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig) -> list[Smoothed]:
-    """The calibration at every drive, by one graph of all of them.
+    """The calibration at every drive, by all drives of its stretch.
 
     Args:
         drives: in the order of their days.
@@ -84,30 +85,12 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     Raises:
         EstimationError: a direction that no drive determines.
     """
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for k, drive in enumerate(drives):
-        graph.add(drive.marginal.factor(_E(k), _D(k)))
-        cTl, time_offset_s = drive.marginal.best()
-        values.insert(_E(k), cTl)
-        values.insert(_D(k), np.array([time_offset_s]))
-        if k and k not in steps:
-            for factor in _walk(k - 1, k, drive.day - drives[k - 1].day, config):
-                graph.add(factor)
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-12)
-    params.setAbsoluteErrorTol(1e-12)
-    try:
-        found = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-        marginals = gtsam.Marginals(graph, found)
-        return [_at(k, found, marginals) for k in range(len(drives))]
-    except RuntimeError as error:
-        raise EstimationError(f"calibration over {len(drives)} drives: not determined ({error})") from error
-
-
-def _at(k: int, values: gtsam.Values, marginals: gtsam.Marginals) -> Smoothed:
-    covariance = marginals.jointMarginalCovariance([_E(k), _D(k)]).fullMatrix()
-    # gtsam's order of a joint marginal is that of the keys asked for.
-    return Smoothed(values.atPose3(_E(k)), float(values.atVector(_D(k))[0]), np.asarray(covariance))
+    ways = passes(drives, steps, config)
+    found = []
+    for upto, after in zip(ways.upto, ways.after, strict=True):
+        both = upto if after is None else upto.plus(after)
+        found.append(Smoothed(*both.best(), both.covariance()))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
