@@ -62,6 +62,7 @@ def build_parser() -> argparse.ArgumentParser:
         _add_demo,
         _add_simulate,
         _add_calibrate,
+        _add_batch,
         _add_track,
         _add_evaluate,
         _add_inspect,
@@ -131,32 +132,13 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     _add_source_options(calibrate, several_cameras=True)
     _add_label_options(calibrate)
-    calibrate.add_argument(
-        "--method",
-        choices=("auto", "joint", "edges", "motion", "paper", "static", "semalign"),
-        help="auto: joint where both sensors have labels, else edges (default); joint: extrinsic and offset "
-        "by outlines of labelled objects; edges: the same by LiDAR edges and pictures, no labels needed; "
-        "motion: LiDAR odometry against visual odometry, no labels needed; paper: SST-Calib as printed; "
-        "static: its first stage, the extrinsic alone; semalign: sampled starts, the extrinsic alone",
-    )
-    calibrate.add_argument(
-        "--init",
-        metavar="dataset|none|FILE",
-        default="dataset",
-        help="start: the data's nominal calibration (default), no guess at all, or a calibration.json or "
-        "another file that import reads (KITTI, ROS, Kalibr, ...)",
-    )
-    calibrate.add_argument(
-        "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
-    )
+    _add_method(calibrate)
     calibrate.add_argument(
         "--time-offset-per-drive", action="store_true", default=None, help="one time offset for each drive"
     )
     calibrate.add_argument(
         "--delay-per-drive", action=_Renamed, const="--time-offset-per-drive", help=argparse.SUPPRESS
     )
-    _add_estimate(calibrate)
-    _add_settings(calibrate)
     _add_rig(calibrate)
     calibrate.add_argument(
         "--out",
@@ -169,12 +151,36 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
         "--video", type=Path, metavar="MP4|GIF", help="write the LiDAR in the pictures along the drives, too"
     )
     calibrate.add_argument(
-        "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
-    )
-    calibrate.add_argument(
         "--overwrite", action="store_true", help="replace an earlier result in DIR, and the video"
     )
     return calibrate
+
+
+def _add_method(command: _Parser) -> None:
+    """How one drive or several are calibrated."""
+    command.add_argument(
+        "--method",
+        choices=("auto", "joint", "edges", "motion", "paper", "static", "semalign"),
+        help="auto: joint where both sensors have labels, else edges (default); joint: extrinsic and offset "
+        "by outlines of labelled objects; edges: the same by LiDAR edges and pictures, no labels needed; "
+        "motion: LiDAR odometry against visual odometry, no labels needed; paper: SST-Calib as printed; "
+        "static: its first stage, the extrinsic alone; semalign: sampled starts, the extrinsic alone",
+    )
+    command.add_argument(
+        "--init",
+        metavar="dataset|none|FILE",
+        default="dataset",
+        help="start: the data's nominal calibration (default), no guess at all, or a calibration.json or "
+        "another file that import reads (KITTI, ROS, Kalibr, ...)",
+    )
+    command.add_argument(
+        "--classes", metavar="vehicle|all|A,B", help="classes to align, such as vehicle,pole"
+    )
+    _add_estimate(command)
+    _add_settings(command)
+    command.add_argument(
+        "--no-report", action="store_true", help="leave out report.html, the page with pictures and charts"
+    )
 
 
 def _add_rig(command: _Parser) -> None:
@@ -204,6 +210,75 @@ def _add_estimate(command: _Parser) -> None:
         "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the "
         "standard deviation of its prior about 0 (docs/understand/assumptions.md)",
     )
+
+
+def _add_batch(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "calibrate many drives, each in a process of its own; fuse those of one vehicle; one summary"
+    batch = commands.add_parser(
+        "batch",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]} (docs/batch.md). Drives that are done are not run again.",
+    )
+    batch.add_argument(
+        "drives",
+        metavar="DRIVES",
+        help="folder of drives, pattern such as 'drives/*' (in quotes), or list: one path or URL a line, or "
+        "a CSV with a column drive and any of name, vehicle, date",
+    )
+    batch.add_argument(
+        "--out", required=True, metavar="DIR", help="folder to write or to go on with, or a URL"
+    )
+    batch.add_argument(
+        "--workers", type=int, metavar="N", help="drives at a time on this machine (default: its processors)"
+    )
+    batch.add_argument(
+        "--dask",
+        default="",
+        metavar="ADDRESS|local",
+        help="run on a Dask cluster: its scheduler, such as tcp://host:8786, or local (extra dask)",
+    )
+    batch.add_argument(
+        "--retries",
+        type=int,
+        default=2,
+        metavar="N",
+        help="further attempts after a crash (default %(default)s)",
+    )
+    batch.add_argument("--time-limit", type=float, metavar="S", help="longest time of a drive in seconds")
+    batch.add_argument("--memory-limit", type=float, metavar="GB", help="largest memory of a drive")
+    batch.add_argument(
+        "--name-parts",
+        type=int,
+        default=1,
+        metavar="N",
+        help="how many of the last parts of its path make a drive's name (default %(default)s)",
+    )
+    vehicles = batch.add_argument_group("vehicles")
+    vehicles.add_argument(
+        "--vehicle-from",
+        metavar="REGEX|CSV",
+        help="vehicle and date of a drive: a regular expression on its path with the groups vehicle and "
+        "date, or a CSV with columns drive, vehicle and date",
+    )
+    vehicles.add_argument(
+        "--drift",
+        metavar="DEG,CM,MS",
+        help="random walk of a vehicle's calibration: standard deviation along each axis after one day "
+        "(default 0.005,0.05,0.1)",
+    )
+    vehicles.add_argument(
+        "--false-alarm-rate",
+        type=float,
+        metavar="P",
+        help="probability that a change or a contradicting drive is named of a vehicle without any "
+        "(default 0.001)",
+    )
+    own = len(batch._actions)
+    _add_source_options(batch)
+    _add_label_options(batch)
+    _add_method(batch)
+    batch.set_defaults(passed_on=tuple(batch._actions[own:]), time_offset_per_drive=None)
+    return batch
 
 
 def _add_track(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:

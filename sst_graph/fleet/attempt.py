@@ -1,0 +1,219 @@
+"""One drive from its data to its record: fetched, calibrated in a process of its own, retried, published."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from sst_graph.errors import DataError, SstGraphError, printable
+from sst_graph.files import MANIFEST
+from sst_graph.files.manifest import read_manifest
+from sst_graph.files.staging import claim
+from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.isolated import Ending, Limits, has_ended, run_isolated
+from sst_graph.fleet.places import Place
+from sst_graph.fleet.record import Cost, Numbers, Record, Status, reason_of
+from sst_graph.fleet.scratch import scratch_folder
+from sst_graph.result import read_result
+
+DRIVES, RECORDS = "drives", "records"
+RESULT = "calibration.json"
+
+_EXIT_DONE, _EXIT_BAD_INPUT, _EXIT_NOT_TRUSTED = 0, 2, 3
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_PROGRAM_MODULE, _SAID_BY_IT = "sst_graph.cli", "sst-graph: "
+
+
+@dataclass(frozen=True)
+class Job:
+    """What has to be done for one drive; it travels to other machines.
+
+    Attributes:
+        drive: whose data.
+        options: of ``sst-graph calibrate``, but for DATA and --out.
+        out: the batch's folder.
+        folder: where the program was started: relative paths begin there.
+        limits: of one attempt.
+        retries: further attempts after a crash.
+    """
+
+    drive: Drive
+    options: tuple[str, ...]
+    out: Place
+    folder: str
+    limits: Limits = field(default_factory=Limits)
+    retries: int = 0
+
+    @property
+    def result(self) -> Place:
+        """Folder of the drive's result."""
+        return self.out / DRIVES / self.drive.name
+
+    @property
+    def record(self) -> Place:
+        """File of the drive's record."""
+        return self.out / RECORDS / f"{self.drive.name}.json"
+
+
+def run_drive(job: Job) -> Record:
+    """Calibrate one drive, again after a crash, and write its record. Never raises for what the drive does.
+
+    A result that stands there whole, as of a task that a scheduler repeats, is taken as it is.
+    """
+    record = finished_record(job)
+    attempts = 0
+    while record is None or (record.status in ("crash", "storage") and attempts <= job.retries):
+        if has_ended():
+            return Record(job.drive.name, job.drive.place.url, "not_run", "the batch was ended before")
+        attempts += 1
+        record = _attempt(job)
+        record = replace(record, cost=replace(record.cost, attempts=attempts))
+    if attempts and not has_ended():
+        with contextlib.suppress(SstGraphError, OSError):
+            job.record.write(record.to_json().encode("utf-8"))
+    return record
+
+
+def finished_record(job: Job, stored: bytes | None = None) -> Record | None:
+    """The record of a drive whose result stands there whole, or None.
+
+    A record is written after the result. Where it is missing (the batch was killed between the two), it is
+    made from the result.
+
+    Args:
+        stored: contents of the record's file, where the caller has read it; the result's folder is there.
+    """
+    try:
+        with contextlib.suppress(SstGraphError, OSError):
+            record = Record.from_json(job.record.read() if stored is None else stored, job.record.url)
+            if (
+                record.has_result
+                and record.place == job.drive.place.url
+                and _is_whole(job, stored is not None)
+            ):
+                return record
+        if not (job.result / MANIFEST).exists():
+            return None
+        if job.result.is_local:
+            return _of_result(job, job.result.path)
+        with scratch_folder() as scratch:
+            return _of_result(job, job.result.fetch(scratch))
+    except SstGraphError:
+        return None
+
+
+def _is_whole(job: Job, is_there: bool) -> bool:
+    """Whether the result stands there: a local folder with its manifest, a remote one with its record."""
+    if not job.result.is_local:
+        return is_there or (job.result / MANIFEST).exists()
+    return (job.result.path / MANIFEST).exists()
+
+
+def _attempt(job: Job) -> Record:
+    """One attempt; what cannot be copied is a failure of the storage."""
+    with scratch_folder() as scratch:
+        try:
+            data = _data(job, scratch)
+        except (SstGraphError, OSError) as error:
+            return _failed(job, "storage", str(error))
+        local = job.result.path if job.result.is_local else scratch / "result"
+        try:
+            ending = _calibrated(job, data, local)
+        except OSError as error:
+            return _failed(job, "crash", f"no process could be started: {error}")
+        cost = Cost(1, ending.wall_s, ending.cpu_s, ending.peak_bytes, _size(data))
+        if ending.limit or ending.code not in (_EXIT_DONE, _EXIT_NOT_TRUSTED):
+            _clean(local)
+            return replace(_of_ending(job, ending), cost=cost)
+        record = _of_result(job, local)
+        if record is None:
+            return replace(_failed(job, "crash", "left no whole result"), cost=cost, log=ending.log)
+        if not job.result.is_local:
+            try:
+                job.result.upload(local)
+            except (SstGraphError, OSError) as error:
+                return replace(_failed(job, "storage", str(error)), cost=cost)
+        return replace(record, cost=cost)
+
+
+def _data(job: Job, scratch: Path) -> Path:
+    """The drive's data on this machine."""
+    if job.drive.place.is_local:
+        return Path(job.folder) / job.drive.place.path
+    (scratch / "data").mkdir()
+    return job.drive.place.fetch(scratch / "data")
+
+
+def _calibrated(job: Job, data: Path, out: Path) -> Ending:
+    # -P: nothing is imported from the folder where the program was started.
+    program = [sys.executable, "-P", "-m", _PROGRAM_MODULE, "calibrate"]
+    command = [*program, os.fspath(data), "--out", os.fspath(out), "--overwrite", *job.options]
+    folder = job.folder if os.path.isdir(job.folder) else os.getcwd()
+    return run_isolated(command, _environment(os.environ), job.limits, folder)
+
+
+def _environment(own: Mapping[str, str]) -> dict[str, str]:
+    """One thread a process, for there are as many processes as are wanted; the program as it is here."""
+    found = dict(own)
+    for name in _THREADS:
+        found[name] = "1"
+    paths = [path for path in (*sys.path, own.get("PYTHONPATH", "")) if path]
+    found["PYTHONPATH"] = os.pathsep.join(dict.fromkeys(paths))
+    return found
+
+
+def _of_ending(job: Job, ending: Ending) -> Record:
+    """The record of a process that left no result."""
+    said = next((line for line in reversed(ending.log) if line.startswith(_SAID_BY_IT)), "")
+    said = said.removeprefix(_SAID_BY_IT).removeprefix("error: ")
+    gigabytes = ending.peak_bytes / 2**30
+    status: Status = "crash"
+    if ending.limit == "memory":
+        status, reason = "memory_limit", f"took {gigabytes:.2f} GB of memory"
+    elif ending.limit == "time":
+        status, reason = "time_limit", f"took more than {job.limits.wall_s:g} s"
+    elif ending.code == _EXIT_BAD_INPUT and said:
+        status, reason = "bad_input", said
+    else:
+        last = said or next((line.strip() for line in reversed(ending.log) if line.strip()), "")
+        reason = f"ended by {ending.words} after {ending.wall_s:.1f} s" + (f": {last}" if last else "")
+    return replace(_failed(job, status, reason), log=ending.log)
+
+
+def _of_result(job: Job, folder: Path) -> Record | None:
+    """The record of a result's folder, or None where it is not whole."""
+    manifest = read_manifest(folder)
+    if manifest is None or RESULT not in manifest.files:
+        return None
+    try:
+        result = read_result(folder / RESULT)
+    except DataError:
+        return None
+    record = Record(job.drive.name, job.drive.place.url, result.status, reason_of(result))
+    return replace(record, numbers=Numbers.of(result))
+
+
+def _failed(job: Job, status: Status, reason: str) -> Record:
+    return Record(job.drive.name, job.drive.place.url, status, printable(reason, 1000))
+
+
+def _clean(target: Path) -> None:
+    """Remove what a killed process left beside its output."""
+    with contextlib.suppress(OSError, SstGraphError):
+        claim(Path(os.path.realpath(target))).release()
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, or of all files in a folder."""
+    if path.is_file():
+        return path.stat().st_size
+    total = 0
+    for folder, _, names in os.walk(path):
+        for name in names:
+            with contextlib.suppress(OSError):
+                total += os.stat(os.path.join(folder, name)).st_size
+    return total

@@ -1,0 +1,280 @@
+"""A batch: its folder, which drives are left to do, their records as they come, and the summary.
+
+``OUT/`` holds ``batch.json`` (what was asked for), ``drives/NAME/`` (what ``sst-graph calibrate`` writes:
+whole or not at all), ``records/NAME.json`` (what became of each drive), and the summary. A result that stands
+there whole is the record that its drive is done, whatever stopped an earlier batch.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.files.json_table import json_table
+from sst_graph.files.reading import parse_json
+from sst_graph.files.staging import lock_file
+from sst_graph.files.strict_json import strict_json
+from sst_graph.fleet.attempt import DRIVES, RECORDS, Job, finished_record, run_drive
+from sst_graph.fleet.dask_pool import Cluster, run_on_dask
+from sst_graph.fleet.drives import Drive, file_name
+from sst_graph.fleet.isolated import Limits
+from sst_graph.fleet.local_pool import run_locally
+from sst_graph.fleet.places import Place, read_many
+from sst_graph.fleet.record import Record
+from sst_graph.fleet.scratch import sweep_scratch
+from sst_graph.fleet.summary.page import summary_html
+from sst_graph.fleet.summary.tables import Row, csv_bytes, drive_rows, parquet_bytes, vehicle_rows
+from sst_graph.fleet.vehicles.fused import Vehicle, vehicle_json, vehicles_of
+from sst_graph.fleet.vehicles.walk import WalkConfig
+
+BATCH = "batch.json"
+FORMAT = "sst-graph/batch"
+VERSION = 1
+LOCK = ".sst-graph-batch.lock"
+
+Told = Callable[["Progress"], None]
+
+
+@dataclass(frozen=True)
+class BatchConfig:
+    """How drives are run.
+
+    Attributes:
+        options: of ``sst-graph calibrate``, but for DATA and --out.
+        workers: drives at a time on this machine, or of a local Dask cluster.
+        dask: address of a Dask scheduler, ``local``, or empty.
+        limits: of one attempt at a drive.
+        retries: further attempts at a drive after a crash, or where its data could not be copied.
+        walk: how calibrations of vehicles may drift, and the false-alarm rate.
+    """
+
+    options: tuple[str, ...] = ()
+    workers: int = 1
+    dask: str = ""
+    limits: Limits = field(default_factory=Limits)
+    retries: int = 2
+    walk: WalkConfig = field(default_factory=WalkConfig)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a batch stands.
+
+    Attributes:
+        done, total: drives, those that an earlier run had finished among them.
+        earlier: how many of them an earlier run had finished.
+        without_result: how many failed so far.
+        seconds: since this run began.
+        last: the drive that was done last, or None.
+    """
+
+    done: int
+    total: int
+    earlier: int
+    without_result: int
+    seconds: float
+    last: Record | None = None
+
+    @property
+    def per_hour(self) -> float:
+        """Drives an hour, of this run."""
+        return 3600.0 * (self.done - self.earlier) / max(self.seconds, 1e-9)
+
+    @property
+    def left_s(self) -> float | None:
+        """Time to the end at this rate [s]; None before the first drive."""
+        return 3600.0 * (self.total - self.done) / self.per_hour if self.done > self.earlier else None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a batch leaves.
+
+    Attributes:
+        rows: of the drives, what needs attention first.
+        vehicles: of those that are known.
+        names: of the summary's files.
+    """
+
+    rows: list[Row]
+    vehicles: list[Vehicle]
+    names: list[str]
+
+    @property
+    def all_fine(self) -> bool:
+        """Whether every drive is ok, and no vehicle changed or is contradicted."""
+        drives = all(row["status"] == "ok" and not row["contradicts"] for row in self.rows)
+        return drives and all(one.status == "ok" for one in self.vehicles)
+
+
+@contextmanager
+def open_batch(out: Place, options: Sequence[str]) -> Iterator[None]:
+    """Take the folder of a batch, new or begun before with the same options.
+
+    Raises:
+        ConfigError: it holds something else, or a batch with other options, or another run is at it.
+        DataError: it cannot be read or written.
+    """
+    if out.is_local and out.exists() and not out.is_folder():
+        raise ConfigError(f"{out}: found a file, expected a folder or nothing")
+    if (out / BATCH).exists():
+        place = (out / BATCH).url
+        table = json_table(
+            parse_json(_utf8((out / BATCH).read(), place), place, BATCH), place, FORMAT, VERSION
+        )
+        before = [str(one) for one in table.sequence("options")]
+        if before != list(options):
+            raise ConfigError(
+                f"{out}: was begun with the options {' '.join(before) or '(none)'}, found "
+                f"{' '.join(options) or '(none)'}, expected the same: results of both would be "
+                "mixed (or another --out)"
+            )
+    elif out.is_folder() and out.below():
+        raise ConfigError(
+            f"{out}: found a folder without {BATCH}, expected a batch's folder, an empty one or none"
+        )
+    with _locked(out):
+        if not (out / BATCH).exists():
+            document = {"format": FORMAT, "version": VERSION, "options": list(options)}
+            (out / BATCH).write((strict_json(document) + "\n").encode("utf-8"))
+        sweep_scratch()
+        yield
+
+
+def run_batch(
+    drives: Sequence[Drive],
+    out: Place,
+    config: BatchConfig,
+    told: Told,
+    run: Callable[[Job], Record] = run_drive,
+) -> dict[str, Record]:
+    """Run all drives that have no result yet; the records of all, by name.
+
+    Args:
+        told: is called after every drive, and now and then between.
+        run: what is done for a drive; it does not raise, and Dask can send it to its workers.
+
+    Raises:
+        ConfigError: an earlier run calibrated other data under the name of a drive.
+        DataError: the folder cannot be read.
+    """
+    jobs = [Job(drive, config.options, out, os.getcwd(), config.limits, config.retries) for drive in drives]
+    records = _finished(jobs, out)
+    left = [job for job in jobs if job.drive.name not in records]
+    earlier, started = len(records), time.monotonic()
+    failed = 0
+    told(Progress(earlier, len(jobs), earlier, failed, 0.0))
+    if config.dask and left:
+        coming = run_on_dask(left, Cluster(config.dask, config.workers), run)
+    else:
+        coming = run_locally(left, config.workers, run)
+    for record in coming:
+        if record is not None:
+            records[record.drive] = record
+            failed += not record.has_result
+        told(Progress(len(records), len(jobs), earlier, failed, time.monotonic() - started, record))
+    return records
+
+
+def write_summary(
+    drives: Sequence[Drive], records: dict[str, Record], out: Place, config: BatchConfig
+) -> Outcome:
+    """Fuse the vehicles and write the summary: tables and page.
+
+    Raises:
+        OSError, DataError: it cannot be written.
+    """
+    vehicles = vehicles_of(drives, records, config.walk)
+    report = "report.md" if "--no-report" in config.options else "report.html"
+    rows, of_vehicles = drive_rows(drives, records, vehicles, report), vehicle_rows(vehicles)
+    contents: dict[str, bytes | None] = {
+        "summary.csv": csv_bytes(rows),
+        "summary.parquet": parquet_bytes(rows),
+        "vehicles.csv": csv_bytes(of_vehicles) or None,
+        "vehicles.parquet": parquet_bytes(of_vehicles),
+        "summary.html": summary_html(rows, of_vehicles, vehicles).encode("utf-8"),
+    }
+    written = [name for name, data in contents.items() if data is not None]
+    for name, data in contents.items():
+        if data is not None:
+            (out / name).write(data)
+    names = _vehicle_files(vehicles)
+    for vehicle in vehicles:
+        (out / "vehicles" / names[vehicle.name]).write(
+            vehicle_json(vehicle, records, config.walk).encode("utf-8")
+        )
+    return Outcome(rows, vehicles, written)
+
+
+def _vehicle_files(vehicles: Sequence[Vehicle]) -> dict[str, str]:
+    """A file's name for each vehicle."""
+    files: dict[str, str] = {}
+    for vehicle in vehicles:
+        name = f"{file_name(vehicle.name)}.json"
+        if name in files.values():
+            other = next(one for one, taken in files.items() if taken == name)
+            raise ConfigError(f"vehicles {other!r} and {vehicle.name!r}: found one file {name} for both")
+        files[vehicle.name] = name
+    return files
+
+
+def _finished(jobs: Sequence[Job], out: Place) -> dict[str, Record]:
+    """The records of drives whose results stand there whole."""
+    folder = out / DRIVES
+    if not folder.exists():
+        return {}
+    there = {place.name for place in folder.below()}
+    begun = [job for job in jobs if job.drive.name in there]
+    stored = read_many(out / RECORDS / f"{job.drive.name}.json" for job in begun)
+    found = {}
+    for job in begun:
+        data = stored.get(job.record)
+        _check_same(job, data)
+        record = finished_record(job, data)
+        if record is not None:
+            found[job.drive.name] = record
+    return found
+
+
+def _check_same(job: Job, data: bytes | None) -> None:
+    if data is None:
+        return
+    try:
+        before = Record.from_json(data, job.record.url)
+    except DataError:
+        return  # it is written anew
+    if before.has_result and before.place != job.drive.place.url:
+        raise ConfigError(
+            f"{job.drive.place}: found a result of {before.place} under the name {job.drive.name}, "
+            "expected one of the same data (names differ with --name-parts 2, or another --out)"
+        )
+
+
+@contextmanager
+def _locked(out: Place) -> Iterator[None]:
+    """No second run on a local folder at the same time."""
+    if not out.is_local:
+        yield
+        return
+    try:
+        out.path.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(out.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    except OSError as error:
+        raise ConfigError(f"{out}: nothing can be made there ({error.strerror})") from error
+    try:
+        if not lock_file(descriptor):
+            raise ConfigError(f"{out}: another run of sst-graph batch is at it, expected to be the only one")
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _utf8(data: bytes, place: str) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        raise DataError(place, "bytes that are no UTF-8", BATCH) from None

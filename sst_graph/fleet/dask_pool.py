@@ -1,0 +1,113 @@
+"""Drives on a cluster of dask.distributed (extra ``dask``): the same work on other machines.
+
+A task runs one drive as the local pool does, in a process of its own below the Dask worker. Where a worker is
+lost, the scheduler repeats its task elsewhere; a result that is whole by then is taken as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+from sst_graph.errors import ConfigError, MissingDependencyError
+from sst_graph.fleet.attempt import Job
+from sst_graph.fleet.record import Record
+
+LOCAL = "local"
+"""In the place of an address: a cluster on this machine, started for the batch."""
+_PATIENCE_S, _CONNECT_S = 0.5, 20.0
+_AHEAD = 4
+"""Tasks at the scheduler for each that can run: enough that none waits, few enough for its memory."""
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Which cluster.
+
+    Attributes:
+        address: of its scheduler, such as tcp://host:8786, or :data:`LOCAL`.
+        workers: of a local cluster.
+    """
+
+    address: str
+    workers: int
+
+
+def run_on_dask(
+    jobs: Iterable[Job], cluster: Cluster, run: Callable[[Job], Record]
+) -> Iterator[Record | None]:
+    """The records of all jobs, as they are done; None now and then while there is none.
+
+    Raises:
+        ConfigError: no scheduler answers.
+        MissingDependencyError: dask.distributed is not installed.
+    """
+    distributed = _distributed()
+    with _client(distributed, cluster) as client:
+        waiting = iter(jobs)
+        running: dict[Any, Job] = {}
+        while True:
+            threads = sum(one["nthreads"] for one in client.scheduler_info(n_workers=-1)["workers"].values())
+            for job in islice(waiting, max(_AHEAD * max(threads, 1) - len(running), 0)):
+                running[client.submit(run, job, pure=False, key=f"sst-graph-{job.drive.name}")] = job
+            if not running:
+                return
+            try:
+                done = distributed.wait(
+                    list(running), timeout=_PATIENCE_S, return_when="FIRST_COMPLETED"
+                ).done
+            except (TimeoutError, distributed.TimeoutError):
+                yield None
+                continue
+            for future in done:
+                yield _record(future, running.pop(future))
+                future.release()
+
+
+def _record(future: Any, job: Job) -> Record:
+    """What a task gave; a task that killed every worker it was given to has crashed."""
+    error = future.exception()
+    if error is None:
+        record = future.result()
+        assert isinstance(record, Record)
+        return record
+    words = " ".join(str(error).split()) or type(error).__name__
+    return Record(job.drive.name, job.drive.place.url, "crash", f"its Dask worker was lost: {words:.500}")
+
+
+def _client(distributed: Any, cluster: Cluster) -> Any:
+    try:
+        if cluster.address == LOCAL:
+            local = distributed.LocalCluster(
+                n_workers=cluster.workers, threads_per_worker=1, processes=True, dashboard_address=None
+            )
+            return _OwnCluster(distributed, local)
+        return distributed.Client(cluster.address, timeout=_CONNECT_S)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConfigError(f"--dask {cluster.address}: found no scheduler ({error})") from error
+
+
+class _OwnCluster:
+    """A client that closes its cluster, too."""
+
+    def __init__(self, distributed: Any, cluster: Any) -> None:
+        self._cluster, self._client = cluster, distributed.Client(cluster)
+
+    def __enter__(self) -> Any:
+        return self._client.__enter__()
+
+    def __exit__(self, *error: Any) -> None:
+        self._client.__exit__(*error)
+        self._cluster.close()
+
+
+def _distributed() -> Any:
+    try:
+        import distributed
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--dask needs dask.distributed: pip install 'sst-graph[dask]'"
+        ) from error
+    return distributed

@@ -1,0 +1,228 @@
+"""The drives of a batch: from a folder, a pattern or a list to names, vehicles and dates."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+
+from sst_graph.errors import ConfigError, DataError
+from sst_graph.fleet.places import Place
+
+_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._=+-]+")
+_PATTERN = re.compile(r"[*?\[]")
+_LONGEST_NAME = 150
+MOST_DRIVES = 1_000_000
+
+_DATES = (
+    "%Y-%m-%d",
+    "%Y%m%d",
+    "%Y_%m_%d",
+    "%Y-%m-%dT%H:%M:%S",
+    "%Y-%m-%dT%H-%M-%S",
+    "%Y-%m-%d-%H-%M-%S",
+    "%Y-%m-%d_%H-%M-%S",
+    "%Y%m%dT%H%M%S",
+    "%Y%m%d_%H%M%S",
+    "%Y%m%d-%H%M%S",
+)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive that is to be calibrated.
+
+    Attributes:
+        name: of its result's folder; no two drives of a batch have the same.
+        place: where its data stand.
+        vehicle: whose sensors it shares with other drives; empty where that is not known.
+        date: ISO 8601, UTC where it names no zone; empty where it is not known.
+    """
+
+    name: str
+    place: Place
+    vehicle: str = ""
+    date: str = ""
+
+    @property
+    def day(self) -> float | None:
+        """Days since 1970, or None without a date."""
+        return None if not self.date else _instant(self.date).timestamp() / 86400.0
+
+
+def find_drives(what: str, name_parts: int = 1) -> list[Drive]:
+    """The drives that a folder, a pattern or a list names, in the order of the list or of their names.
+
+    A list is a text file with one path or URL a line (# begins a comment), or a CSV with a column ``drive``
+    and any of ``name``, ``vehicle`` and ``date``. Paths in it are relative to where the program was started.
+
+    Args:
+        name_parts: how many of the last parts of a path make a drive's name.
+
+    Raises:
+        ConfigError: none are found, or two have the same name.
+        DataError: the list cannot be read.
+    """
+    place = Place.of(what)
+    if _PATTERN.search(what):
+        drives = [_named(one, name_parts) for one in place.matches()]
+    elif place.is_folder():
+        drives = [_named(one, name_parts) for one in place.below()]
+    elif place.exists():
+        drives = _of_list(place, name_parts)
+    else:
+        raise ConfigError(f"{what}: found nothing, expected a folder of drives, a pattern, or a list")
+    if not drives:
+        raise ConfigError(f"{what}: found no drive, expected at least one")
+    if len(drives) > MOST_DRIVES:
+        raise ConfigError(f"{what}: found {len(drives)} drives, expected at most {MOST_DRIVES}")
+    _check_names(drives)
+    return drives
+
+
+def with_vehicles(drives: Sequence[Drive], given: str) -> list[Drive]:
+    """The drives with vehicle and date by a CSV or a regular expression.
+
+    Args:
+        given: a CSV with columns ``drive`` (its name, path or URL), ``vehicle`` and, if known, ``date``; or a
+            regular expression on a drive's path with a group ``vehicle`` (or one group without a name) and,
+            if its dates are in the paths, a group ``date``.
+
+    Raises:
+        ConfigError: no such expression, or it fits no drive.
+        DataError: the CSV cannot be read.
+    """
+    told = _by_table(given) if given.lower().endswith(".csv") else _by_expression(given)
+    found = []
+    for drive in drives:
+        row = told(drive)
+        date = _checked_date(row.get("date") or drive.date, given)
+        found.append(replace(drive, vehicle=(row.get("vehicle") or drive.vehicle).strip(), date=date))
+    if not any(drive.vehicle for drive in found):
+        raise ConfigError(f"--vehicle-from {given}: found no vehicle of any of {len(found)} drives")
+    return found
+
+
+def file_name(words: str) -> str:
+    """Words as the name of a file: what may be trouble in one becomes an underscore."""
+    name = _NOT_IN_A_NAME.sub("_", words).strip("._") or "_"
+    return name[:_LONGEST_NAME]
+
+
+def _by_table(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
+    known = {row["drive"].rstrip("/"): row for row in _rows(Place.of(given), ("drive", "vehicle"))}
+
+    def told(drive: Drive) -> Mapping[str, str | None]:
+        return known.get(drive.name) or known.get(drive.place.url) or {}
+
+    return told
+
+
+def _by_expression(given: str) -> Callable[[Drive], Mapping[str, str | None]]:
+    try:
+        expression = re.compile(given)
+    except re.error as error:
+        raise ConfigError(f"--vehicle-from {given!r}: found no regular expression ({error})") from error
+    names = expression.groupindex
+    if "vehicle" not in names and not expression.groups:
+        raise ConfigError(f"--vehicle-from {given!r}: found no group, expected (?P<vehicle>...)")
+
+    def told(drive: Drive) -> Mapping[str, str | None]:
+        match = expression.search(drive.place.url)
+        if match is None:
+            return {}
+        named = match.groupdict()
+        return {"vehicle": named.get("vehicle") or match.group(1), "date": named.get("date")}
+
+    return told
+
+
+def _of_list(place: Place, name_parts: int) -> list[Drive]:
+    if place.name.lower().endswith(".csv"):
+        drives = []
+        for row in _rows(place, ("drive",)):
+            drive = _named(Place.of(row["drive"]), name_parts)
+            date = _checked_date(row.get("date", ""), place.url)
+            name = file_name(row["name"]) if row.get("name") else drive.name
+            drives.append(Drive(name, drive.place, row.get("vehicle", ""), date))
+        return drives
+    lines = (line.partition("#")[0].strip() for line in _text(place).splitlines())
+    return [_named(Place.of(line), name_parts) for line in lines if line]
+
+
+def _rows(place: Place, needed: Iterable[str]) -> list[dict[str, str]]:
+    """Rows of a CSV, by the names in its first line, without spaces around."""
+    try:
+        reader = csv.DictReader(io.StringIO(_text(place)), strict=True)
+        head = [name.strip().lower() for name in reader.fieldnames or ()]
+        missing = [name for name in needed if name not in head]
+        if missing:
+            raise DataError(place.url, f"the columns {', '.join(head)}", f"a column {missing[0]}")
+        reader.fieldnames = head
+        rows = []
+        for row in reader:
+            extra = row.pop(None, None)
+            if extra:
+                raise DataError(f"{place}: line {reader.line_num}", "too many cells", f"{len(head)}")
+            rows.append({name: (cell or "").strip() for name, cell in row.items()})
+            if any(not rows[-1][name] for name in needed):
+                raise DataError(f"{place}: line {reader.line_num}", "an empty cell", ", ".join(needed))
+        return rows
+    except csv.Error as error:
+        raise DataError(place.url, str(error), "a CSV file") from error
+
+
+def _text(place: Place) -> str:
+    try:
+        text = place.read().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(place.url, "bytes that are no UTF-8", "a list of drives (text or CSV)") from error
+    if "\0" in text:
+        raise DataError(place.url, "a zero byte", "a list of drives (text or CSV)")
+    return text
+
+
+def _named(place: Place, parts: int) -> Drive:
+    return Drive(file_name("_".join(place.url.split("/")[-parts:])), place)
+
+
+def _check_names(drives: Sequence[Drive]) -> None:
+    names = Counter(drive.name for drive in drives)
+    for name, count in names.items():
+        if count > 1:
+            first, second = [drive.place.url for drive in drives if drive.name == name][:2]
+            raise ConfigError(
+                f"{first} and {second}: found two drives named {name}, expected names that differ "
+                "(--name-parts 2 takes the folder above into the name; a list in CSV has a column name)"
+            )
+
+
+def _checked_date(text: str, place: str) -> str:
+    """A date in ISO 8601."""
+    if not text:
+        return ""
+    try:
+        return _instant(text).isoformat()
+    except ValueError:
+        raise DataError(
+            place, f"the date {text!r:.60}", "one such as 2026-11-23 or 20261123_101500"
+        ) from None
+
+
+def _instant(text: str) -> datetime:
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        for form in _DATES:
+            try:
+                found = datetime.strptime(text, form)
+                break
+            except ValueError:
+                continue
+        else:
+            raise
+    return found if found.tzinfo else found.replace(tzinfo=UTC)

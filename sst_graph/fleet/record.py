@@ -1,0 +1,216 @@
+"""What became of one drive: the record that a batch keeps of it, and its row in the summary."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import DataError, printable
+from sst_graph.files.json_table import json_table
+from sst_graph.files.reading import FileKind, parse_json
+from sst_graph.files.strict_json import strict_json
+from sst_graph.inspect.reasons import short_reasons
+from sst_graph.marginal import CalibrationMarginal, inverse
+from sst_graph.result import CalibrationResult
+
+FloatArray = NDArray[np.float64]
+
+FORMAT = "sst-graph/batch-record"
+VERSION = 1
+RECORD = FileKind("a record of a batch", 1024 * 1024)
+
+Status = Literal[
+    "ok",
+    "unobservable",
+    "not_converged",
+    "bad_input",
+    "crash",
+    "memory_limit",
+    "time_limit",
+    "storage",
+    "not_run",
+]
+"""The result's own status, or why there is none: the command refused the data (``bad_input``), its process
+ended by itself (``crash``) or at a limit, the data or the result could not be copied (``storage``), the batch
+ended before (``not_run``)."""
+WITH_RESULT = ("ok", "unobservable", "not_converged")
+
+ATTENTION = ("crash", "memory_limit", "time_limit", "storage", "bad_input", "not_run", "not_converged")
+"""Status by how much it needs to be looked at, most first; then come unobservable and ok."""
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What the attempts at a drive took.
+
+    Attributes:
+        attempts: how many there were.
+        wall_s, cpu_s: of the last one [s].
+        peak_bytes: of memory, of the last one.
+        input_bytes: size of the drive's files.
+    """
+
+    attempts: int = 0
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_bytes: int = 0
+    input_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """The numbers of a result, as plain lists; conventions of calibration.json.
+
+    Attributes:
+        T_camera_lidar: 4 rows of 4.
+        time_offset_s: [s].
+        covariance: 7 rows of 7.
+        common: columns of 7, one an assumption: what its deviation (one sigma) shifts the result by.
+        frames: how many took part.
+        camera: name of the camera.
+    """
+
+    T_camera_lidar: list[list[float]]
+    time_offset_s: float
+    covariance: list[list[float]]
+    common: list[list[float]]
+    frames: int
+    camera: str
+
+    @staticmethod
+    def of(result: CalibrationResult) -> Numbers:
+        """Of a result."""
+        return Numbers(
+            result.T_camera_lidar.matrix().tolist(),
+            result.time_offset_s,
+            result.covariance.tolist(),
+            _common(result.diagnostics.get("assumptions")),
+            len(result.frames_used),
+            result.camera_name,
+        )
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(7,) standard deviations [rad, m, s]."""
+        return np.asarray(np.sqrt(np.diag(np.array(self.covariance))))
+
+    def marginal(self) -> CalibrationMarginal:
+        """As :func:`sst_graph.export.marginal_of_result` of the result.
+
+        Raises:
+            EstimationError: the covariance has no inverse.
+        """
+        information = inverse(np.array(self.covariance), "covariance of the result")
+        cTl = gtsam.Pose3(np.array(self.T_camera_lidar))
+        return CalibrationMarginal(cTl, self.time_offset_s, information, np.zeros(7))
+
+
+@dataclass(frozen=True)
+class Record:
+    """What became of one drive.
+
+    Attributes:
+        drive: its name; place: where its data stand.
+        status: of the result, or why there is none.
+        reason: one line; empty where all is well.
+        cost: what it took.
+        numbers: of the result, or None.
+        log: last lines of what a failed attempt wrote on stderr.
+    """
+
+    drive: str
+    place: str
+    status: Status
+    reason: str = ""
+    cost: Cost = Cost()
+    numbers: Numbers | None = None
+    log: tuple[str, ...] = ()
+
+    @property
+    def has_result(self) -> bool:
+        """Whether the drive's folder holds a result."""
+        return self.status in WITH_RESULT
+
+    @property
+    def attention(self) -> int:
+        """Rank by how much it needs to be looked at, 0 first."""
+        order = (*ATTENTION, "unobservable", "ok")
+        return order.index(self.status)
+
+    def to_json(self) -> str:
+        """The text of its file."""
+        return strict_json({"format": FORMAT, "version": VERSION, **asdict(self)}) + "\n"
+
+    @staticmethod
+    def from_json(data: bytes, place: str | Path) -> Record:
+        """The record in such a text.
+
+        Raises:
+            DataError: no such text.
+        """
+        table = json_table(parse_json(_text(data, place), place, RECORD.name), place, FORMAT, VERSION)
+        status, cost = table.text("status"), table.table("cost")
+        if status not in get_args(Status):
+            raise DataError(place, f"status {status!r:.40}", f"one of {', '.join(get_args(Status))}")
+        numbers = None
+        if table.value("numbers", None) is not None:
+            read = table.table("numbers")
+            numbers = Numbers(
+                read.pose("T_camera_lidar").matrix().tolist(),
+                read.time_offset_s("time_offset_s"),
+                read.matrix("covariance", (7, 7)).tolist(),
+                read.matrix("common", (len(read.sequence("common")), 7)).tolist()
+                if read.value("common")
+                else [],
+                read.integer("frames"),
+                read.text("camera"),
+            )
+        spent = Cost(
+            cost.integer("attempts"),
+            cost.number("wall_s"),
+            cost.number("cpu_s"),
+            cost.integer("peak_bytes"),
+            cost.integer("input_bytes"),
+        )
+        return Record(
+            table.text("drive"),
+            table.text("place"),
+            status,  # type: ignore[arg-type]
+            table.sentence("reason"),
+            spent,
+            numbers,
+            table.sentences("log"),
+        )
+
+
+def reason_of(result: CalibrationResult) -> str:
+    """The first reason of a result that is not ok, in short."""
+    if result.status == "ok":
+        return ""
+    first, *others = short_reasons(result) or ("the result carries no reason",)
+    return printable(first + (f" ({len(others)} more in its report)" if others else ""), 1000)
+
+
+def _common(assumptions: Any) -> list[list[float]]:
+    """Shift of the result by one sigma of each assumption's parameter that was considered."""
+    columns = []
+    for entry in assumptions.values() if isinstance(assumptions, dict) else ():
+        try:
+            column = float(entry["sigma"]) * np.asarray(entry["sensitivity"], np.float64)
+        except (KeyError, TypeError, ValueError):
+            continue
+        if column.shape == (7,) and np.isfinite(column).all():
+            columns.append(column.tolist())
+    return columns
+
+
+def _text(data: bytes, place: str | Path) -> str:
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        raise DataError(place, "bytes that are no UTF-8", RECORD.name) from None

@@ -1,0 +1,224 @@
+"""The summary of a batch as one page: nothing is loaded from elsewhere; links lead to the drives' reports."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from importlib.resources import files
+from urllib.parse import quote
+
+import numpy as np
+
+from sst_graph.fleet.drives import file_name
+from sst_graph.fleet.summary.tables import Row
+from sst_graph.fleet.vehicles.fused import Vehicle
+from sst_graph.report.chart import Chart
+from sst_graph.report.html import bullets, details, figure, grid, paragraph, section, text
+
+MOST_ROWS = 5000
+"""Drives on the page; the tables have all of them. Those that need attention come first."""
+MOST_CHARTS = 60
+"""Vehicles with charts of their drift, those that need attention first."""
+_SHOWN = ("drive", "vehicle", "date", "status", "reason", "rotation", "translation", "time offset", "took")
+
+
+def summary_html(rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle]) -> str:
+    """The page.
+
+    Args:
+        rows: of the drives, in the order of the page.
+        vehicle_rows: of the vehicles, in the order of the page.
+        vehicles: all of them.
+    """
+    by_name = {one.name: one for one in vehicles}
+    body = [
+        _verdict(rows, vehicle_rows),
+        _vehicles(vehicle_rows),
+        _drifts([by_name[str(row["vehicle"])] for row in vehicle_rows]),
+        _drives(rows),
+    ]
+    title = f"Batch of {len(rows)} drives"
+    style = files("sst_graph.report").joinpath("page.css").read_text(encoding="utf-8")
+    own = files("sst_graph.fleet.summary")
+    script = own.joinpath("page.js").read_text(encoding="utf-8")
+    return (
+        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        '<link rel="icon" href="data:,">\n'
+        f"<title>{text(title)}</title>\n<style>\n{style}{own.joinpath('page.css').read_text(encoding='utf-8')}"
+        f"</style>\n</head>\n<body>\n<h1>{text(title)}</h1>\n<main>\n"
+        + "\n".join(one for one in body if one)
+        + f"\n</main>\n<script>\n{script}</script>\n</body>\n</html>\n"
+    )
+
+
+def counts_line(rows: Sequence[Row]) -> str:
+    """How many drives there are of each status."""
+    counts = Counter(str(row["status"]) for row in rows)
+    return ", ".join(f"{count} {name}" for name, count in counts.most_common())
+
+
+def _verdict(rows: Sequence[Row], vehicle_rows: Sequence[Row]) -> str:
+    counts = Counter(str(row["status"]) for row in rows)
+    bars = "".join(
+        f'<span class="s-{name}" style="flex:{count}" title="{count} {name}"></span>'
+        for name, count in counts.most_common()
+    )
+    failed = [row for row in rows if not row["report"]]
+    state = "ok" if counts["ok"] == len(rows) else "not_converged" if failed else "unobservable"
+    reasons = Counter(_kind_of(row) for row in failed)
+    wrong = [row for row in vehicle_rows if row["status"] != "ok"]
+    return section(
+        "verdict",
+        "Verdict",
+        f'<p class="verdict {state}">{counts["ok"]} of {len(rows)} drives are ok; '
+        f"{len(failed)} have no result"
+        + (f"; {len(wrong)} of {len(vehicle_rows)} vehicles need attention" if vehicle_rows else "")
+        + "</p>",
+        f'<div class="bars">{bars}</div>',
+        paragraph(counts_line(rows)),
+        bullets(f"{count} × {kind}" for kind, count in reasons.most_common(12)),
+    )
+
+
+def _kind_of(row: Row) -> str:
+    """A failure's status and the part of its reason that drives have in common."""
+    reason = str(row["reason"])
+    words = reason.split(": found ", 1)
+    last = words[0].rsplit("/", 1)[-1] if len(words) == 2 else ""
+    return f"{row['status']}: {last}: found {words[1]}"[:160] if last else f"{row['status']}: {reason}"[:160]
+
+
+def _vehicles(rows: Sequence[Row]) -> str:
+    if not rows:
+        return ""
+    lines = []
+    for row in rows:
+        name = str(row["vehicle"])
+        link = f'<a href="vehicles/{quote(file_name(name))}.json">{text(name)}</a>'
+        lines.append(
+            f'<tr><th scope="row">{link}</th><td>{_tag(row)}</td>'
+            f'<td class="why">{text(str(row["reason"]))}</td><td class="num">{row["drives"]}</td>'
+            f'<td class="num">{row["without"]}</td>{_sigma_cells(row)}</tr>'
+        )
+    heads = ("vehicle", "status", "what happened", "drives", "without", *_SHOWN[5:8])
+    return section(
+        "vehicles",
+        "Vehicles",
+        paragraph(
+            "The calibration of each vehicle by all of its drives; σ is the largest of the three axes.",
+            "note",
+        ),
+        _table("vehicles-table", heads, lines),
+    )
+
+
+def _drives(rows: Sequence[Row]) -> str:
+    lines = []
+    for row in rows[:MOST_ROWS]:
+        name = text(str(row["drive"]))
+        if row["report"]:
+            name = f'<a href="{quote(str(row["report"]))}">{name}</a>'
+        seconds = float(row["wall_s"] or 0.0)
+        lines.append(
+            f'<tr data-status="{row["status"]}"><th scope="row">{name}</th>'
+            f"<td>{text(str(row['vehicle']))}</td>"
+            f"<td>{text(str(row['date'])[:16])}</td><td>{_tag(row)}</td>"
+            f'<td class="why">{text(str(row["reason"]))}</td>{_sigma_cells(row)}'
+            f'<td class="num" data-value="{seconds}">{seconds:.0f} s</td></tr>'
+        )
+    statuses = sorted({str(row["status"]) for row in rows})
+    choices = "".join(f'<option value="{name}">{name}</option>' for name in statuses)
+    left_out = len(rows) - MOST_ROWS
+    note = f"{left_out} more, which need less attention, are in summary.csv." if left_out > 0 else ""
+    return section(
+        "drives",
+        "Drives",
+        paragraph("What needs attention comes first; a click on a head sorts.", "note"),
+        paragraph(note, "note") if note else "",
+        '<div class="filters"><label>status <select id="status"><option value="">all</option>'
+        f'{choices}</select></label><label>words <input id="words" type="search"></label>'
+        '<span id="shown" class="note"></span></div>',
+        _table("drives-table", _SHOWN, lines),
+    )
+
+
+def _table(name: str, heads: Sequence[str], lines: Sequence[str]) -> str:
+    top = "".join(f'<th scope="col">{text(head)}</th>' for head in heads)
+    return (
+        f'<div class="scroll"><table id="{name}"><thead><tr>{top}</tr></thead><tbody>'
+        + "\n".join(lines)
+        + "</tbody></table></div>"
+    )
+
+
+def _tag(row: Row) -> str:
+    return f'<span class="tag s-{row["status"]}">{text(str(row["status"]))}</span>'
+
+
+def _sigma_cells(row: Row) -> str:
+    """Largest sigma of the rotations and of the translations, and that of the offset."""
+    cells = []
+    for names, digits, unit in (
+        (("rot_x_deg", "rot_y_deg", "rot_z_deg"), 2, "°"),
+        (("trans_x_cm", "trans_y_cm", "trans_z_cm"), 1, " cm"),
+        (("time_offset_ms",), 1, " ms"),
+    ):
+        values = [row[f"sigma_{name}"] for name in names]
+        if any(value is None for value in values):
+            cells.append('<td class="num" data-value=""></td>')
+            continue
+        largest = max(float(value) for value in values if value is not None)
+        cells.append(f'<td class="num" data-value="{largest:.6g}">±{largest:.{digits}f}{unit}</td>')
+    return "".join(cells)
+
+
+def _drifts(vehicles: Sequence[Vehicle]) -> str:
+    """Charts of those with two drives or more."""
+    moving = [one for one in vehicles if len(one.drift) > 1]
+    blocks = [
+        details(f"{one.name}: {one.status}, {len(one.drives)} drives", grid(_charts(one)))
+        for one in moving[:MOST_CHARTS]
+    ]
+    note = (
+        "The calibration at each drive by all drives of its stretch, against that of the first, along "
+        "the LiDAR's axes; the band of the time offset is one σ. Errors that all drives have in common do "
+        "not show."
+    )
+    return section("drift", "Drift", paragraph(note, "note"), *blocks) if blocks else ""
+
+
+def _charts(vehicle: Vehicle) -> list[str]:
+    first, days = vehicle.drift[0], np.array(vehicle.days)
+    steps = np.array(
+        [
+            [*first.cTl.localCoordinates(one.cTl), one.time_offset_s - first.time_offset_s]
+            for one in vehicle.drift
+        ]
+    )
+    human = steps * np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
+    span = (float(days[0]), float(days[-1]))
+    unit = "days" if vehicle.dated else "drives"
+    shown = []
+    for title, columns, label in (
+        ("Rotation", (0, 1, 2), "deg"),
+        ("Translation", (3, 4, 5), "cm"),
+        ("Time offset", (6,), "ms"),
+    ):
+        values = human[:, list(columns)]
+        sigma = 1e3 * np.sqrt([one.covariance[6, 6] for one in vehicle.drift]) if len(columns) == 1 else None
+        room = 0.0 if sigma is None else float(sigma.max())
+        chart = Chart(
+            span,
+            (float(values.min()) - room, float(values.max()) + room),
+            (f"{unit} from the first", label),
+            f"{title} of {vehicle.name} over its drives",
+        )
+        if sigma is not None:
+            chart.band(days, values[:, 0] - sigma, values[:, 0] + sigma, "a", "one sigma")
+        for k, axis in enumerate("xyz"[: len(columns)]):
+            name = axis if len(columns) == 3 else ""
+            chart.line(days, values[:, k], "abc"[k], name)
+            chart.dots(days, values[:, k], "abc"[k], titles=vehicle.drives)
+        shown.append(figure(chart.svg(), title, ""))
+    return shown

@@ -1,0 +1,269 @@
+"""The drives of one vehicle fused: its calibration, its drift, its changes, drives that contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.errors import EstimationError
+from sst_graph.export import fuse_marginals
+from sst_graph.files.strict_json import strict_json
+from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.record import Numbers, Record
+from sst_graph.fleet.vehicles.changes import Finding, Findings, find_changes
+from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, smoothed
+
+FloatArray = NDArray[np.float64]
+VehicleStatus = Literal["ok", "changed", "contradicted", "no_result"]
+
+FORMAT = "sst-graph/vehicle"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Change:
+    """A step of a vehicle's calibration.
+
+    Attributes:
+        after, before: names of the last drive before it and of the first drive after it.
+        since, until: dates of the two, or empty.
+        finding: the test.
+        drives: how many drives of the stretches on either side; a side of one drive cannot tell a change from
+            a bad drive.
+    """
+
+    after: str
+    before: str
+    since: str
+    until: str
+    finding: Finding
+    drives: tuple[int, int]
+
+    @property
+    def words(self) -> str:
+        """One sentence for people."""
+        dates = f" ({self.since[:10]} to {self.until[:10]})" if self.since and self.until else ""
+        doubt = "" if min(self.drives) > 1 else "; only one drive on a side, which may be wrong itself"
+        return f"between {self.after} and {self.before}{dates}: {self.finding.words}{doubt}"
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """What the drives of one vehicle say together.
+
+    Attributes:
+        name: of the vehicle.
+        status: ``changed`` where a step was found, ``contradicted`` where only a drive contradicts the
+            others, ``no_result`` where no drive of it has a result that counts.
+        drives: names of those that count, in order.
+        calibration: at the last of them, with what the drives have in common in its covariance; None without.
+        days: of each of them, from the first.
+        drift: at each of them; their covariances are of the differences, without what they have in common.
+        changes: steps.
+        contradicting: drives that were left out, by name.
+        without: drives that do not count, and why.
+        dated: whether all have a date; else their order counts, a day from each to the next.
+    """
+
+    name: str
+    status: VehicleStatus
+    drives: tuple[str, ...]
+    days: tuple[float, ...]
+    calibration: Smoothed | None
+    drift: tuple[Smoothed, ...]
+    changes: tuple[Change, ...]
+    contradicting: Mapping[str, Finding]
+    without: Mapping[str, str]
+    dated: bool
+
+    @property
+    def reason(self) -> str:
+        """One line, empty where nothing is wrong."""
+        parts = [f"changed {change.words}" for change in self.changes]
+        parts += [f"{name} contradicts the others: {one.words}" for name, one in self.contradicting.items()]
+        if self.calibration is None:
+            parts.append("no drive of it has a result that counts")
+        return "; ".join(parts)
+
+
+def vehicle_of(
+    name: str, drives: Sequence[Drive], records: Mapping[str, Record], config: WalkConfig
+) -> Vehicle:
+    """Fuse the drives of one vehicle.
+
+    A drive counts if its result is ``ok`` or ``unobservable`` (what it does not determine has a large sigma).
+
+    Args:
+        drives: in the order of the list.
+        records: by the name of the drive.
+    """
+    counted, without = _counted(drives, records)
+    dated = all(drive.day is not None for drive in counted)
+    if dated:
+        counted.sort(key=lambda drive: (drive.day or 0.0, drive.name))
+    estimates = [
+        DriveEstimate(
+            drive.name, (drive.day or 0.0) if dated else float(k), _numbers(records, drive.name).marginal()
+        )
+        for k, drive in enumerate(counted)
+    ]
+    if not estimates:
+        return _without_result(name, without)
+    found = find_changes(estimates, config)
+    drift = smoothed(found.left, found.steps, config)
+    by_name = {drive.name: drive for drive in counted}
+    changes = _changes(found, by_name)
+    last = found.left[max(found.steps, default=0) :]
+    common = _common_covariance(last, [_numbers(records, one.name) for one in last])
+    at_last = drift[-1]
+    calibration = Smoothed(at_last.cTl, at_last.time_offset_s, at_last.covariance + common)
+    status: VehicleStatus = "changed" if changes else "contradicted" if found.contradicting else "ok"
+    return Vehicle(
+        name,
+        status,
+        tuple(one.name for one in found.left),
+        tuple(one.day - found.left[0].day for one in found.left),
+        calibration,
+        tuple(drift),
+        changes,
+        found.contradicting,
+        without,
+        dated,
+    )
+
+
+def _without_result(name: str, without: Mapping[str, str]) -> Vehicle:
+    return Vehicle(name, "no_result", (), (), None, (), (), {}, without, False)
+
+
+def vehicles_of(drives: Sequence[Drive], records: Mapping[str, Record], config: WalkConfig) -> list[Vehicle]:
+    """All vehicles, by name; drives of no known vehicle are left out."""
+    by_vehicle: dict[str, list[Drive]] = {}
+    for drive in drives:
+        if drive.vehicle:
+            by_vehicle.setdefault(drive.vehicle, []).append(drive)
+    found = []
+    for name, own in sorted(by_vehicle.items()):
+        try:
+            found.append(vehicle_of(name, own, records, config))
+        except EstimationError as error:
+            without = {drive.name: str(error) for drive in own}
+            found.append(_without_result(name, without))
+    return found
+
+
+def vehicle_json(vehicle: Vehicle, records: Mapping[str, Record], config: WalkConfig) -> str:
+    """The text of ``vehicles/NAME.json``."""
+    now = vehicle.calibration
+    document = {
+        "format": FORMAT,
+        "version": VERSION,
+        "vehicle": vehicle.name,
+        "status": vehicle.status,
+        "reason": vehicle.reason,
+        "calibration": None if now is None else {"drive": vehicle.drives[-1], **_plain(now)},
+        "camera": records[vehicle.drives[-1]].numbers.camera if now is not None else None,  # type: ignore[union-attr]
+        "dated": vehicle.dated,
+        "walk_per_sqrt_day": config,
+        "changes": [
+            {
+                "after": change.after,
+                "before": change.before,
+                "since": change.since,
+                "until": change.until,
+                "words": change.words,
+                "drives_on_each_side": change.drives,
+                **_tested(change.finding),
+            }
+            for change in vehicle.changes
+        ],
+        "contradicting": [{"drive": name, **_tested(one)} for name, one in vehicle.contradicting.items()],
+        "without": vehicle.without,
+        "drift": [
+            {"drive": name, "day": day, **_plain(one)}
+            for name, day, one in zip(vehicle.drives, vehicle.days, vehicle.drift, strict=True)
+        ],
+    }
+    return strict_json(document) + "\n"
+
+
+def _plain(one: Smoothed) -> dict[str, Any]:
+    return {
+        "T_camera_lidar": one.cTl.matrix(),
+        "time_offset_s": one.time_offset_s,
+        "covariance": one.covariance,
+    }
+
+
+def _tested(finding: Finding) -> dict[str, Any]:
+    return {
+        "kinds": finding.kinds,
+        "step": finding.difference.step,
+        "step_covariance": finding.difference.covariance,
+        "chi2": finding.difference.chi2,
+        "p_value": finding.p_value,
+    }
+
+
+def _counted(drives: Sequence[Drive], records: Mapping[str, Record]) -> tuple[list[Drive], dict[str, str]]:
+    """Drives with a result that can be fused, and why the others cannot."""
+    counted, without = [], {}
+    for drive in drives:
+        record = records.get(drive.name)
+        if record is None:
+            without[drive.name] = "not run"
+        elif record.status not in ("ok", "unobservable") or record.numbers is None:
+            without[drive.name] = f"{record.status}: {record.reason}" if record.reason else record.status
+        else:
+            try:
+                record.numbers.marginal()
+            except EstimationError as error:
+                without[drive.name] = str(error)
+            else:
+                counted.append(drive)
+    return counted, without
+
+
+def _numbers(records: Mapping[str, Record], name: str) -> Numbers:
+    numbers = records[name].numbers
+    assert numbers is not None, name
+    return numbers
+
+
+def _changes(found: Findings, drives: Mapping[str, Drive]) -> tuple[Change, ...]:
+    names = [one.name for one in found.left]
+    borders = [0, *sorted(found.steps), len(names)]
+    sizes = {
+        at: (at - start, end - at) for start, (at, end) in zip(borders, pairwise(borders[1:]), strict=False)
+    }
+    return tuple(
+        Change(
+            names[k - 1], names[k], drives[names[k - 1]].date, drives[names[k]].date, found.steps[k], sizes[k]
+        )
+        for k in sorted(found.steps)
+    )
+
+
+def _common_covariance(drives: Sequence[DriveEstimate], numbers: Sequence[Numbers]) -> FloatArray:
+    """(7, 7) what the covariance of the fused drives lacks where their assumptions err together.
+
+    Each result's covariance holds the shift s of its estimate by one sigma of each assumption (the lens, the
+    principal point, ...), as if it were its own. The sensors are the same in all drives, so with weights W_k
+    the fused estimate is shifted by sum W_k s_k, where independent shifts would give sum W_k s_k s_k' W_k'.
+    """
+    fused = fuse_marginals([one.marginal for one in drives], significance=0.0)
+    covariance, extra = fused.covariance(), np.zeros((7, 7))
+    assumptions = min(len(one.common) for one in numbers)
+    for i in range(assumptions):
+        shifts = [
+            covariance @ one.marginal.information @ np.array(own.common[i])
+            for one, own in zip(drives, numbers, strict=True)
+        ]
+        together = np.sum(shifts, axis=0)
+        extra += np.outer(together, together) - sum(np.outer(shift, shift) for shift in shifts)
+    return np.asarray(extra)

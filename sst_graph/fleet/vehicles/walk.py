@@ -1,0 +1,165 @@
+"""The calibration of one vehicle over its drives: a random walk, on extrinsic and time offset, with steps.
+
+Every drive k has an extrinsic E(k) and a time offset D(k), and on them the marginal of its result as one
+factor (:func:`sst_graph.export.marginal_of_result`). Consecutive drives are tied by random walks
+(:func:`sst_graph.factors.extrinsic_drift`, :func:`sst_graph.factors.time_offset_drift`) over the days
+between them. Where a step is, that tie is left out. The chain is solved by eliminating each drive's variables
+in turn, once forward and once back: the two marginals at a drive together are the smoothed one, and each
+alone is what a step is tested with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.config import Settings, setting
+from sst_graph.export import EXTRINSIC, TIME_OFFSET, CalibrationMarginal, marginal_of_graph
+from sst_graph.factors import extrinsic_drift, time_offset_drift
+from sst_graph.marginal import carried
+
+FloatArray = NDArray[np.float64]
+
+_DAY_S = 86400.0
+_LEAST_DAYS = 1.0 / 24.0
+"""Drives of one date, or of one hour, count as an hour apart."""
+
+
+@dataclass(frozen=True)
+class WalkConfig(Settings):
+    """How fast a calibration may change between drives without that being a step.
+
+    Attributes:
+        rotation_deg: standard deviation of the rotation about each axis after one day [deg].
+        translation_m: of the translation along each axis after one day [m].
+        time_offset_s: of the time offset after one day [s].
+        false_alarm_rate: probability that anything is named of a vehicle whose calibration only walks.
+    """
+
+    rotation_deg: float = setting(0.005, at_least=1e-4, at_most=10.0)
+    translation_m: float = setting(0.0005, at_least=1e-5, at_most=10.0)
+    time_offset_s: float = setting(0.0001, at_least=1e-6, at_most=10.0)
+    false_alarm_rate: float = setting(1e-3, at_least=1e-9, at_most=0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveEstimate:
+    """What one drive says of its vehicle's calibration.
+
+    Attributes:
+        name: of the drive.
+        day: when it was driven, in days from any fixed day.
+        marginal: of its result.
+    """
+
+    name: str
+    day: float
+    marginal: CalibrationMarginal
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """The calibration at one drive, by all drives of its stretch.
+
+    Attributes:
+        cTl, time_offset_s: the estimate.
+        covariance: (7, 7) right perturbation, order of the conventions.
+    """
+
+    cTl: gtsam.Pose3
+    time_offset_s: float
+    covariance: FloatArray
+
+
+def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig) -> list[Smoothed]:
+    """The calibration at every drive, by all drives of its stretch.
+
+    Args:
+        drives: in the order of their days.
+        steps: k for a step between drive k - 1 and drive k.
+
+    Raises:
+        EstimationError: a direction that no drive determines.
+    """
+    ways = passes(drives, steps, config)
+    found = []
+    for upto, after in zip(ways.upto, ways.after, strict=True):
+        both = upto if after is None else upto.plus(after)
+        found.append(Smoothed(*both.best(), both.covariance()))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Passes:
+    """What the drives before each drive, and those after it, say of the calibration at that drive.
+
+    Attributes:
+        before: for each drive, the earlier ones of its stretch, walked up to it; None where there is none.
+        after: for each drive, the later ones of its stretch, walked back to it; None where there is none.
+        upto: for each drive, itself with ``before``; since: itself with ``after``.
+    """
+
+    before: list[CalibrationMarginal | None]
+    after: list[CalibrationMarginal | None]
+    upto: list[CalibrationMarginal]
+    since: list[CalibrationMarginal]
+
+
+def passes(drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig) -> Passes:
+    """One pass forward over the drives and one back, each drive's variables eliminated as it goes."""
+    before, upto = _one_pass(drives, steps, config)
+    mirrored = [len(drives) - k for k in steps]
+    after, since = _one_pass(drives[::-1], mirrored, config)
+    return Passes(before, after[::-1], upto, since[::-1])
+
+
+def _one_pass(
+    drives: Sequence[DriveEstimate], steps: Collection[int], config: WalkConfig
+) -> tuple[list[CalibrationMarginal | None], list[CalibrationMarginal]]:
+    predictions: list[CalibrationMarginal | None] = []
+    together: list[CalibrationMarginal] = []
+    for k, drive in enumerate(drives):
+        prediction = None
+        if k and k not in steps:
+            prediction = walked(together[-1], abs(drive.day - drives[k - 1].day), config)
+        both = drive.marginal if prediction is None else prediction.plus(drive.marginal)
+        predictions.append(prediction)
+        together.append(carried(both, *both.best()))
+    return predictions, together
+
+
+def walked(marginal: CalibrationMarginal, days: float, config: WalkConfig) -> CalibrationMarginal:
+    """What a marginal says after a random walk of so many days."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(marginal.factor(_E(0), _D(0)))
+    for factor in _walk(0, 1, days, config):
+        graph.add(factor)
+    cTl, time_offset_s = marginal.best()
+    for k in (0, 1):
+        values.insert(_E(k), cTl)
+        values.insert(_D(k), np.array([time_offset_s]))
+    return marginal_of_graph(graph, values, _E(1), _D(1))
+
+
+def _walk(
+    a: int, b: int, days: float, config: WalkConfig
+) -> tuple[gtsam.BetweenFactorPose3, gtsam.NoiseModelFactor]:
+    """The ties between two drives."""
+    seconds, root = max(days, _LEAST_DAYS) * _DAY_S, np.sqrt(_DAY_S)
+    rotation, translation = np.radians(config.rotation_deg) / root, config.translation_m / root
+    return (
+        extrinsic_drift(_E(a), _E(b), seconds, rotation, translation),
+        time_offset_drift(_D(a), _D(b), seconds, config.time_offset_s / root),
+    )
+
+
+def _E(k: int) -> int:
+    return EXTRINSIC + k
+
+
+def _D(k: int) -> int:
+    return TIME_OFFSET + k

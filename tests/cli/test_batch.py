@@ -1,0 +1,241 @@
+"""``sst-graph batch`` as a user calls it: drives that fail alone, kills, resuming, S3, Dask."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sst_graph.cli import main
+from sst_graph.fleet import Place, Record
+
+PROGRAM = [sys.executable, "-m", "sst_graph.cli"]
+FAST = ["--no-report"]
+
+
+@pytest.fixture
+def drives(kitti_drive: Path, tmp_path: Path) -> Path:
+    """Three drives of a few pixels (no vehicle, so unobservable), and one whose calib.txt is cut off."""
+    folder = tmp_path / "drives"
+    for name in ("v1_2026-03-01", "v1_2026-03-08", "v2_2026-03-01", "v2_2026-03-08"):
+        shutil.copytree(kitti_drive.parents[1], folder / name)
+    (folder / "v2_2026-03-08/sequences/00/calib.txt").write_text("P0: 1")
+    return folder
+
+
+def rows_of(out: Path) -> dict[str, dict[str, str]]:
+    with (out / "summary.csv").open(newline="") as stream:
+        return {row["drive"]: row for row in csv.DictReader(stream)}
+
+
+def results(out: Path) -> dict[str, bytes]:
+    return {str(one.relative_to(out)): one.read_bytes() for one in out.rglob("*") if one.is_file()}
+
+
+def test_a_bad_file_costs_that_drive_alone(
+    drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    vehicle = ["--vehicle-from", r"(?P<vehicle>v\d)_(?P<date>[\d-]+)$"]
+    command = ["batch", str(drives), "--out", str(out), "--workers", "2", *vehicle, *FAST]
+    assert main(command) == 3
+    said = capfd.readouterr()
+    assert "4: 3 unobservable, 1 bad_input" in said.out and "calib.txt" in said.out
+    rows = rows_of(out)
+    assert [rows[f"{v}_2026-03-{d}"]["status"] for v, d in (("v1", "01"), ("v1", "08"), ("v2", "01"))] == [
+        "unobservable"
+    ] * 3
+    assert rows["v2_2026-03-08"]["status"] == "bad_input" and not (out / "drives/v2_2026-03-08").exists()
+    # each as the command itself makes it
+    alone = tmp_path / "alone"
+    assert main(["calibrate", str(drives / "v1_2026-03-08"), "--out", str(alone), *FAST]) == 3
+    assert results(alone) == results(out / "drives/v1_2026-03-08")
+    # again: nothing is run but what failed, which is mended by then
+    shutil.copy(
+        drives / "v2_2026-03-01/sequences/00/calib.txt", drives / "v2_2026-03-08/sequences/00/calib.txt"
+    )
+    before = {
+        name: one.stat().st_mtime_ns for name in rows for one in (out / "drives").glob(f"{name}/*.json")
+    }
+    assert main(command) == 3
+    assert {row["status"] for row in rows_of(out).values()} == {"unobservable"}
+    after = {
+        name: one.stat().st_mtime_ns for name in before for one in (out / "drives").glob(f"{name}/*.json")
+    }
+    assert before.items() <= after.items()
+    assert json.loads((out / "vehicles/v1.json").read_text())["dated"] is True
+
+
+def test_limits_are_recorded_with_what_was_taken(drives: Path, tmp_path: Path) -> None:
+    one = [str(drives / "v1_*-01"), "--retries", "0", *FAST]
+    assert main(["batch", *one, "--out", str(tmp_path / "a"), "--memory-limit", "0.04"]) == 3
+    assert main(["batch", *one, "--out", str(tmp_path / "b"), "--time-limit", "0.2"]) == 3
+    memory, wall = (rows_of(tmp_path / name)["v1_2026-03-01"] for name in "ab")
+    assert memory["status"] == "memory_limit" and "GB of memory" in memory["reason"]
+    assert float(memory["peak_mb"]) > 40.0
+    assert (wall["status"], wall["reason"]) == ("time_limit", "took more than 0.2 s")
+    for name in "ab":
+        assert list((tmp_path / name).glob("drives/*")) == []  # nothing unfinished either
+
+
+def wait_for(condition: object, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def running(pid: int) -> list[int]:
+    """Processes that another one started."""
+    found = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        found += [int(one) for one in task.read_text().split()]
+    return found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="finds processes by /proc")
+@pytest.mark.slow
+def test_killed_drives_are_tried_again_and_a_killed_batch_goes_on(drives: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shutil.rmtree(drives / "v2_2026-03-08")
+    command = [*PROGRAM, "batch", str(drives), "--out", str(out), "--workers", "1", *FAST]
+    # 1. the process of a drive is killed: it is tried again
+    batch = subprocess.Popen(command, stderr=subprocess.PIPE)
+    wait_for(lambda: running(batch.pid))
+    os.kill(running(batch.pid)[0], signal.SIGKILL)
+    wait_for(lambda: len(list(out.glob("records/*"))) >= 1)
+    # 2. the batch itself is killed: its drives end with it
+    wait_for(lambda: running(batch.pid))
+    orphans = running(batch.pid)
+    batch.kill()
+    batch.wait()
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() and _is_alive(pid) for pid in orphans))
+    assert not (out / "summary.csv").exists()
+    # 3. Ctrl-C: it ends with a line, and no process stays
+    batch = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    wait_for(lambda: running(batch.pid))
+    orphans = running(batch.pid)
+    batch.send_signal(signal.SIGINT)
+    _, said = batch.communicate(timeout=60)
+    assert batch.returncode == 130 and "interrupted" in said and "Traceback" not in said
+    wait_for(lambda: not any(_is_alive(pid) for pid in orphans))
+    assert not list(out.glob("drives/.*"))
+    # 4. the same command finishes
+    assert subprocess.run(command, check=False).returncode == 3
+    rows = rows_of(out)
+    assert len(rows) == 3 and {row["status"] for row in rows.values()} == {"unobservable"}
+    assert max(int(row["attempts"]) for row in rows.values()) == 2
+    assert main(["calibrate", str(drives / "v1_2026-03-01"), "--out", str(tmp_path / "alone"), *FAST]) == 3
+    assert results(tmp_path / "alone") == results(out / "drives/v1_2026-03-01")
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+
+
+@pytest.mark.slow
+def test_from_s3_to_s3(drives: Path, tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drives are copied, results uploaded whole, and nothing stays on this machine."""
+    (tmp_path / "scratch").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    for name in ("v1_2026-03-01", "v2_2026-03-08"):
+        Place.of(f"{s3}/in/{name}").upload(drives / name)
+    command = ["batch", f"{s3}/in", "--out", f"{s3}/out", *FAST]
+    assert main(command) == 3
+    out = Place.of(f"{s3}/out")
+    text = (out / "summary.csv").read().decode()
+    assert "v1_2026-03-01,,,unobservable" in text and "v2_2026-03-08,,,bad_input" in text
+    found = (out / "drives/v1_2026-03-01").fetch(tmp_path)
+    assert main(["calibrate", str(drives / "v1_2026-03-01"), "--out", str(tmp_path / "alone"), *FAST]) == 3
+    assert results(tmp_path / "alone") == results(found)
+    assert list((tmp_path / "scratch").iterdir()) == []
+    record = Record.from_json((out / "records/v1_2026-03-01.json").read(), "record")
+    assert record.cost.attempts == 1 and record.cost.input_bytes > 1000
+    (out / "drives/v2_2026-03-08").remove()
+    assert main(command) == 3
+    again = Record.from_json((out / "records/v1_2026-03-01.json").read(), "record")
+    assert again == record  # not run again: it would have taken another time
+
+
+@pytest.mark.slow
+def test_on_dask(drives: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    out = tmp_path / "out"
+    one = str(drives / "v?_*-08")
+    assert main(["batch", one, "--out", str(out), "--dask", "local", "--workers", "1", *FAST]) == 3
+    assert {name: row["status"] for name, row in rows_of(out).items()} == {
+        "v1_2026-03-08": "unobservable",
+        "v2_2026-03-08": "bad_input",
+    }
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--workers", "0"], "--workers 0"),
+        (["--retries", "-1"], "--retries -1"),
+        (["--time-limit", "nan"], "--time-limit nan"),
+        (["--memory-limit", "0"], "--memory-limit 0"),
+        (["--name-parts", "0"], "--name-parts 0"),
+        (["--drift", "1,2"], "--drift 1,2"),
+        (["--drift", "1,2,x"], "--drift 1,2,x"),
+        (["--false-alarm-rate", "2"], "false_alarm_rate"),
+        (["--vehicle-from", "("], "no regular expression"),
+        (["--set", "nothing=1"], "nothing"),
+        (["--init", "nowhere.json"], "nowhere.json"),
+        (["--classes", "cow"], "cow"),
+        (["--method", "none"], "--method"),
+    ],
+)
+def test_usage(
+    drives: Path, tmp_path: Path, options: list[str], words: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["batch", str(drives), "--out", str(tmp_path / "out"), *options]) == 2
+    said = capfd.readouterr().err
+    assert words in said and said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_places_that_are_taken(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").write_text("x")
+    (tmp_path / "file").write_text("x")
+    for out, words in (
+        (drives, "found the drive"),
+        (drives / "v1_2026-03-01" / "out", "found the drive"),
+        (tmp_path / "other", "without batch.json"),
+        (tmp_path / "file", "found a file"),
+    ):
+        assert main(["batch", str(drives), "--out", str(out)]) == 2
+        assert words in capfd.readouterr().err
+    assert main(["batch", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_other_options_do_not_mix(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    bad = str(drives / "v2_*-08")
+    assert main(["batch", bad, "--out", str(out), "--retries", "0"]) == 3
+    assert main(["batch", bad, "--out", str(out), "--set", "seed=1"]) == 2
+    said = capfd.readouterr().err
+    assert "was begun with the options (none), found --set=seed=1" in said
+    (out / "batch.json").write_text("{")
+    assert main(["batch", bad, "--out", str(out)]) == 2
+
+
+def test_two_batches_do_not_meet(drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    from sst_graph.fleet import open_batch
+
+    with open_batch(Place(str(tmp_path / "out")), ()):
+        assert main(["batch", str(drives), "--out", str(tmp_path / "out")]) == 2
+    assert "another run" in capfd.readouterr().err

@@ -1,0 +1,68 @@
+"""Many jobs on this machine and on Dask: all are done, whatever happens to workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sst_graph.errors import ConfigError
+from sst_graph.fleet.attempt import Job
+from sst_graph.fleet.dask_pool import Cluster, run_on_dask
+from sst_graph.fleet.drives import Drive
+from sst_graph.fleet.local_pool import run_locally
+from sst_graph.fleet.places import Place
+from sst_graph.fleet.record import Record
+
+
+def jobs(count: int, folder: Path | str = "/") -> Iterator[Job]:
+    for k in range(count):
+        yield Job(Drive(f"drive_{k:04d}", Place("/nowhere")), (), Place("/nowhere"), str(folder))
+
+
+def instant(job: Job) -> Record:
+    return Record(job.drive.name, job.drive.place.url, "ok")
+
+
+def deadly(job: Job) -> Record:
+    """Kills its worker the first time that the third job is tried, and every time for the fifth."""
+    mark = Path(job.folder) / job.drive.name
+    first = not mark.exists()
+    mark.touch()
+    if (job.drive.name == "drive_0003" and first) or job.drive.name == "drive_0005":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return instant(job)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_every_job_is_done_once(workers: int) -> None:
+    done = [one.drive for one in run_locally(jobs(500), workers, instant) if one is not None]
+    assert sorted(done) == [job.drive.name for job in jobs(500)]
+
+
+def test_a_fault_of_the_program_is_no_silence() -> None:
+    def faulty(job: Job) -> Record:
+        raise ZeroDivisionError(job.drive.name)
+
+    with pytest.raises(ZeroDivisionError):
+        list(run_locally(jobs(5), 2, faulty))
+
+
+@pytest.mark.slow
+def test_dask_repeats_what_a_lost_worker_had(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    found = {one.drive: one for one in run_on_dask(jobs(8, tmp_path), Cluster("local", 2), deadly) if one}
+    assert sorted(found) == [job.drive.name for job in jobs(8)]
+    assert found["drive_0003"].status == "ok"
+    assert found["drive_0005"].status == "crash" and "Dask worker was lost" in found["drive_0005"].reason
+    assert [one.status for name, one in found.items() if name != "drive_0005"] == ["ok"] * 7
+
+
+def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("sst_graph.fleet.dask_pool._CONNECT_S", 0.5)
+    with pytest.raises(ConfigError, match="found no scheduler"):
+        list(run_on_dask(jobs(1), Cluster("tcp://127.0.0.1:1", 1), instant))

@@ -1,0 +1,175 @@
+"""Records, tables and the page: nothing is hidden, what needs attention comes first."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from fleet.vehicle_drives import RIG, SIGMAS
+
+from sst_graph.errors import DataError
+from sst_graph.export import fuse_marginals, marginal_of_result
+from sst_graph.factors import PinholeCamera
+from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
+from sst_graph.fleet.record import Cost, Numbers
+from sst_graph.fleet.vehicles.fused import vehicle_of
+from sst_graph.fleet.vehicles.walk import WalkConfig
+from sst_graph.result import CalibrationResult
+
+CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
+SHIFT = np.array([0.0, 0.002, 0.0, 0.01, 0.0, 0.0, 0.0])
+"""Of the estimate by a principal point that is off by one sigma."""
+
+
+def result(seed: int, status: str = "ok", knock: float = 0.0) -> CalibrationResult:
+    """With errors as its covariance says, part of which is that of an assumption."""
+    rng = np.random.default_rng(seed)
+    error = rng.normal(size=7) * SIGMAS
+    error[2] += knock
+    return CalibrationResult(
+        RIG.retract(error[:6]),
+        0.02 + error[6],
+        np.diag(SIGMAS**2) + np.outer(SHIFT, SHIFT),
+        status,  # type: ignore[arg-type]
+        CAMERA,
+        reasons=() if status == "ok" else ("because",),
+        diagnostics={"assumptions": {"cx": {"sigma": 0.5, "sensitivity": (SHIFT / 0.5).tolist()}}},
+    )
+
+
+def done(name: str, found: CalibrationResult) -> Record:
+    reason = "; ".join(found.reasons)
+    return Record(
+        name, f"/data/{name}", found.status, reason, Cost(1, 9.0, 8.0, 10**8, 10**6), Numbers.of(found)
+    )
+
+
+def drive(name: str, vehicle: str = "", date: str = "") -> Drive:
+    return Drive(name, Place(f"/data/{name}"), vehicle, date)
+
+
+@pytest.fixture
+def batch() -> tuple[list[Drive], dict[str, Record]]:
+    """Six drives of a vehicle that is knocked before the fourth, and one of each kind of failure."""
+    drives = [drive(f"a{k}", "car 1", f"2026-03-{k + 1:02d}T00:00:00+00:00") for k in range(6)]
+    records = [done(f"a{k}", result(k, knock=0.03 * (k >= 3))) for k in range(6)]
+    drives += [drive("b0", "car 2"), drive("c0", "<b>car</b> 3"), drive("d0"), drive("e0")]
+    records += [
+        done("b0", result(9, "not_converged")),
+        Record("c0", "/data/c0", "bad_input", "=cmd|x: <script>alert(1)</script>", log=("a", "b")),
+        Record("d0", "/data/d0", "crash", "ended by SIGSEGV after 1.0 s"),
+    ]
+    return drives, {one.drive: one for one in records}
+
+
+def test_the_summary_says_it_all(batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path) -> None:
+    drives, records = batch
+    outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    assert not outcome.all_fine
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "summary.csv").read_text())))
+    assert [row["drive"] for row in rows][:4] == ["d0", "c0", "e0", "b0"] and len(rows) == 10
+    status = {row["drive"]: row["status"] for row in rows}
+    assert (status["e0"], status["d0"], status["b0"]) == ("not_run", "crash", "not_converged")
+    by_name = {row["drive"]: row for row in rows}
+    assert by_name["c0"]["reason"].startswith("'=cmd") and by_name["c0"]["sigma_rot_x_deg"] == ""
+    assert float(by_name["a0"]["sigma_trans_x_cm"]) == pytest.approx(100.0 * np.hypot(SIGMAS[3], SHIFT[3]))
+    assert by_name["a0"]["report"] == "drives/a0/report.html" and by_name["d0"]["report"] == ""
+    vehicles = {one["vehicle"]: one for one in csv.DictReader((tmp_path / "vehicles.csv").open())}
+    assert vehicles["car 1"]["status"] == "changed" and "between a2 and a3" in vehicles["car 1"]["reason"]
+    assert "2026-03-03 to 2026-03-04" in vehicles["car 1"]["reason"]
+    assert vehicles["car 2"]["status"] == "no_result" and vehicles["car 2"]["without"] == "1"
+    stored = json.loads((tmp_path / "vehicles/car_1.json").read_text())
+    assert [(one["after"], one["before"]) for one in stored["changes"]] == [("a2", "a3")]
+    assert len(stored["drift"]) == 6 and stored["calibration"]["drive"] == "a5"
+
+
+def test_parquet_has_the_rows_of_the_csv(
+    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    drives, records = batch
+    outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    for name, rows in (("summary", outcome.rows), ("vehicles", None)):
+        read = parquet.read_table(tmp_path / f"{name}.parquet").to_pylist()
+        texts = list(csv.DictReader((tmp_path / f"{name}.csv").open()))
+        assert len(read) == len(texts) and list(read[0]) == list(texts[0])
+        assert rows is None or read == rows
+
+
+def test_the_page_shows_failures_and_runs_nothing_of_the_data(
+    batch: tuple[list[Drive], dict[str, Record]], tmp_path: Path
+) -> None:
+    drives, records = batch
+    write_summary(drives, records, Place.of(tmp_path), BatchConfig(options=("--no-report",)))
+    page = (tmp_path / "summary.html").read_text()
+    assert "<script>alert" not in page and "&lt;script&gt;alert(1)" in page and "<b>car</b>" not in page
+    assert "6 of 10 drives are ok; 3 have no result; 3 of 3 vehicles need attention" in page
+    assert "1 × crash: ended by SIGSEGV after 1.0 s" in page
+    assert 'href="drives/a0/report.md"' in page and "http" not in page.replace("http://www.w3.org", "")
+    assert page.index('row">d0<') < page.index('row">c0<') < page.index(">b0</a>") < page.index(">a0</a>")
+
+
+def test_all_fine(tmp_path: Path) -> None:
+    drives = [drive("x", "v"), drive("y", "v")]
+    records = {name: done(name, result(k)) for k, name in enumerate("xy")}
+    assert write_summary(drives, records, Place.of(tmp_path), BatchConfig()).all_fine
+
+
+def test_a_contradicting_drive_stands_before_those_that_are_ok(tmp_path: Path) -> None:
+    drives = [drive(f"x{k}", "v") for k in range(6)]
+    records = {one.name: done(one.name, result(k, knock=0.03 * (k == 2))) for k, one in enumerate(drives)}
+    outcome = write_summary(drives, records, Place.of(tmp_path), BatchConfig())
+    assert outcome.rows[0]["drive"] == "x2" and outcome.rows[0]["contradicts"] is True
+    assert "contradicts the other drives of v" in str(outcome.rows[0]["reason"]) and not outcome.all_fine
+
+
+def test_what_drives_have_in_common_does_not_average_out() -> None:
+    """Sixteen drives: their own errors fall to a quarter, that of the assumption stays."""
+    drives = [drive(f"x{k:02d}", "v") for k in range(16)]
+    results = [result(k) for k in range(16)]
+    records = {one.name: done(one.name, found) for one, found in zip(drives, results, strict=True)}
+    still = WalkConfig(rotation_deg=1e-4, translation_m=1e-5, time_offset_s=1e-6)
+    now = vehicle_of("v", drives, records, still).calibration
+    assert now is not None
+    expected = np.sqrt(SIGMAS**2 / 16.0 + SHIFT**2)
+    np.testing.assert_allclose(np.sqrt(np.diag(now.covariance)), expected, rtol=0.02)
+    fused = fuse_marginals([marginal_of_result(one) for one in results])
+    assert np.linalg.norm(fused.cTl.localCoordinates(now.cTl)) < 1e-5
+
+
+def test_drives_without_dates_count_in_their_order() -> None:
+    drives = [drive("z", "v"), drive("a", "v"), drive("m", "v", "2026-03-01T00:00:00+00:00")]
+    records = {one.name: done(one.name, result(k)) for k, one in enumerate(drives)}
+    found = vehicle_of("v", drives, records, WalkConfig())
+    assert (found.drives, found.days, found.dated) == (("z", "a", "m"), (0.0, 1.0, 2.0), False)
+    dated = [replace(one, date=f"2026-03-0{9 - k}T00:00:00+00:00") for k, one in enumerate(drives)]
+    assert vehicle_of("v", dated, records, WalkConfig()).drives == ("m", "a", "z")
+
+
+def test_a_record_reads_back() -> None:
+    for record in (done("x", result(1)), Record("y", "s3://b/y", "crash", "died", log=("one", "two"))):
+        assert Record.from_json(record.to_json().encode(), "record.json") == record
+
+
+@pytest.mark.parametrize(
+    "changed", [{"status": "fine"}, {"cost": 3}, {"numbers": {}}, {"log": [1]}, {"version": 2}, {"drive": 7}]
+)
+def test_a_record_that_is_none(changed: dict[str, object]) -> None:
+    document = json.loads(done("x", result(1)).to_json()) | changed
+    with pytest.raises(DataError, match=r"record\.json"):
+        Record.from_json(json.dumps(document).encode(), "record.json")
+
+
+def test_the_pose_in_the_table_is_that_of_the_result(tmp_path: Path) -> None:
+    found = result(5)
+    outcome = write_summary([drive("x")], {"x": done("x", found)}, Place.of(tmp_path), BatchConfig())
+    row = outcome.rows[0]
+    w, x, y, z = (float(row[f"quat_{name}"]) for name in "wxyz")  # type: ignore[arg-type]
+    rotation = gtsam.Rot3.Quaternion(w, x, y, z)
+    assert rotation.equals(found.T_camera_lidar.rotation(), 1e-9) and row["vehicle"] == ""
