@@ -20,7 +20,7 @@ from sst_graph import SemanticClass, open_source
 
 FRAME = 12
 WIDTH, QUALITY = 1000, 82
-VERDICT_PX = (860, 400)
+VERDICT_PX = (860, 560)
 """Size of the window that shows the head of the report."""
 
 Picture = NDArray[np.uint8]
@@ -43,7 +43,7 @@ def _inputs(folder: Path) -> Picture:
     image, scan = frame.image, frame.scan
     if image is None or scan is None:
         raise SystemExit(f"{folder}: found no frame {FRAME} with both sensors")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 2.75), width_ratios=(2.55, 1))
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 3.0), width_ratios=(2.55, 1))
     shown = np.repeat(image.pixels[..., None], 3, axis=2) if image.pixels.ndim == 2 else image.pixels[..., ::-1]
     vehicle = (image.mask == SemanticClass.VEHICLE)[..., None]
     left.imshow(np.where(vehicle, (0.45 * shown + 0.55 * np.array([250, 190, 0])), shown).astype(np.uint8))

@@ -6,11 +6,12 @@ import drives
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from scipy.stats import chi2, norm
 
 NAMES = {
     "standing": "standing",
-    "constant": "one speed,\nstraight",
+    "constant": "one\nspeed",
     "no_stop": "speed\nvaries",
     "stop_and_go": "stop\nand go",
     "turning": "turning",
@@ -38,12 +39,15 @@ def observability() -> Figure:
                 axes.plot(np.full(len(sigmas), at), sigmas[:, column], ".", color=colour, ms=4, alpha=0.6)
                 axes.plot([at - 0.1, at + 0.1], [np.median(sigmas[:, column])] * 2, color=colour, lw=2.2)
         axes.axhline(limit, color="#9aa2ab", ls="--", lw=1)
-        axes.text(4.45, limit, "limit of ok", ha="right", va="bottom", fontsize=7, color="#6b737c")
+        axes.text(-0.5, limit, "limit of ok", ha="left", va="bottom", fontsize=7, color="#6b737c")
         axes.set_yscale("log")
         axes.set_xticks(range(len(NAMES)), NAMES.values(), fontsize=7)
         axes.set_title(f"σ of {title}" + (" x, y, z" if len(columns) > 1 else "") + f" [{unit}]", fontsize=9)
         axes.grid(axis="y", color="#e6e9ec", lw=0.7)
         axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+        low, high = axes.get_ylim()
+        axes.set_ylim(low / 1.3, high * 2.5)
     for k, name in enumerate("xyz"):
         panels[0].plot([], [], color=COLOURS[k], lw=2.2, label=f"{name} of the LiDAR")
     panels[0].legend(fontsize=7, frameon=False, loc="upper right")
@@ -52,17 +56,18 @@ def observability() -> Figure:
 
 
 def sigma() -> Figure:
-    """Errors in units of the claimed sigma, and the NEES, of all drives whose status is ok."""
-    rows = [row for row in drives.read() if row.status == "ok"]
+    """Errors in units of the claimed sigma, and the NEES, of all drives that are not not_converged."""
+    rows = [row for row in drives.read() if row.status != "not_converged"]
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), width_ratios=(3, 2))
     ratios = np.array([row.errors / row.sigmas for row in rows])
     for k, name in enumerate(("rotation\nx", "y", "z", "translation\nx", "y", "z", "time\noffset")):
         spread = np.linspace(-0.25, 0.25, len(ratios))
         left.plot(k + spread, ratios[:, k], ".", color="#1c64c8", ms=6)
-        left.text(k, -3.75, name, ha="center", va="top", fontsize=8)
+        left.text(k, -0.02, name, ha="center", va="top", fontsize=8, transform=left.get_xaxis_transform())
     for size, colour in ((2.0, "#eef2f7"), (1.0, "#dbe4ef")):
         left.axhspan(-size, size, color=colour, zorder=0)
-    left.set(xlim=(-0.6, 6.6), ylim=(-3.6, 3.6), xticks=[], ylabel="error / claimed σ")
+    limit = max(3.6, 1.1 * float(np.abs(ratios).max()))
+    left.set(xlim=(-0.6, 6.6), ylim=(-limit, limit), xticks=[], ylabel="error / claimed σ")
     within = [float((np.abs(ratios) < size).mean()) for size in (1.0, 2.0)]
     left.set_title(
         f"within 1σ {within[0]:.0%} (ideal {norm.cdf(1) - norm.cdf(-1):.0%}), "
