@@ -1,0 +1,91 @@
+"""Takes the pictures of README and *Start* from a demo: ``python docs/figures/make.py --demo out/demo``.
+
+The picture of the report is taken by a browser, chromium or google-chrome, without a window.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph import SemanticClass, open_source
+
+FRAME = 12
+WIDTH, QUALITY = 1000, 82
+VERDICT_PX = (860, 560)
+"""Size of the window that shows the head of the report."""
+
+Picture = NDArray[np.uint8]
+
+
+def take(folder: Path, into: Path) -> None:
+    """Write demo_inputs.jpg, demo_overlay.jpg and demo_report.png."""
+    _save(into / "demo_inputs.jpg", _inputs(folder / "drive"))
+    overlay = folder / "calibration" / f"overlay_drive_00_{FRAME:06d}.png"
+    picture = cv2.imread(str(overlay))
+    if picture is None:
+        raise SystemExit(f"{overlay}: found no picture, expected one of make demo")
+    _save(into / "demo_overlay.jpg", np.asarray(picture, np.uint8))
+    _photograph(folder / "calibration" / "report.html", into / "demo_report.png")
+
+
+def _inputs(folder: Path) -> Picture:
+    """A picture with its mask, and the scan from above with its labels."""
+    frame = open_source(folder, camera="image_2")[FRAME]
+    image, scan = frame.image, frame.scan
+    if image is None or scan is None:
+        raise SystemExit(f"{folder}: found no frame {FRAME} with both sensors")
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 3.0), width_ratios=(2.55, 1))
+    shown = np.repeat(image.pixels[..., None], 3, axis=2) if image.pixels.ndim == 2 else image.pixels[..., ::-1]
+    vehicle = (image.mask == SemanticClass.VEHICLE)[..., None]
+    left.imshow(np.where(vehicle, (0.45 * shown + 0.55 * np.array([250, 190, 0])), shown).astype(np.uint8))
+    left.set_title("image_2 and semantic_2: the picture, vehicles in its mask", fontsize=9)
+    ahead = scan.points[:, 0] > 0.0
+    x, y = scan.points[ahead, 0], scan.points[ahead, 1]
+    vehicles = scan.classes[ahead] == SemanticClass.VEHICLE
+    right.plot(-y[~vehicles], x[~vehicles], ",", color="#8b949e")
+    right.plot(-y[vehicles], x[vehicles], ",", color="#c77700")
+    right.set(xlim=(-22.0, 22.0), ylim=(0.0, 40.0), aspect="equal")
+    right.set_title("velodyne and labels, from above", fontsize=9)
+    for axes in (left, right):
+        axes.set(xticks=[], yticks=[])
+    figure.tight_layout(pad=0.4)
+    figure.set_dpi(200)
+    figure.canvas.draw()
+    canvas: Any = figure.canvas
+    return np.asarray(canvas.buffer_rgba())[..., 2::-1].copy()
+
+
+def _save(path: Path, picture: Picture) -> None:
+    height = round(WIDTH * picture.shape[0] / picture.shape[1])
+    small = cv2.resize(picture, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", np.asarray(small), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not done:
+        raise SystemExit(f"{path}: cannot be written as JPEG")
+    path.write_bytes(data.tobytes())
+    print(path)
+
+
+def _photograph(page: Path, path: Path) -> None:
+    """The head of a page, as a browser shows it."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        raise SystemExit("found no chromium and no google-chrome, expected one to take a picture of the report")
+    with tempfile.TemporaryDirectory() as profile:
+        subprocess.run(
+            [
+                browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+                f"--user-data-dir={profile}", "--window-size={},{}".format(*VERDICT_PX),
+                f"--screenshot={path}", page.resolve().as_uri(),
+            ],
+            check=True, capture_output=True,
+        )  # fmt: skip
+    print(path)
