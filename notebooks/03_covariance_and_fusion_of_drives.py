@@ -78,7 +78,7 @@ for name, (found, sigma) in table.items():
 # Fusion and one graph agree to a part of their sigma, not to the last digit: matches are made at other
 # estimates, and one graph has one error model for both drives, so that its sigmas differ as well. On frozen
 # matches `fuse_graphs`, which takes every drive's marginal again at the fused estimate, and one graph are
-# equal (tests hold them to a thousandth of a sigma; docs/export.md has the recipe).
+# equal (tests hold them to a thousandth of a sigma; docs/marginal.md has the recipe).
 #
 # The marginal leaves Python as plain JSON, for a C++ back-end, and as a factor that needs gtsam only:
 

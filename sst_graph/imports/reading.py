@@ -20,7 +20,7 @@ from sst_graph.types import ByValue
 
 _DEFAULT_CAMERA = "image_2"
 _KITTI_LINE = re.compile(r"^(P\d|Tr):\s", re.MULTILINE)
-_PYTHON_LINE = re.compile(r"^\s*(from|import) launch|^def generate_launch_description", re.MULTILINE)
+_PYTHON_LINE = re.compile(r"^[ \t]*(from|import) launch|^def generate_launch_description", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import gtsam
@@ -227,3 +228,16 @@ def test_a_loop_of_frames_ends(tmp_path: Path) -> None:
     text = f"<robot>{joint.format('lidar', 'a')}{joint.format('a', 'lidar')}</robot>"
     tree = read_tree(written(tmp_path, text))
     assert tree.root("lidar") in ("a", "lidar")
+
+
+@pytest.mark.parametrize(
+    "text", ["\n" * 100_000, " " * 100_000, f'<robot><a params="{"a" * 1_000_000}"/></robot>', "${" * 500_000]
+)
+def test_no_text_takes_long(text: str, tmp_path: Path) -> None:
+    """Lines and words without end, on which a search that starts anew at each of them takes minutes."""
+    if text.startswith("<"):
+        text = text.replace("<a", '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"')
+    began = time.process_time()
+    with pytest.raises(DataError):
+        import_calibration(written(tmp_path, text))
+    assert time.process_time() - began < 2.0
