@@ -102,7 +102,7 @@ def test_a_calibration_starts_from_a_file_of_another_program(
         ("cam0: {T_cam_imu: 1, T_imu_cam: 1}", [], "import --from FORMAT chooses"),
         ("cam0: {T_cam_imu: 1}", ["--camera-frame", "a", "--camera-link", "b"], "found both"),
         ("cam0: {T_cam_imu: 1}", ["--tree", "nowhere"], "nowhere: found no such file"),
-        ("\x00", [], "no YAML"),
+        ("\x00", [], "no known format"),
     ],
 )
 def test_bad_usage(
