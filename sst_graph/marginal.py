@@ -5,7 +5,7 @@ The cost of a calibration (cTl, offset), in the tangent space of the linearizati
     0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - time_offset_0_s]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
-docs/how-to/export.md shows how a C++ program rebuilds it from the JSON.
+docs/reference/marginal.md shows how a C++ program rebuilds it from the JSON.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class CalibrationMarginal(ByValue):
         return self.time_offset_s == other.time_offset_s and self.cTl.equals(other.cTl, 0.0)
 
     def to_json(self, E_key: int = EXTRINSIC, D_key: int = TIME_OFFSET) -> str:
-        """The marginal as documented in docs/how-to/export.md."""
+        """The marginal as documented in docs/reference/marginal.md."""
         document = {
             "format": FORMAT,
             "version": VERSION,

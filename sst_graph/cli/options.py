@@ -441,7 +441,7 @@ def _add_export(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
         help="kitti only: calib.txt whose P lines place the camera beside camera 0 "
         "(without it the camera counts as camera 0)",
     )
-    frames = export.add_argument_group("frames (docs/export.md)")
+    frames = export.add_argument_group("frames (docs/how-to/export.md)")
     frames.add_argument(
         "--camera-frame",
         metavar="NAME",
@@ -484,7 +484,7 @@ def _add_import(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     command = commands.add_parser(
         "import",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}; docs/imports.md states what is taken for what. --init "
+        description=f"{text[0].upper()}{text[1:]}; docs/how-to/imports.md states what is taken for what. --init "
         "FILE reads the same files where nothing has to be named.",
     )
     command.add_argument("file", metavar="FILE", type=Path, help="file in a format that export writes")

@@ -5,7 +5,7 @@ The cost of a calibration (cTl, offset), in the tangent space of the linearizati
     0.5 d' information d - vector' d + 0.5 constant,   d = [Log(cTl_0^-1 cTl), offset - time_offset_0_s]
 
 with d (7,) = [rotation xyz rad, translation xyz m, offset s]: gtsam's ``HessianFactor`` on E (6) and D (1).
-docs/how-to/export.md describes how a C++ program rebuilds it from the JSON.
+docs/reference/marginal.md describes how a C++ program rebuilds it from the JSON.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from sst_graph.errors import DataError
 from sst_graph.files.reading import CALIBRATION, FileKind, parse_json, read_text
 from sst_graph.files.yaml_file import YAML, parse_yaml
 
-ANY = FileKind("a calibration in a format of docs/imports.md", CALIBRATION.max_bytes)
+ANY = FileKind("a calibration in a format of docs/how-to/imports.md", CALIBRATION.max_bytes)
 
 _MOST_CHARACTERS = {"XML": 4 << 20, "Python": 64 << 10, "YAML": YAML.max_bytes}
 

@@ -20,7 +20,7 @@ from sst_graph.types import ByValue
 
 _DEFAULT_CAMERA = "image_2"
 _KITTI_LINE = re.compile(r"^(P\d|Tr):\s", re.MULTILINE)
-_PYTHON_LINE = re.compile(r"^\s*(from|import) launch|^def generate_launch_description", re.MULTILINE)
+_PYTHON_LINE = re.compile(r"^[ \t]*(from|import) launch|^def generate_launch_description", re.MULTILINE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,11 +116,19 @@ def _of_text(document: Document, start: str) -> set[str]:
         value = document.json
         if isinstance(value, dict):
             marginal = value.get("format") == MARGINAL_FORMAT
+            if value.get("format") == "sst-graph/rig":
+                expected = "the calibration.json of one (calibrate --init takes the folder of a rig)"
+                raise DataError(document.path, "a rig of several cameras", expected)
             return {"gtsam"} if marginal else {"calibration"} if "T_camera_lidar" in value else set()
         return {"nuscenes"} if records.is_nuscenes(value) else set()
     if document.path.suffix == ".py" or _PYTHON_LINE.search(document.text):
         return {"ros2-launch"}
-    table = document.yaml
+    try:
+        table = document.yaml
+    except DataError:
+        if document.path.suffix in (".yaml", ".yml"):
+            raise
+        return set()
     kinds = (("ros-tf", tables.is_message), ("autoware", tables.is_sensor_kit), ("opencv", records.is_opencv))
     return chains.dialects(table) | {name for name, matches in kinds if matches(table)}
 

@@ -16,7 +16,7 @@ from sst_graph.imports.document import Document
 from sst_graph.imports.rotations import pose_by_rpy
 
 _REFERENCE = re.compile(r"\$\{\s*(\w+)\s*\}|\$\(arg (\w+)\)")
-_DEFAULT = re.compile(r"(\w+):=('[^']*'|\S+)")
+_DEFAULT = re.compile(r"\b(\w{1,100}):=('[^']*'|\S+)")
 
 
 def is_xacro(root: ET.Element) -> bool:

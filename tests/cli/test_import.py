@@ -95,14 +95,14 @@ def test_a_calibration_starts_from_a_file_of_another_program(
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
-        (None, [], "found no such file, expected a calibration in a format of docs/imports.md"),
+        (None, [], "found no such file, expected a calibration in a format of docs/how-to/imports.md"),
         ("a: 1", [], "found a file of no known format, expected one of calibration, kitti"),
         ("a: 1", ["--from", "urdf"], "found a file of no known format, expected one of the format urdf"),
         ("a: 1", ["--from", "autocad"], "invalid choice: 'autocad'"),
         ("cam0: {T_cam_imu: 1, T_imu_cam: 1}", [], "import --from FORMAT chooses"),
         ("cam0: {T_cam_imu: 1}", ["--camera-frame", "a", "--camera-link", "b"], "found both"),
         ("cam0: {T_cam_imu: 1}", ["--tree", "nowhere"], "nowhere: found no such file"),
-        ("\x00", [], "no YAML"),
+        ("\x00", [], "no known format"),
     ],
 )
 def test_bad_usage(

@@ -1,4 +1,4 @@
-"""What docs/how-to/export.md says of marginals of drives that disagree, on one pair."""
+"""What docs/reference/marginal.md says of marginals of drives that disagree, on one pair."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import gtsam
@@ -153,8 +154,8 @@ def test_a_xacro_file_that_needs_xacro(tmp_path: Path) -> None:
 
 
 BAD = {
-    "": "an empty file",
-    "no calibration": "a YAML str",
+    "": "no known format",
+    "no calibration": "no known format",
     "a: 1": "no known format, expected one of calibration, kitti, ros-tf",
     "<html/>": "no known format",
     "<robot": "no XML",
@@ -177,6 +178,21 @@ BAD = {
     "kit: {lidar: {x: 0, y: 0, z: 0, roll: 0, pitch: 0, yaw: 0}, b: 1}": "a frame with x, y, z",
     "x: 1\n---\ny: 2\n": "no known format",
 }
+
+
+def test_a_yaml_file_that_is_damaged_says_where(tmp_path: Path) -> None:
+    for text, message in (
+        ("cam0: {T_cam_imu: [1", "no YAML.*line 1"),
+        ("", "an empty file"),
+        ("a", "YAML str"),
+    ):
+        with pytest.raises(DataError, match=message):
+            import_calibration(written(tmp_path, text, "camchain.yaml"))
+
+
+def test_a_rig_is_the_calibration_of_no_single_camera(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"a rig of several cameras, expected the calibration\.json of one"):
+        import_calibration(written(tmp_path, '{"format": "sst-graph/rig", "version": 1}'))
 
 
 @pytest.mark.parametrize("text", BAD)
@@ -227,3 +243,16 @@ def test_a_loop_of_frames_ends(tmp_path: Path) -> None:
     text = f"<robot>{joint.format('lidar', 'a')}{joint.format('a', 'lidar')}</robot>"
     tree = read_tree(written(tmp_path, text))
     assert tree.root("lidar") in ("a", "lidar")
+
+
+@pytest.mark.parametrize(
+    "text", ["\n" * 100_000, " " * 100_000, f'<robot><a params="{"a" * 1_000_000}"/></robot>', "${" * 500_000]
+)
+def test_no_text_takes_long(text: str, tmp_path: Path) -> None:
+    """Lines and words without end, on which a search that starts anew at each of them takes minutes."""
+    if text.startswith("<"):
+        text = text.replace("<a", '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"')
+    began = time.process_time()
+    with pytest.raises(DataError):
+        import_calibration(written(tmp_path, text))
+    assert time.process_time() - began < 2.0
