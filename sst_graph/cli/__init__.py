@@ -37,4 +37,4 @@ def main(argv: Sequence[str] | None = None) -> int:
     with own_process() as arguments:
         from sst_graph.cli.command import run
 
-        return run(arguments)
+        return run(arguments, own_process=True)

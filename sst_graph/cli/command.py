@@ -11,15 +11,19 @@ import sys
 from collections.abc import Sequence
 
 from sst_graph.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_READER_GONE
-from sst_graph.cli.messages import StreamError, complain, flush
+from sst_graph.cli.messages import StreamError, complain, flush, loudness
 from sst_graph.cli.options import build_parser
 from sst_graph.errors import SstGraphError
 
 
-def run(argv: Sequence[str]) -> int:
-    """Run the command that ``argv`` names; its exit code (:func:`sst_graph.cli.main`)."""
+def run(argv: Sequence[str], own_process: bool = False) -> int:
+    """Run the command that ``argv`` names; its exit code (:func:`sst_graph.cli.main`).
+
+    Args:
+        own_process: its process runs nothing else, so that progress is shown in lines, too.
+    """
     try:
-        code = _run(argv)
+        code = _run(argv, own_process)
         flush()
         return code
     except StreamError as error:
@@ -37,8 +41,9 @@ def run(argv: Sequence[str]) -> int:
         return _failed(str(error), EXIT_BAD_INPUT)
 
 
-def _run(argv: Sequence[str]) -> int:
+def _run(argv: Sequence[str], own_process: bool) -> int:
     args = build_parser().parse_args(argv)
+    loudness.quiet, loudness.lines = args.quiet, own_process
     _set_up_logging(args.verbose)
     name = f"{args.command}_" if keyword.iskeyword(args.command) else args.command
     command = importlib.import_module(f"sst_graph.cli.commands.{name}")

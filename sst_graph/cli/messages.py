@@ -6,6 +6,7 @@ import errno
 import os
 import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TextIO
 
 
@@ -34,8 +35,27 @@ def say(text: str, end: str = "\n") -> None:
         raise StreamError(error) from None
 
 
+@dataclass
+class Loudness:
+    """What is said beside results, warnings and errors, in this process.
+
+    Attributes:
+        quiet: neither progress nor what :func:`mention` is given.
+        lines: progress in plain lines where stderr is no terminal.
+    """
+
+    quiet: bool = False
+    lines: bool = False
+
+
+loudness = Loudness()
+"""Set when a command begins."""
+
+
 def mention(text: str) -> None:
     """Print what was done, where the results are in files: a failure to print is no error."""
+    if loudness.quiet:
+        return
     try:
         say(text)
     except StreamError as error:

@@ -74,9 +74,17 @@ def build_parser() -> argparse.ArgumentParser:
         _add_segment,
         _add_settings_command,
         _add_experiment,
+        _add_completion,
     ):
         command = add(commands)
-        command.add_argument("--verbose", action="store_true", help="log what happens on stderr")
+        loudness = command.add_mutually_exclusive_group()
+        loudness.add_argument("-v", "--verbose", action="store_true", help="log what happens on stderr")
+        loudness.add_argument(
+            "-q",
+            "--quiet",
+            action="store_true",
+            help="no progress, and no summary of what stands in the files; warnings and errors only",
+        )
     return parser
 
 
@@ -149,6 +157,9 @@ def _add_calibrate(commands: argparse._SubParsersAction[_Parser]) -> argparse.Ar
     )
     calibrate.add_argument(
         "--video", type=Path, metavar="MP4|GIF", help="write the LiDAR in the pictures along the drives, too"
+    )
+    calibrate.add_argument(
+        "--json", action="store_true", help="print the result as JSON (units in the names), not a summary"
     )
     calibrate.add_argument(
         "--overwrite", action="store_true", help="replace an earlier result in DIR, and the video"
@@ -579,6 +590,18 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: the terminal)")
     experiment.add_argument("--overwrite", action="store_true", help="replace the file")
     return experiment
+
+
+def _add_completion(commands: argparse._SubParsersAction[_Parser]) -> argparse.ArgumentParser:
+    text = "print what completes commands and options in a shell"
+    completion = commands.add_parser(
+        "completion",
+        help=text,
+        description=f"{text[0].upper()}{text[1:]}: source <(sst-graph completion bash), or in zsh "
+        "sst-graph completion zsh > a folder of $fpath, as _sst-graph.",
+    )
+    completion.add_argument("shell", choices=("bash", "zsh", "tcsh"))
+    return completion
 
 
 SOURCE_DEFAULTS: dict[str, str | int | float | None] = {

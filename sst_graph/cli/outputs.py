@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import os
 import re
@@ -10,9 +11,12 @@ from pathlib import Path
 
 from sst_graph.cli.messages import complain
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
+from sst_graph.cli.progress import ProgressBar, ProgressStage
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
+from sst_graph.files.strict_json import strict_json
+from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, markdown_report
 from sst_graph.metrics import calibration_errors
@@ -66,7 +70,21 @@ def write_calibration(
     Args:
         with_report: write the page with pictures and charts, too.
     """
+    with ProgressBar() as progress:
+        stage = progress.stage("pictures and report")
+        return _written(folder, result, sources, against, with_report, stage)
+
+
+def _written(
+    folder: Path,
+    result: CalibrationResult,
+    sources: Sequence[Source],
+    against: Comparison | None,
+    with_report: bool,
+    progress: ProgressStage,
+) -> list[str]:
     pictures, frames = [], []
+    progress(0, PICTURES + 1)
     read = [with_sweep_of(source, result.diagnostics) for source in sources]
     for source, swept in zip(sources, read, strict=True):
         drive = RecentReader(swept)
@@ -77,6 +95,7 @@ def write_calibration(
             if with_report and result.fit is None:  # else the report chooses by the fit
                 frames.append(shown.drawn())
             pictures.append(name)
+            progress(len(pictures), PICTURES + 1)
     (folder / RESULT_NAME).write_text(result.to_json(), encoding="utf-8")
     (folder / "report.md").write_text(markdown_report(result, against, pictures), encoding="utf-8")
     if not with_report:
@@ -84,7 +103,26 @@ def write_calibration(
     drawn = [one for one in frames if one is not None]
     page = report_html(ReportInputs(result, read, against, drawn))
     (folder / REPORT_NAME).write_text(page, encoding="utf-8")
+    progress(PICTURES + 1, PICTURES + 1)
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
+
+
+def result_json(result: CalibrationResult, against: Comparison | None, written: Mapping[str, object]) -> str:
+    """The result as one JSON object: pose, offset, what ``inspect --json`` prints, errors where known.
+
+    Args:
+        written: further entries.
+    """
+    errors = None if against is None else dataclasses.asdict(against.errors)
+    document = {
+        "T_camera_lidar": result.T_camera_lidar.matrix(),
+        "time_offset_s": result.time_offset_s,
+        **to_dict(inspect_result(result)),
+        "errors": errors,
+        "errors_against": None if against is None else against.name,
+        **written,
+    }
+    return strict_json(document)
 
 
 def exit_code(result: CalibrationResult) -> int:

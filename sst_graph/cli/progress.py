@@ -1,19 +1,33 @@
-"""Progress of long work: a bar on stderr where a person watches, nothing elsewhere."""
+"""Progress of long work on stderr: a bar where a person watches, plain lines where it goes to a file."""
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Iterable, Iterator, Sized
 from types import TracebackType
+from typing import TypeVar
 
 from tqdm import tqdm
 
+from sst_graph.cli.messages import complain, loudness
+
+T = TypeVar("T")
+
+FIRST_S, EVERY_S = 2.0, 10.0
+"""A stage that takes longer than the first has a line, and another each time the second has gone by [s]."""
+
+PREFIX = "progress: "
+"""Begins every plain line, behind the program's name."""
+
 
 class ProgressBar:
-    """Callable ``(stage, done, total)`` that shows one bar a stage on a terminal."""
+    """Callable ``(stage, done, total)`` that shows how far each stage is."""
 
     def __init__(self) -> None:
         self._bar: tqdm | None = None
-        self._stage = ""
+        self._stage, self._total = "", 0
+        self._next_line_s = 0.0
 
     def __enter__(self) -> ProgressBar:
         return self
@@ -25,15 +39,27 @@ class ProgressBar:
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """``done`` of ``total`` steps of ``stage`` are behind us."""
-        if self._bar is None or stage != self._stage or total != self._bar.total:
+        if self._bar is None or stage != self._stage or total != self._total:
             self._close()
-            self._stage = stage
-            self._bar = tqdm(total=total, desc=stage, file=sys.stderr, disable=None, leave=False)
-        self._bar.update(done - self._bar.n)
+            self._stage, self._total = stage, total
+            hidden = True if loudness.quiet else None  # None: hidden where stderr is no terminal
+            self._bar = tqdm(total=total, desc=stage, file=sys.stderr, disable=hidden, leave=False)
+            self._next_line_s = time.monotonic() + FIRST_S
+        if self._bar.disable:
+            self._say_line(done)
+        else:
+            self._bar.update(done - self._bar.n)
 
     def stage(self, name: str) -> ProgressStage:
         """Callable ``(done, total)`` for one stage."""
         return ProgressStage(self, name)
+
+    def _say_line(self, done: int) -> None:
+        now_s = time.monotonic()
+        if loudness.lines and not loudness.quiet and now_s >= self._next_line_s and self._total:
+            self._next_line_s = now_s + EVERY_S
+            share = round(100.0 * done / self._total)
+            complain(f"{PREFIX}{self._stage}: {done} of {self._total} ({share} %)")
 
     def _close(self) -> None:
         if self._bar is not None:
@@ -49,3 +75,14 @@ class ProgressStage:
 
     def __call__(self, done: int, total: int) -> None:
         self._bar(self._name, done, total)
+
+
+def counted(items: Iterable[T], sized: Sized, stage: ProgressStage) -> Iterator[T]:
+    """The items, each counted when the next one is asked for.
+
+    Args:
+        sized: tells their number.
+    """
+    for done, item in enumerate(items, 1):
+        yield item
+        stage(done, len(sized))

@@ -13,12 +13,20 @@ from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.choice import with_method_for
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
-from sst_graph.cli.messages import mention
-from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, exit_code, write_calibration
+from sst_graph.cli.messages import mention, say
+from sst_graph.cli.outputs import (
+    CALIBRATION,
+    check_apart,
+    comparison,
+    exit_code,
+    result_json,
+    write_calibration,
+)
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
 from sst_graph.cli.video import refuse_video_of_rig, video_beside
+from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
 from sst_graph.inspect.report import Comparison, summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
@@ -32,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     cameras = given_cameras(args)
     if len(cameras) > 1:
         refuse_video_of_rig(args)
+        if args.json:
+            raise ConfigError("--json: expected with one camera (a rig's numbers are in rig.json)")
         return run_rig(args, cameras)
     args.camera = cameras[0] if cameras else None
     refuse_rig_options(args)
@@ -51,15 +61,20 @@ def run(args: argparse.Namespace) -> int:
             result, against = calibrate_drives(sources, initial, time_offset_s, config, args.camera)
             result = dataclasses.replace(result, read_as=read_as)
             # The numbers first: what follows may find the disk full.
-            mention(summary(result, against))
+            if not args.json:
+                mention(summary(result, against))
             names = write_calibration(folder, result, sources, against, not args.no_report)
             if video is not None and video.inside is not None:
                 names.append(video.write(folder / video.inside, result, sources))
-        mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
+        if not args.json:
+            mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
         if video is not None and video.beside is not None:
             video.write(video.beside.partial, result, sources)
             video.beside.publish()
-            mention(f"{'wrote':<15} {args.video}")
+            if not args.json:
+                mention(f"{'wrote':<15} {args.video}")
+    if args.json:
+        say(result_json(result, against, {"out": str(args.out), "files": names}))
     return exit_code(result)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ from sst_graph.cli.inputs import chosen_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.outputs import CHECKPOINT_FILE, RERUN_FILE, RESULT_FILE, check_apart
+from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
@@ -48,6 +50,9 @@ def run(args: argparse.Namespace) -> int:
             recorded = outputs.enter_context(output_file(args.view_save, args.overwrite, RERUN_FILE))
         read_as = options_of(args)
         tracker, source, frames = _begun(args, open_drive(args, args.data))
+        progress = outputs.enter_context(ProgressBar())
+        if not sys.stdout.isatty():  # else each line shows how far it is
+            frames = counted(frames, source, progress.stage("track"))
         with _viewed(args, tracker, None if recorded is None else recorded.partial) as view:
             tracker, last = _track(args, source, tracker, frames, view)
             if view is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
 from contextlib import ExitStack
 
 import numpy as np
@@ -13,14 +12,14 @@ from sst_graph.cli.inputs import chosen_classes, result_at, result_file
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import RERUN_FILE, check_apart
 from sst_graph.cli.pictures import offset_of
-from sst_graph.cli.progress import ProgressBar, ProgressStage
+from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive_of
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
 from sst_graph.inspect.inspection import inspect_result
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Frame, SemanticClass, Source
+from sst_graph.types import SemanticClass, Source
 from sst_graph.viewer import Recording, rerun
 from sst_graph.viewer.fixed_calibration import views_under
 
@@ -50,7 +49,7 @@ def _log(recording: Recording, result: CalibrationResult, source: Source) -> int
     time_offset_s, count = offset_of(result, source), 0
     frames = result.T_camera_lidar, time_offset_s, _classes(result)
     with ProgressBar() as progress:
-        shown = _counted(source, progress.stage("view"))
+        shown = counted(source, source, progress.stage("view"))
         for view in views_under(shown, source.camera, *frames):
             recording.frame(view)
             count += 1
@@ -61,12 +60,6 @@ def _log(recording: Recording, result: CalibrationResult, source: Source) -> int
         if one.frame.drive == source.name:
             recording.sigmas_at(one.frame.frame, final * one.so_far)
     return count
-
-
-def _counted(source: Source, progress: ProgressStage) -> Iterator[Frame]:
-    for done, frame in enumerate(source, 1):
-        yield frame
-        progress(done, len(source))
 
 
 def _classes(result: CalibrationResult) -> tuple[SemanticClass, ...]:

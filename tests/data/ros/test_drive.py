@@ -14,7 +14,7 @@ pytest.importorskip("rosbags")
 from bags import EPOCH_NS, KINDS, MASK, Kind, bag_of, files_of
 
 from sst_graph.batch import calibrate
-from sst_graph.cli.pictures import overlay, telling_positions
+from sst_graph.cli.pictures import ShownFrame, overlay, telling_positions
 from sst_graph.data import KittiSource, open_source
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.data.two_clocks import TwoClockSource
@@ -134,7 +134,8 @@ def test_images_stamped_later_change_the_time_offset_alone(drive: KittiSource, t
     reader = RecentReader(source)
     (position,) = telling_positions(reader, from_bag, 1)
     assert position not in source.image_positions
-    assert overlay(reader, position, from_bag, None).shape[2] == 3
+    shown = ShownFrame.of(reader, position, from_bag)
+    assert overlay(shown, from_bag, None).shape[2] == 3
 
 
 def test_without_masks_nothing_is_labelled_and_motion_is_estimated(

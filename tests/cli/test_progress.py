@@ -1,0 +1,154 @@
+"""Progress, quiet runs, JSON and completion, as a user meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stored import written
+
+from sst_graph.cli import main
+from sst_graph.cli.messages import Loudness, loudness
+from sst_graph.cli.progress import EVERY_S, FIRST_S, ProgressBar, counted
+from sst_graph.result import read_result
+from sst_graph.simulator import SimulationConfig
+
+SMALL = ["--frames", "2", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
+
+
+@pytest.fixture
+def lines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plain lines, as in a process of the command's own."""
+    monkeypatch.setattr(loudness, "lines", True)
+    monkeypatch.setattr(loudness, "quiet", False)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """The time that the progress sees [s], in a list of one."""
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    return now
+
+
+@pytest.mark.usefixtures("lines")
+def test_a_stage_over_two_seconds_has_lines(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar() as progress:
+        solve = progress.stage("solve")
+        # The stage begins with its first call, at 0.5 s.
+        for done, seconds in enumerate((0.5, 2.1, 3.0, 12.0, 13.1), 1):
+            clock[0] = 100.0 + seconds
+            solve(done, 8)
+    assert (FIRST_S, EVERY_S) == (2.0, 10.0)
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["sst-graph: progress: solve: 3 of 8 (38 %)", "sst-graph: progress: solve: 5 of 8 (62 %)"]
+
+
+@pytest.mark.usefixtures("lines")
+def test_short_stages_are_silent(clock: list[float], capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressBar() as progress:
+        for k in range(20):
+            clock[0] += 1.0
+            progress(f"stage {k}", 1, 1)
+    assert capsys.readouterr().err == ""
+
+
+def test_nothing_is_said_in_a_process_of_others(
+    clock: list[float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert loudness == Loudness(loudness.quiet, lines=False)
+    with ProgressBar() as progress:
+        for item in counted("abc", "abc", progress.stage("letters")):
+            clock[0] += 60.0
+            assert item in "abc"
+    assert capsys.readouterr().err == ""
+
+
+def test_a_terminal_has_a_bar_and_quiet_has_none(tmp_path: Path) -> None:
+    for options, has_bar in (([], True), (["-q"], False)):
+        main_end, process_end = pty.openpty()
+        termios.tcsetwinsize(process_end, (24, 80))
+        arguments = ["simulate", str(tmp_path / f"street{has_bar}"), *SMALL, *options]
+        done = subprocess.run(
+            [sys.executable, "-m", "sst_graph.cli", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=process_end,
+            text=True,
+        )
+        os.set_blocking(main_end, False)
+        try:
+            shown = os.read(main_end, 1 << 16)
+        except BlockingIOError:
+            shown = b""
+        os.close(main_end)
+        os.close(process_end)
+        assert done.returncode == 0
+        assert (b"simulate" in shown) == has_bar
+        assert ("wrote" in done.stdout) == has_bar
+
+
+def test_quiet_leaves_results_and_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["simulate", str(tmp_path / "a"), *SMALL, "--quiet"]) == 0
+    assert capsys.readouterr() == ("", "")
+    assert main(["info", str(tmp_path / "a"), "-q"]) == 0
+    assert "a/00" in capsys.readouterr().out
+    assert main(["simulate", str(tmp_path / "a"), *SMALL, "--quiet"]) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "a"), "-q", "-v"]) == 2
+    assert "not allowed with" in capsys.readouterr().err
+
+
+def test_a_calibration_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    street = SimulationConfig(
+        seed=4, frames=2, width=276, height=84, azimuth_step_deg=0.5, vehicle_density=0.3, motion="standing"
+    )
+    out = tmp_path / "out"
+    options = ["--no-report", "--json", "--set", "search.enabled=false"]
+    code = main(["calibrate", str(written(street)), "--out", str(out), *options])
+    found = json.loads(capsys.readouterr().out)
+    result = read_result(out / "calibration.json")
+    assert code == (0 if result.status == "ok" else 3) and found["status"] == result.status
+    np.testing.assert_allclose(found["T_camera_lidar"], result.T_camera_lidar.matrix())
+    assert found["time_offset_s"] == result.time_offset_s
+    assert found["files"][0] == "calibration.json" and found["out"] == str(out)
+    assert found["errors"]["qad_deg"] < 5.0 and found["errors_against"] == "the truth"
+    cameras = ["--camera", "image_2", "image_3", "--json"]
+    assert main(["calibrate", str(written(street)), *cameras, "--out", str(tmp_path / "rig")]) == 2
+    assert "--json: expected with one camera" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "tcsh"])
+def test_completion_knows_commands_and_options(shell: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(word in script for word in ("calibrate", "overlay", "view", "image-shift"))
+
+
+def test_bash_accepts_the_script_and_completes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "completion"
+    script.write_text(capsys.readouterr().out)
+    ask = (
+        f"source {script}; COMP_WORDS=(sst-graph calib); COMP_CWORD=1; COMP_LINE='sst-graph calib'; "
+        "f=$(complete -p sst-graph | sed 's/.*-F \\([^ ]*\\).*/\\1/'); $f sst-graph calib sst-graph; "
+        "echo ${COMPREPLY[@]}"
+    )
+    done = subprocess.run(["bash", "-c", ask], capture_output=True, text=True)
+    assert done.stdout.split() == ["calibrate"], done.stderr
+
+
+def test_without_shtab_the_message_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert main(["completion", "bash"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1 and "pip install 'sst-graph[completion]'" in captured.err
