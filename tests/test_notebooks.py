@@ -42,12 +42,11 @@ def run(name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> dict[str,
     drawn = [pyplot.figure(number) for number in pyplot.get_fignums()]
     assert 2 <= len(drawn) <= 5
     for figure in drawn:
-        shared = {id(ax) for ax in figure.axes if ax.get_shared_x_axes().get_siblings(ax)[0] is not ax}
         for ax in figure.axes:
             if ax.get_label() == "<colorbar>":
                 continue
-            assert ax.get_ylabel(), f"{name}: an axis without a label"
-            assert ax.get_xlabel() or id(ax) not in shared, f"{name}: an axis without a label"
+            together = ax.get_shared_x_axes().get_siblings(ax)
+            assert ax.get_ylabel() and any(each.get_xlabel() for each in together), f"{name}: no label"
         figure.canvas.draw()
     return found
 
@@ -125,8 +124,9 @@ def test_calibration_in_a_slam_graph(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert np.degrees(np.linalg.norm(error[:3])) < 0.3 and abs(error[6]) < 0.02
     off = {name: np.linalg.norm(at - found["true"], axis=1).mean() for name, at in found["position"].items()}
     assert off["with loops"] < 0.5 * off["odometry"] and off["with the camera"] < 0.5 * off["odometry"]
-    first, last = found["history"][4], found["history"][-1]
-    assert last.converged and (np.diag(last.covariance) < np.diag(first.covariance) * 1.1).all()
+    first = next(update for update in found["history"] if update.converged)
+    last = found["history"][-1]
+    assert last.converged and (np.diag(last.covariance) < np.diag(first.covariance)).all()
 
 
 @pytest.mark.slow
