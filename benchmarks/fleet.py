@@ -238,7 +238,7 @@ def environment() -> dict[str, str]:
 
 
 def empty_drive(job: Job) -> Record:
-    """The scheduler's work for a drive and none of the calibration's: a result, and its record on the disk."""
+    """The scheduler's work for a drive, none of the calibration's: a result, and its record on the disk."""
     number = int(job.drive.name[1:])
     rng = np.random.default_rng(number)
     sigmas = np.array([2e-3] * 3 + [0.02] * 3 + [0.005])
