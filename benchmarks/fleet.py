@@ -111,11 +111,11 @@ def drive_of(
     return replace(simulate(config), truth=GroundTruth(cTl, offset_s))
 
 
-def make_fleet(folder: Path, vehicles: int, drives: int) -> list[Path]:
+def make_fleet(folder: Path, vehicles: Sequence[int], drives: int) -> list[Path]:
     """Folders of all drives, named VEHICLE_DATE; those that are there are kept."""
     made = []
     for number in range(drives):
-        for vehicle in range(vehicles):
+        for vehicle in vehicles:
             name = f"v{vehicle:02d}"
             day = FIRST_DAY + timedelta(days=7 * number + vehicle % 5)
             path = folder / f"{name}_{day.isoformat()}"
@@ -127,7 +127,7 @@ def make_fleet(folder: Path, vehicles: int, drives: int) -> list[Path]:
 
 def add_bad_drives(folder: Path) -> list[Path]:
     """Three drives that cannot be read: a calib.txt cut off, a picture that is none, an empty folder."""
-    whole = next(path for path in sorted(folder.iterdir()) if path.name.startswith("v00"))
+    whole = next(path for path in sorted(folder.iterdir()) if (path / "sequences/00/calib.txt").exists())
     day = (FIRST_DAY - timedelta(days=30)).isoformat()
     cut, spoilt, empty = (folder / f"{name}_{day}" for name in ("v01", "v04", "v08"))
     for path in (cut, spoilt):
@@ -303,7 +303,7 @@ def main() -> None:
         measure_scheduler(given.empty, given.out, 2, given.dask)
         return
     folder, alone, batch = given.out / "drives", given.out / "one_by_one", given.out / "batch"
-    drives = make_fleet(folder, given.vehicles, given.drives)
+    drives = make_fleet(folder, range(given.vehicles), given.drives)
     bad = add_bad_drives(folder)
     times_file = given.out / "one_by_one.json"
     took = json.loads(times_file.read_text()) if times_file.exists() else {}
