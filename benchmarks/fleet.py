@@ -111,11 +111,11 @@ def drive_of(
     return replace(simulate(config), truth=GroundTruth(cTl, offset_s))
 
 
-def make_fleet(folder: Path, vehicles: int, drives: int) -> list[Path]:
+def make_fleet(folder: Path, vehicles: Sequence[int], drives: int) -> list[Path]:
     """Folders of all drives, named VEHICLE_DATE; those that are there are kept."""
     made = []
     for number in range(drives):
-        for vehicle in range(vehicles):
+        for vehicle in vehicles:
             name = f"v{vehicle:02d}"
             day = FIRST_DAY + timedelta(days=7 * number + vehicle % 5)
             path = folder / f"{name}_{day.isoformat()}"
@@ -127,7 +127,7 @@ def make_fleet(folder: Path, vehicles: int, drives: int) -> list[Path]:
 
 def add_bad_drives(folder: Path) -> list[Path]:
     """Three drives that cannot be read: a calib.txt cut off, a picture that is none, an empty folder."""
-    whole = next(path for path in sorted(folder.iterdir()) if path.name.startswith("v00"))
+    whole = next(path for path in sorted(folder.iterdir()) if (path / "sequences/00/calib.txt").exists())
     day = (FIRST_DAY - timedelta(days=30)).isoformat()
     cut, spoilt, empty = (folder / f"{name}_{day}" for name in ("v01", "v04", "v08"))
     for path in (cut, spoilt):
@@ -238,7 +238,7 @@ def environment() -> dict[str, str]:
 
 
 def empty_drive(job: Job) -> Record:
-    """The scheduler's work for a drive and none of the calibration's: a result, and its record on the disk."""
+    """The scheduler's work for a drive, none of the calibration's: a result, and its record on the disk."""
     number = int(job.drive.name[1:])
     rng = np.random.default_rng(number)
     sigmas = np.array([2e-3] * 3 + [0.02] * 3 + [0.005])
@@ -303,7 +303,7 @@ def main() -> None:
         measure_scheduler(given.empty, given.out, 2, given.dask)
         return
     folder, alone, batch = given.out / "drives", given.out / "one_by_one", given.out / "batch"
-    drives = make_fleet(folder, given.vehicles, given.drives)
+    drives = make_fleet(folder, range(given.vehicles), given.drives)
     bad = add_bad_drives(folder)
     times_file = given.out / "one_by_one.json"
     took = json.loads(times_file.read_text()) if times_file.exists() else {}

@@ -228,7 +228,7 @@ def _add_batch(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
     batch = commands.add_parser(
         "batch",
         help=text,
-        description=f"{text[0].upper()}{text[1:]} (docs/batch.md). Drives that are done are not run again.",
+        description=f"{text[0].upper()}{text[1:]} (docs/how-to/batch.md). Drives that are done are not run again.",
     )
     batch.add_argument(
         "drives",

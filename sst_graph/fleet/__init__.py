@@ -1,6 +1,6 @@
 """Many drives: each calibrated in a process of its own, their vehicles fused, one summary.
 
-The command is ``sst-graph batch`` (docs/batch.md).
+The command is ``sst-graph batch`` (docs/how-to/batch.md).
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 
 from sst_graph.fleet.drives import file_name
-from sst_graph.fleet.summary.tables import Row
+from sst_graph.fleet.summary.tables import HUMAN, Row
 from sst_graph.fleet.vehicles.fused import Vehicle
 from sst_graph.report.chart import Chart
 from sst_graph.report.html import bullets, details, figure, grid, paragraph, section, text
@@ -19,7 +19,8 @@ MOST_ROWS = 5000
 """Drives on the page; the tables have all of them. Those that need attention come first."""
 MOST_CHARTS = 60
 """Vehicles with charts of their drift, those that need attention first."""
-_SHOWN = ("drive", "vehicle", "date", "status", "reason", "rotation", "translation", "time offset", "took")
+_SIGMA_HEADS = ("σ rotation", "σ translation", "σ time offset")
+_SHOWN = ("drive", "vehicle", "date", "status", "reason", *_SIGMA_HEADS, "took")
 
 
 def summary_html(rows: Sequence[Row], vehicle_rows: Sequence[Row], vehicles: Sequence[Vehicle]) -> str:
@@ -101,7 +102,7 @@ def _vehicles(rows: Sequence[Row]) -> str:
             f'<td class="why">{text(str(row["reason"]))}</td><td class="num">{row["drives"]}</td>'
             f'<td class="num">{row["without"]}</td>{_sigma_cells(row)}</tr>'
         )
-    heads = ("vehicle", "status", "what happened", "drives", "without", *_SHOWN[5:8])
+    heads = ("vehicle", "status", "what happened", "drives", "without", *_SIGMA_HEADS)
     return section(
         "vehicles",
         "Vehicles",
@@ -123,7 +124,7 @@ def _drives(rows: Sequence[Row]) -> str:
         lines.append(
             f'<tr data-status="{row["status"]}"><th scope="row">{name}</th>'
             f"<td>{text(str(row['vehicle']))}</td>"
-            f"<td>{text(str(row['date'])[:16])}</td><td>{_tag(row)}</td>"
+            f'<td class="day">{text(str(row["date"])[:10])}</td><td>{_tag(row)}</td>'
             f'<td class="why">{text(str(row["reason"]))}</td>{_sigma_cells(row)}'
             f'<td class="num" data-value="{seconds}">{seconds:.0f} s</td></tr>'
         )
@@ -182,7 +183,7 @@ def _drifts(vehicles: Sequence[Vehicle]) -> str:
     ]
     note = (
         "The calibration at each drive by all drives of its stretch, against that of the first, along "
-        "the LiDAR's axes; the band of the time offset is one σ. Errors that all drives have in common do "
+        "the LiDAR's axes; the bands are one σ. Errors that all drives have in common do "
         "not show."
     )
     return section("drift", "Drift", paragraph(note, "note"), *blocks) if blocks else ""
@@ -196,29 +197,27 @@ def _charts(vehicle: Vehicle) -> list[str]:
             for one in vehicle.drift
         ]
     )
-    human = steps * np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
+    human = steps * HUMAN
+    sigmas = np.sqrt([np.diag(one.covariance) for one in vehicle.drift]) * HUMAN
     span = (float(days[0]), float(days[-1]))
     unit = "days" if vehicle.dated else "drives"
     shown = []
     for title, columns, label in (
-        ("Rotation", (0, 1, 2), "deg"),
-        ("Translation", (3, 4, 5), "cm"),
-        ("Time offset", (6,), "ms"),
+        ("Rotation", [0, 1, 2], "deg"),
+        ("Translation", [3, 4, 5], "cm"),
+        ("Time offset", [6], "ms"),
     ):
-        values = human[:, list(columns)]
-        sigma = 1e3 * np.sqrt([one.covariance[6, 6] for one in vehicle.drift]) if len(columns) == 1 else None
-        room = 0.0 if sigma is None else float(sigma.max())
+        values, sigma = human[:, columns], sigmas[:, columns]
         chart = Chart(
             span,
-            (float(values.min()) - room, float(values.max()) + room),
+            (float((values - sigma).min()), float((values + sigma).max())),
             (f"{unit} from the first", label),
             f"{title} of {vehicle.name} over its drives",
         )
-        if sigma is not None:
-            chart.band(days, values[:, 0] - sigma, values[:, 0] + sigma, "a", "one sigma")
         for k, axis in enumerate("xyz"[: len(columns)]):
-            name = axis if len(columns) == 3 else ""
-            chart.line(days, values[:, k], "abc"[k], name)
-            chart.dots(days, values[:, k], "abc"[k], titles=vehicle.drives)
+            colour, name = "abc"[k], axis if len(columns) == 3 else ""
+            chart.band(days, values[:, k] - sigma[:, k], values[:, k] + sigma[:, k], colour)
+            chart.line(days, values[:, k], colour, name)
+            chart.dots(days, values[:, k], colour, titles=vehicle.drives)
         shown.append(figure(chart.svg(), title, ""))
     return shown

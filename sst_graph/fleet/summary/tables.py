@@ -26,7 +26,8 @@ _SIGMAS = (
     "sigma_time_offset_ms",
 )
 _POSE = ("trans_x_m", "trans_y_m", "trans_z_m", "quat_x", "quat_y", "quat_z", "quat_w", "time_offset_s")
-_HUMAN = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
+HUMAN = np.array([180.0 / np.pi] * 3 + [100.0] * 3 + [1000.0])
+"""From rad, m, s to deg, cm, ms."""
 
 
 def drive_rows(
@@ -49,7 +50,7 @@ def drive_rows(
             against = f"contradicts the other drives of {vehicle}: {finding.words}"
             reason, rank = f"{against}; {reason}" if reason else against, min(rank, 6.5)
         numbers = record.numbers
-        sigmas = None if numbers is None else numbers.sigmas * _HUMAN
+        sigmas = None if numbers is None else numbers.sigmas * HUMAN
         row: Row = {
             "drive": drive.name,
             "vehicle": drive.vehicle,
@@ -80,7 +81,7 @@ def vehicle_rows(vehicles: Sequence[Vehicle]) -> list[Row]:
     rows: list[Row] = []
     for one in sorted(vehicles, key=lambda each: (order.index(each.status), each.name)):
         now = one.calibration
-        sigmas = [None] * 7 if now is None else map(float, np.sqrt(np.diag(now.covariance)) * _HUMAN)
+        sigmas = [None] * 7 if now is None else map(float, np.sqrt(np.diag(now.covariance)) * HUMAN)
         rows.append(
             {
                 "vehicle": one.name,
