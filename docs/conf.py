@@ -50,6 +50,7 @@ html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 copybutton_exclude = ".linenos, .gp, .go"
+highlight_language = "text"  # of blocks that name none: commands and their output
 pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 

@@ -13,6 +13,13 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
+REFERENCE = DOCS / "reference"
+PAGES = [
+    path
+    for path in sorted(DOCS.rglob("*.md"))
+    if path not in (REFERENCE / "api.md", REFERENCE / "command-line.md") and path.parent != REFERENCE / "api"
+]
+"""All but those that are written from docstrings and from argparse."""
 
 
 class _Links(HTMLParser):
@@ -61,3 +68,30 @@ def test_the_site_needs_no_network_and_its_links_lead_somewhere(site: Path) -> N
     assert dead == []
     loaded = re.compile(r'<(?:script|img|link rel="stylesheet")[^>]*(?:src|href)="(?:https?:)?//')
     assert [path.name for path in pages if loaded.search(path.read_text(encoding="utf-8"))] == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_a_page_is_short_enough_to_read(path: Path) -> None:
+    lines = path.read_text(encoding="utf-8").splitlines()
+    prose = " ".join(line for line in lines if not line.startswith("|"))
+    assert len(prose.split()) <= 1200
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
+
+
+def test_the_program_of_the_figures_draws(tmp_path: Path) -> None:
+    program = DOCS / "figures" / "make.py"
+    subprocess.run([sys.executable, str(program), "clocks", "--into", str(tmp_path)], cwd=ROOT, check=True)
+    drawn = (tmp_path / "clocks.svg").read_text(encoding="utf-8")
+    assert "</svg>" in drawn and len(drawn) > 10_000
+    refused = subprocess.run(
+        [sys.executable, str(program), "clock"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert refused.returncode == 2 and "found clock, expected some of frames, clocks" in refused.stderr
+
+
+def test_figures_are_small() -> None:
+    sizes = [path.stat().st_size for path in DOCS.rglob("*") if path.suffix in (".svg", ".png", ".jpg")]
+    assert len(sizes) >= 8 and sum(sizes) < 1_500_000

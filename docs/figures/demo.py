@@ -44,7 +44,9 @@ def _inputs(folder: Path) -> Picture:
     if image is None or scan is None:
         raise SystemExit(f"{folder}: found no frame {FRAME} with both sensors")
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 3.0), width_ratios=(2.55, 1))
-    shown = np.repeat(image.pixels[..., None], 3, axis=2) if image.pixels.ndim == 2 else image.pixels[..., ::-1]
+    shown = (
+        np.repeat(image.pixels[..., None], 3, axis=2) if image.pixels.ndim == 2 else image.pixels[..., ::-1]
+    )
     vehicle = (image.mask == SemanticClass.VEHICLE)[..., None]
     left.imshow(np.where(vehicle, (0.45 * shown + 0.55 * np.array([250, 190, 0])), shown).astype(np.uint8))
     left.set_title("image_2 and semantic_2: the picture, vehicles in its mask", fontsize=9)
@@ -78,7 +80,9 @@ def _photograph(page: Path, path: Path) -> None:
     """The head of a page, as a browser shows it."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
-        raise SystemExit("found no chromium and no google-chrome, expected one to take a picture of the report")
+        raise SystemExit(
+            "found no chromium and no google-chrome, expected one to take a picture of the report"
+        )
     with tempfile.TemporaryDirectory() as profile:
         subprocess.run(
             [

@@ -45,7 +45,9 @@ def frames() -> Figure:
     above.set_title("from above", fontsize=9)
     _frame(above, (-0.2, 6.3), (-1.6, 1.6))
     above.text(3.65, -0.9, "cP = cTl · lP\np_camera = T_camera_lidar · p_lidar", ha="left", va="top")
-    above.text(3.65, 1.2, "x red, y green, z blue\n⊙ towards you, ⊗ away from you", ha="left", va="top", color=DARK)
+    above.text(
+        3.65, 1.2, "x red, y green, z blue\n⊙ towards you, ⊗ away from you", ha="left", va="top", color=DARK
+    )
     figure.tight_layout()
     return figure
 
@@ -75,7 +77,8 @@ def clocks() -> Figure:
     axes.add_patch(_arrow(np.array([scan, 1.15]), np.array([shown, 1.15]), X))
     axes.text(scan + 5.0, 1.15, "τ = (t_image + offset) − t_point = −30 ms", va="center", ha="left", color=X)
     axes.text(
-        150.0, -0.5, "The image stamped 100 ms shows the world at LiDAR time 170 ms; the scan at 200 ms is nearest.",
+        150.0, -0.5,
+        "The image stamped 100 ms shows the world at LiDAR time 170 ms; the scan at 200 ms is nearest.",
         ha="center", va="top",
     )  # fmt: skip
     figure.tight_layout()
@@ -136,7 +139,16 @@ def _axes(axes: Axes, at: FloatArray, directions: dict[str, tuple[int, int]], th
 
 
 def _vehicle_from_the_side(axes: Axes) -> None:
-    body = [(0.1, 0.25), (0.1, 0.85), (0.75, 0.95), (1.05, 1.45), (2.2, 1.45), (2.7, 0.95), (3.4, 0.82), (3.45, 0.25)]
+    body = [
+        (0.1, 0.25),
+        (0.1, 0.85),
+        (0.75, 0.95),
+        (1.05, 1.45),
+        (2.2, 1.45),
+        (2.7, 0.95),
+        (3.4, 0.82),
+        (3.45, 0.25),
+    ]
     axes.add_patch(Polygon(body, fc="#edf0f3", ec=GREY))
     for x in (0.8, 2.75):
         axes.add_patch(Circle((x, 0.22), 0.3, fc="white", ec=GREY))
@@ -210,7 +222,7 @@ def _grid(step: float) -> FloatArray:
 
 
 def _points(outline: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where scan lines 9 px apart meet the car: all points 9 px apart, and the first and last of each line."""
+    """Where scan lines 9 px apart meet the car: points 9 px apart, and the first and last of each line."""
     interior, boundary = [], []
     for v in np.arange(9.0, 88.0, 9.0):
         along = [u for u in np.arange(0.0, 230.0, 1.0) if _inside(outline, np.array([u, v]))]
