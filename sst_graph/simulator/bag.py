@@ -159,7 +159,8 @@ class _Messages:
         )
 
     def transform(self, cTl: gtsam.Pose3) -> Any:
-        q, t = cTl.rotation().toQuaternion(), cTl.translation()
+        q: Any = cTl.rotation().toQuaternion()  # the stubs do not know it
+        t = cTl.translation()
         pose = self.make(
             "geometry_msgs/msg/Transform",
             translation=self.make("geometry_msgs/msg/Vector3", x=t[0], y=t[1], z=t[2]),
