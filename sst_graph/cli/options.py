@@ -228,7 +228,8 @@ def _add_batch(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argume
     batch = commands.add_parser(
         "batch",
         help=text,
-        description=f"{text[0].upper()}{text[1:]} (docs/how-to/batch.md). Drives that are done are not run again.",
+        description=f"{text[0].upper()}{text[1:]} (docs/how-to/batch.md). "
+        "Drives that are done are not run again.",
     )
     batch.add_argument(
         "drives",
@@ -495,7 +496,8 @@ def _add_import(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
     command = commands.add_parser(
         "import",
         help=text,
-        description=f"{text[0].upper()}{text[1:]}; docs/how-to/imports.md states what is taken for what. --init "
+        description=f"{text[0].upper()}{text[1:]}; docs/how-to/imports.md states what is taken for what. "
+        "--init "
         "FILE reads the same files where nothing has to be named.",
     )
     command.add_argument("file", metavar="FILE", type=Path, help="file in a format that export writes")
