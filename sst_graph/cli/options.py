@@ -497,8 +497,7 @@ def _add_import(commands: argparse._SubParsersAction[_Parser]) -> argparse.Argum
         "import",
         help=text,
         description=f"{text[0].upper()}{text[1:]}; docs/how-to/imports.md states what is taken for what. "
-        "--init "
-        "FILE reads the same files where nothing has to be named.",
+        "--init FILE reads the same files where nothing has to be named.",
     )
     command.add_argument("file", metavar="FILE", type=Path, help="file in a format that export writes")
     command.add_argument(
