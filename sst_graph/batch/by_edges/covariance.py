@@ -29,7 +29,7 @@ BoolArray = NDArray[np.bool_]
 
 FLOOR = np.array([*np.radians([0.06] * 3), 0.01, 0.01, 0.01, 0.002])
 """(7,) sigmas that are added [rad, m, s], for what all objects have in common and no choice of them shows:
-edges inside an object draw its top edge down, and pitch and height with it, on every street."""
+edges inside an object draw its outline inwards, its top down, and pitch and height with it."""
 SAMPLES = 8
 """Half-samples: the order of a Hadamard matrix."""
 _PAIRS = SAMPLES - 1
