@@ -98,13 +98,13 @@ def find_compact_objects(
 
 def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tuple[IntArray, IntArray]:
     """Pairs of raised points, neighbours in the scan, that are near each other for their range."""
-    pairs = []
+    pairs, columns = [], np.ascontiguousarray(points.T)
     order, some = beams.order, np.flatnonzero(raised[beams.order])
     along = order[some]
     for ahead in range(1, _AHEAD + 1):
         a, b = along[:-ahead], along[ahead:]
         limit = np.maximum(_APART_M, _APART_STEPS * beams.step * beams.rho[a])
-        pairs.append(_near(points, a, b, (beams.ring[a] == beams.ring[b]), limit))
+        pairs.append(_near(columns, a, b, beams.ring[a] == beams.ring[b], limit))
     # Across rings: the raised point of the ring above that is nearest in azimuth.
     keys = beams.keys[some]
     for up in range(1, _RINGS_UP + 1):
@@ -116,18 +116,20 @@ def _linked(points: FloatArray, raised: NDArray[np.bool_], beams: Beams) -> tupl
         usual = up * float(np.median(np.diff(beams.elevation)))
         gap = np.maximum(beams.elevation[ring] - beams.elevation[beams.ring[a]], usual)
         limit = np.maximum(_APART_M, _APART_UP_STEPS * gap * beams.rho[a])
-        for side in (0,):
-            b = along[np.clip(place + side, 0, len(along) - 1)]
-            pairs.append(_near(points, a, b, beams.ring[b] == ring, limit))
+        b = along[np.minimum(place, len(along) - 1)]
+        pairs.append(_near(columns, a, b, beams.ring[b] == ring, limit))
     return np.concatenate([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
 
 
 def _near(
-    points: FloatArray, a: IntArray, b: IntArray, same: NDArray[np.bool_], limit_m: FloatArray
+    columns: FloatArray, a: IntArray, b: IntArray, same: NDArray[np.bool_], limit_m: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """The pairs that are candidates and not farther apart than a limit each."""
-    step = points[b] - points[a]
-    near = same & (np.einsum("ij,ij->i", step, step) < limit_m**2)
+    """The pairs of points, columns (3, n), that are candidates and not farther apart than a limit each."""
+    square = np.zeros(len(a))
+    for column in columns:
+        step = column[b] - column[a]
+        square += step * step
+    near = same & (square < limit_m * limit_m)
     return a[near], b[near]
 
 

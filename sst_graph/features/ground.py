@@ -42,7 +42,8 @@ def heights_above_ground(points: FloatArray) -> FloatArray:
     # 1. The plane that fits the lowest points of all cells.
     cells = _cells(points)
     size = int(2.0 * _REACH_M / _CELL_M)
-    order = np.lexsort((points[:, 2], cells))
+    # By cell, then by height: one key is sorted much faster than two.
+    order = np.argsort(cells * (np.ptp(points[:, 2]) + 1.0) + points[:, 2])
     first = np.flatnonzero(np.diff(cells[order], prepend=-1))
     counts = np.diff(first, append=len(order))
     lowest = order[first + (_LOWEST_SHARE * counts).astype(np.intp)]

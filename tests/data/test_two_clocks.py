@@ -12,8 +12,9 @@ from stored import simulated
 from streets import CROWDED_STREET
 
 from sst_graph import calibrate
-from sst_graph.cli.pictures import drawn_frames
+from sst_graph.cli.pictures import ShownFrame, telling_positions
 from sst_graph.data import SourceOptions, open_source
+from sst_graph.data.frame_parts import RecentReader
 from sst_graph.data.two_clocks import DriveProperties, Sensor, TwoClockSource, merged
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.result import CalibrationResult
@@ -149,8 +150,11 @@ def test_a_camera_of_30_hz_with_a_lidar_of_10_hz() -> None:
     # Every image is matched, a scan is named once, and pictures show a scan with the image of its instant.
     assert result.diagnostics["pairs"] > 2 * len(result.frames_used)
     assert len(set(result.frames_used)) == len(result.frames_used)
-    shown = drawn_frames([street(drive)], result, 3)
-    assert len(shown) == 3
-    for one in shown:
-        apart_s = (one.image.stamp_ns - one.scan.stamp_ns) * 1e-9 + result.time_offset_s
+    reader = RecentReader(street(drive))
+    positions = telling_positions(reader, result, 3)
+    assert len(positions) == 3
+    for position in positions:
+        shown = ShownFrame.of(reader, position, result).frame
+        assert shown.image is not None and shown.scan is not None
+        apart_s = (shown.image.stamp_ns - shown.scan.stamp_ns) * 1e-9 + result.time_offset_s
         assert abs(apart_s) < 0.5 / 30.0 + 0.002

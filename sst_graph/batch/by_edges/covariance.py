@@ -1,82 +1,92 @@
-"""Covariance of an estimate by edges: that of the matches, and what parts of the data disagree by.
+"""Covariance of an estimate by edges: that of the matches, of the choice of objects, and a floor.
 
-Edges err together, where the matches do not show it: all top edges are seen a little low, all edges on one
-side of the street face away from the sun. So the matches are split in two, in several ways, and the estimate
-is linearized without each half in turn. Half of the difference between two halves is what the whole may be
-wrong by; its square, summed over the ways, is added to the cluster-robust covariance.
+A match with the picture's edge is soft: it follows the pose, and which edge is met is part of the estimate.
+With the matches frozen a problem seems three to ten times stiffer than it is. So the problem is solved again,
+and matched again, with half of the objects, in eight balanced ways (McCarthy, Pseudo-replication: half
+samples, Review of the International Statistical Institute, 1969): the deviation of such an estimate has the
+covariance of the whole one.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import hadamard
 
-from sst_graph.association.edge_matching import SIDES
+from sst_graph.batch.by_edges.parts import thinned, with_objects
 from sst_graph.batch.problem import JointEstimate
-from sst_graph.covariance.jackknife import steps_without
-from sst_graph.covariance.match_table import MatchTable
-from sst_graph.graph.building import PairMatches
+from sst_graph.errors import EstimationError
+from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.hand_eye.solution import difference
+from sst_graph.objects.tracks import ObjectId
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FLOOR = np.array([*np.radians([0.11] * 3), 0.025, 0.025, 0.025, 0.004])
-"""(7,) sigmas that are added [rad, m, s]. The halves share what all edges have in common, and a soft match
-follows the pose a little, so that their differences come out too small: on three simulated streets and two
-real drives the errors were three to ten times the spread. These are about the root mean squares of those
-errors."""
+FLOOR = np.array([*np.radians([0.06] * 3), 0.01, 0.01, 0.01, 0.002])
+"""(7,) sigmas that are added [rad, m, s], for what all objects have in common and no choice of them shows:
+edges inside an object draw its outline inwards, its top down, and pitch and height with it."""
+SAMPLES = 8
+"""Half-samples: the order of a Hadamard matrix."""
+_PAIRS = SAMPLES - 1
+"""Pairs of groups of objects, of which each half-sample has one group: each column but the constant one."""
+_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
+"""Scales of the kernel from the estimate [px]: wide enough to meet other edges, too narrow to leave it."""
+_POINTS_A_SCAN = 500
+"""Most boundary points of a scan before half of the objects are taken: each edge keeps some."""
+_STEP_SIGMAS = 0.5
+"""A step shorter than this many standard deviations of the frozen problem ends a half-sample's outer loop:
+they are a tenth of its own."""
+FEWEST = 4
+"""Fewest half-samples that a spread is believed of."""
+FEW_OBJECTS = (
+    "half of the objects has too few edges in view to calibrate with: how far the estimate may be off "
+    "cannot be told; record a richer scene"
+)
 
 
-def edges_covariance(estimate: JointEstimate) -> tuple[FloatArray, dict[str, Any]]:
-    """(7, 7) covariance of extrinsic and time offset, and the sigmas of its parts, JSON-able."""
-    table = estimate.robust.table
-    covariance = estimate.covariance[:7, :7] + np.diag(FLOOR**2)
-    parts: dict[str, Any] = {"matches": _sigmas(estimate.covariance[:7, :7])}
-    for name, half in _halves(estimate.solution.pairs, table).items():
-        steps = [_step_without(table, estimate.robust.bread, side) for side in (half, ~half)]
-        spread = 0.25 * np.outer(steps[0] - steps[1], steps[0] - steps[1])
-        covariance = covariance + spread
-        parts[name] = _sigmas(spread)
-    return covariance, parts
+def edges_covariance(
+    problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
+) -> tuple[FloatArray, dict[str, Any], tuple[str, ...]]:
+    """(7, 7) covariance of extrinsic and time offset; sigmas of its parts, JSON-able; reasons to doubt it.
 
-
-def _halves(pairs: Sequence[PairMatches], table: MatchTable) -> dict[str, BoolArray]:
-    """(m,) which half each match is in, by name of the split."""
-    alignments = [matches.alignment for pair in pairs for matches in pair.matches.values()]
-    column = np.concatenate([alignment.pixels[:, 0] for alignment in alignments])
-    distance = np.concatenate([np.linalg.norm(alignment.lPs, axis=1) for alignment in alignments])
-    weights = table.root_weights**2
-    splits = {
-        "time": table.frames < _middle(table.frames.astype(np.float64), weights),
-        "left and right": column < _middle(column, weights),
-        "near and far": distance < _middle(distance, weights),
-        "sides and tops": table.sides % SIDES < _TOP,
+    Args:
+        problem: that was solved.
+        objects: tracks of each drive's objects.
+    """
+    steps = _half_sample_steps(problem, estimate, objects)
+    parts = {
+        "matches": estimate.covariance[:7, :7],
+        "objects": np.cov(steps.T) if len(steps) >= FEWEST else np.zeros((7, 7)),
+        "floor": np.diag(FLOOR**2),
     }
-    return {name: half for name, half in splits.items() if half.any() and not half.all()}
+    total = np.asarray(sum(parts.values()), np.float64)
+    sigmas = {name: np.sqrt(np.diag(part)).tolist() for name, part in parts.items()}
+    return total, sigmas | {"samples": len(steps)}, () if len(steps) >= FEWEST else (FEW_OBJECTS,)
 
 
-_TOP = 2
-"""Number of an object's top side; smaller ones are left and right."""
+def half_samples() -> BoolArray:
+    """(SAMPLES, 2 _PAIRS) which groups of objects each half-sample has: one of each pair, all pairs of groups
+    equally often together."""
+    first = hadamard(SAMPLES)[:, 1:] > 0
+    return np.stack([first, ~first], axis=2).reshape(SAMPLES, -1)
 
 
-def _middle(values: FloatArray, weights: FloatArray) -> float:
-    """Weighted median."""
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
-
-
-def _step_without(table: MatchTable, bread: FloatArray, left_out: BoolArray) -> FloatArray:
-    """(7,) how far the linearized estimate moves without some of the matches."""
-    J, r = table.J[left_out], (table.root_weights * table.r)[left_out]
-    columns = np.unique(J.indices)
-    own = J[:, columns].toarray()
-    information, score = own.T @ own, own.T @ r
-    return steps_without(information[None], score[None], columns[None], bread)[0, :7]
-
-
-def _sigmas(covariance: FloatArray) -> list[float]:
-    return [float(value) for value in np.sqrt(np.diag(covariance))]
+def _half_sample_steps(
+    problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
+) -> FloatArray:
+    """(k, 7) steps from the estimate to those of the half-samples that have enough matches."""
+    start, steps = estimate.solution.state, []
+    some = [thinned(drive, _POINTS_A_SCAN) for drive in problem.drives]
+    for kept in half_samples():
+        drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
+        try:
+            part = solve_joint(replace(problem, drives=drives), start, _KERNELS_PX, None, _STEP_SIGMAS)
+        except EstimationError:
+            continue
+        steps.append(difference(start, part.state))
+    return np.array(steps).reshape(-1, 7)

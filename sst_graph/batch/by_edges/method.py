@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.batch.by_edges.covariance import edges_covariance
+from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
@@ -110,9 +111,9 @@ def edges_method(
     candidates = _refined(problem, _starts(problem))
     # 3. All frames, from the best, and from turns about the camera's axis.
     solution = _solved(problem, candidates, progress)
-    # 4. Covariance, with what parts of the data disagree by.
+    # 4. Covariance, with what halves of the objects disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
-    covariance, spread = edges_covariance(estimate)
+    covariance, spread, unsure = edges_covariance(problem.whole, estimate, calibration.objects)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
@@ -125,7 +126,7 @@ def edges_method(
         solution.state.time_offsets_s[0],
         covariance,
         frames_used(drives, solution),
-        (*reasons, *sweeps.reasons),
+        (*reasons, *unsure, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
     )
@@ -177,18 +178,6 @@ def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> 
     tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
     some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
     return _Problem(whole, some, replace(region, cTl=pose), centre, motion)
-
-
-def thinned(drive: Drive, most: int) -> Drive:
-    """The drive with at most so many boundary points, evenly spread, of each class in each scan."""
-    scans = []
-    for scan in drive.scans:
-        boundaries = {
-            c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most))))
-            for c, points in scan.boundaries.items()
-        }
-        scans.append(replace(scan, boundaries=boundaries))
-    return replace(drive, scans=tuple(scans))
 
 
 def _tells_offset(motion: MotionSolution) -> bool:

@@ -1,0 +1,38 @@
+"""Drives with some of their boundary points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.drive.preparation import Drive
+from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
+
+
+def thinned(drive: Drive, most: int) -> Drive:
+    """The drive with at most so many boundary points, evenly spread, of each class in each scan."""
+    scans = []
+    for scan in drive.scans:
+        boundaries = {
+            c: points.take(np.arange(0, len(points), max(1, -(-len(points) // most))))
+            for c, points in scan.boundaries.items()
+        }
+        scans.append(replace(scan, boundaries=boundaries))
+    return replace(drive, scans=tuple(scans))
+
+
+def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.bool_]) -> Drive:
+    """The drive with the boundary points of some groups of objects; tracks go round the groups."""
+    scans = []
+    for position, scan in enumerate(drive.scans):
+        boundaries = {}
+        for c, points in scan.boundaries.items():
+            numbers = {n: tracks[position, c, n] for n in numbers_in(points.objects)}
+            chosen = points.take(np.flatnonzero(kept[of_each(points.objects, numbers) % len(kept)]))
+            if len(chosen):
+                boundaries[c] = chosen
+        scans.append(replace(scan, boundaries=boundaries))
+    return replace(drive, scans=tuple(scans))
