@@ -32,7 +32,7 @@ RESOLUTIONS = ("highest", "lowest-direct")
 IMAGE, MASK = "/camera/image_rect", "/camera/mask"  # of write_bag
 EXTRAS = "plot,ros,yaml,onnx"
 IN_SDIST = (
-    "docs/layout.md",
+    "docs/develop/layout.md",
     "notebooks/",
     "tests/test_layers.py",
     "factors/__init__.py",
