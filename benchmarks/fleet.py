@@ -189,7 +189,7 @@ def run_with_kills(command: Sequence[str], rng: np.random.Generator, every_s: fl
     killed = Killed()
     while True:
         process = subprocess.Popen(command, env=environment())
-        end_at = time.monotonic() + (rng.uniform(2.0, 20.0) * every_s if killed.batches < batches else np.inf)
+        end_at = time.monotonic() + (rng.uniform(1.0, 2.5) * every_s if killed.batches < batches else np.inf)
         next_at = time.monotonic() + rng.exponential(every_s)
         while process.poll() is None:
             time.sleep(0.02)

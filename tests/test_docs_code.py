@@ -64,6 +64,7 @@ def test_the_checker_finds_the_mistake_that_the_page_warns_of() -> None:
         exec(compile(wrong, "extending.md", "exec"), {"check_jacobians": check_jacobians})
 
 
+@pytest.mark.slow
 def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
     street = SimulationConfig(
         seed=5,

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from sst_graph.config import Settings, setting
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.files.json_table import json_table
 from sst_graph.files.reading import parse_json
@@ -40,7 +41,7 @@ Told = Callable[["Progress"], None]
 
 
 @dataclass(frozen=True)
-class BatchConfig:
+class BatchConfig(Settings):
     """How drives are run.
 
     Attributes:
@@ -53,10 +54,10 @@ class BatchConfig:
     """
 
     options: tuple[str, ...] = ()
-    workers: int = 1
+    workers: int = setting(1, at_least=1, at_most=10_000)
     dask: str = ""
     limits: Limits = field(default_factory=Limits)
-    retries: int = 2
+    retries: int = setting(2, at_least=0, at_most=1000)
     walk: WalkConfig = field(default_factory=WalkConfig)
 
 

@@ -14,6 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from sst_graph.config import Settings, setting
+
 GUARD = Path(__file__).with_name("guard.py")
 _LOG_BYTES, _LOG_LINES = 64 * 1024, 30
 _FIRST_LOOK_S, _LONGEST_PAUSE_S = 0.01, 0.1
@@ -25,7 +27,7 @@ _ended = threading.Event()
 
 
 @dataclass(frozen=True)
-class Limits:
+class Limits(Settings):
     """What one attempt may take.
 
     Attributes:
@@ -33,8 +35,8 @@ class Limits:
         memory_bytes: resident memory; None: no limit.
     """
 
-    wall_s: float | None = None
-    memory_bytes: int | None = None
+    wall_s: float | None = setting(None, more_than=0.0, at_most=1e9)
+    memory_bytes: int | None = setting(None, at_least=1, at_most=2**60)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,4 @@
-"""The ROS 2 node: ``python -m sst_graph.ros_node --ros-args -p cloud_topic:=/points ...``.
-
-Its parameters: docs/how-to/ros-node.md.
+"""The ROS 2 node: ``python -m sst_graph.ros_node --ros-args -p ...`` (docs/how-to/ros-node.md).
 
 Messages are taken and published as bytes, and decoded and encoded by rosbags.
 """

@@ -87,6 +87,7 @@ def errors_of(result: CalibrationResult, truth: GroundTruth) -> CalibrationError
     return calibration_errors(result.T_camera_lidar, result.time_offset_s, truth, result.covariance)
 
 
+@pytest.mark.slow
 def test_the_paper_comes_nearer_in_rotation_and_time(drive: Drive, truth: GroundTruth) -> None:
     start = off_start(truth)
     result = calibrate_prepared([drive], start, config_of("paper"))
@@ -98,6 +99,7 @@ def test_the_paper_comes_nearer_in_rotation_and_time(drive: Drive, truth: Ground
     assert {frame.drive for frame in result.frames_used} == {drive.name}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["static", "semalign"])
 def test_space_alone_leaves_the_offset_open(drive: Drive, truth: GroundTruth, method: str) -> None:
     start = off_start(truth)
@@ -154,6 +156,7 @@ def test_a_camera_that_sees_no_point(drive: Drive, truth: GroundTruth) -> None:
         assert result.T_camera_lidar.equals(behind, 1e-12)
 
 
+@pytest.mark.slow
 def test_the_paper_reports_missing_motion(drive: Drive, truth: GroundTruth) -> None:
     still = dataclasses.replace(
         drive, scans=drive.scans[:5], images=drive.images[:5], image_pairs=drive.image_pairs[:4]
@@ -164,6 +167,7 @@ def test_the_paper_reports_missing_motion(drive: Drive, truth: GroundTruth) -> N
     assert np.sqrt(result.covariance[6, 6]) > 0.9
 
 
+@pytest.mark.slow
 def test_without_a_stop(drive: Drive, truth: GroundTruth) -> None:
     moving = dataclasses.replace(
         drive, scans=drive.scans[11:], images=drive.images[11:], image_pairs=drive.image_pairs[11:]
@@ -180,6 +184,7 @@ def test_time_offset_per_drive_needs_method_joint(street: Path) -> None:
         calibrate(open_source(street), gtsam.Pose3(), settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_methods_from_the_command_line(street: Path, tmp_path: Path, method: str) -> None:
     out = tmp_path / "result"

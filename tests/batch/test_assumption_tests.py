@@ -55,6 +55,7 @@ def clean() -> CalibrationResult:
     return calibrated(prepared())
 
 
+@pytest.mark.slow
 def test_a_clean_street_contradicts_nothing(clean: CalibrationResult) -> None:
     report = clean.diagnostics["assumptions"]
     assert list(report) == list(ASSUMPTIONS)
@@ -69,6 +70,7 @@ def test_the_parts_of_the_sigmas_add_up(clean: CalibrationResult) -> None:
     assert "matches" in text and "motion" in text and f"cx off by {considered:.2g} px" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("k1", [-0.1])
 def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
     distorted = prepared(k1)
@@ -87,6 +89,7 @@ def test_a_distorted_picture_is_named_and_can_be_estimated(k1: float) -> None:
     assert rotation_deg < 0.1 and translation_m < 0.015
 
 
+@pytest.mark.slow
 def test_a_slight_distortion_is_covered_or_named() -> None:
     result = calibrated(prepared(-0.03))
     truth = crowded_street().truth
@@ -164,6 +167,7 @@ def test_sizes_in_deviations_need_sizes_and_a_clean_street() -> None:
         AssumptionTableConfig(in_sigmas=True, sizes=(2.0,), cases=("k1",))
 
 
+@pytest.mark.slow
 def test_a_wrong_focal_length_is_contradicted() -> None:
     result = calibrated(prepare_drives([with_focal(crowded_street(), 0.03)], CONFIG))
     assert result.status != "ok"

@@ -130,12 +130,14 @@ def first_frame_after(result: CalibrationResult) -> int:
     return int(step["frames"][0])
 
 
+@pytest.mark.slow
 def test_a_clean_drive_contradicts_nothing() -> None:
     result = calibrated([Edited(street(), frames_of())])
     assert result.diagnostics["contradictions"] == {"within": [], "between": {}}
     assert not [reason for reason in result.reasons if "contradict" in reason]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "degrees"), [(12, 2.0), (9, -0.7)])
 def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
     result = calibrated([Edited(street(), knocked(frames_of(), first, degrees))])
@@ -147,6 +149,7 @@ def test_a_mount_knocked_while_moving(first: int, degrees: float) -> None:
     assert np.linalg.norm(step["step"][:3]) == pytest.approx(np.radians(abs(degrees)), rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_mount_knocked_while_standing() -> None:
     source, frames = street("standing", 12), frames_of("standing", 12)
     result = calibrated([Edited(source, knocked(frames, 6, 2.0))])
@@ -154,6 +157,7 @@ def test_a_mount_knocked_while_standing() -> None:
     assert abs(first_frame_after(result) - 6) <= 3
 
 
+@pytest.mark.slow
 def test_an_image_lost_while_the_numbering_goes_on() -> None:
     result = calibrated([Edited(street(), without_image(frames_of(), 12))])
     assert result.status == "not_converged"
@@ -164,18 +168,21 @@ def test_an_image_lost_while_the_numbering_goes_on() -> None:
     assert step["step"][6] == pytest.approx(street().config.period_s, abs=0.04)
 
 
+@pytest.mark.slow
 def test_masks_that_slide() -> None:
     result = calibrated([Edited(street(), sliding(frames_of(), 10))])
     assert result.status == "not_converged"
     assert any("the masks slide" in reason for reason in result.reasons)
 
 
+@pytest.mark.slow
 def test_no_check_no_contradiction() -> None:
     config = with_overrides(CONFIG, ["check_contradictions=false"])
     result = calibrated([Edited(street(), knocked(frames_of(), 12, 2.0))], config)
     assert not [reason for reason in result.reasons if "contradict each other" in reason]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("own_offsets", ["false", "true"])
 def test_drives_of_two_rigs(own_offsets: str) -> None:
     config = with_overrides(CONFIG, [f"time_offset_per_drive={own_offsets}"])
@@ -188,6 +195,7 @@ def test_drives_of_two_rigs(own_offsets: str) -> None:
     assert "(pitch)" in reason
 
 
+@pytest.mark.slow
 def test_drives_of_one_rig() -> None:
     frames = frames_of()
     clean = calibrated([Edited(street(), frames[:12], "a"), Edited(street(), frames[12:], "b")])
@@ -195,6 +203,7 @@ def test_drives_of_one_rig() -> None:
     assert not [reason for reason in clean.reasons if "contradict" in reason]
 
 
+@pytest.mark.slow
 def test_the_offset_of_every_drive_counts() -> None:
     """A standing drive cannot tell its own time offset, whichever drive comes first."""
     config = with_overrides(CONFIG, ["time_offset_per_drive=true"])
@@ -255,6 +264,7 @@ def test_motion_that_contradicts_a_stretch_is_left_out() -> None:
     assert "frames 4 to 7" in found.remarks[0]
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 @pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
 def test_a_knock_on_a_real_drive() -> None:

@@ -77,6 +77,7 @@ def checked(
     return result, error
 
 
+@pytest.mark.slow
 def test_constant_speed() -> None:
     result, _ = checked(street(motion="constant"))
     (weak,) = result.weak_directions
@@ -101,6 +102,7 @@ def test_one_frame_of_a_vehicle_that_stands_as_its_driver_says() -> None:
     assert (sigmas[3:6] < 0.1).all() and sigmas[6] > 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
 def test_one_object(seed: int) -> None:
     """With so little in view that explains little the pose may be wrong altogether, and that is said, too."""
@@ -115,6 +117,7 @@ def test_one_object(seed: int) -> None:
     assert np.degrees(sigmas[0]) > 0.3 and (sigmas[4:6] > 0.02).all()  # roll, left, up
 
 
+@pytest.mark.slow
 def test_all_vehicles_on_one_side() -> None:
     """Roll, and what is sideways or up, are what the other side would tell."""
 

@@ -41,6 +41,7 @@ def unlabelled() -> KeptDrive:
     return labelled().with_images(no_mask).with_scans(no_classes)
 
 
+@pytest.mark.slow
 def test_auto_takes_labels_where_both_sensors_have_some() -> None:
     config = CalibrationConfig()
     assert config.method == "auto"
@@ -61,6 +62,7 @@ def result():  # type: ignore[no-untyped-def]
     return calibrate(unlabelled(), unlabelled().truth.cTl.retract(AWAY))  # type: ignore[union-attr]
 
 
+@pytest.mark.slow
 def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def]
     truth = unlabelled().truth
     assert truth is not None
@@ -72,6 +74,7 @@ def test_a_street_without_labels(result) -> None:  # type: ignore[no-untyped-def
     assert errors.nees is not None and errors.nees.joint < 3.0 * 7
 
 
+@pytest.mark.slow
 def test_labels_hardly_matter(result) -> None:  # type: ignore[no-untyped-def]
     """By edges; masks still keep the features of vehicles out of visual odometry."""
     truth = labelled().truth
@@ -81,6 +84,7 @@ def test_labels_hardly_matter(result) -> None:  # type: ignore[no-untyped-def]
     assert np.degrees(np.linalg.norm(step[:3])) < 0.05 and np.linalg.norm(step[3:]) < 0.01
 
 
+@pytest.mark.slow
 def test_pictures_of_another_street_are_refused() -> None:
     other = simulated(dataclasses.replace(STREET, seed=77))
     pictures = [frame.image.pixels for frame in other if frame.image is not None]
@@ -103,6 +107,7 @@ def test_without_a_guess_and_without_motion_nothing_is_claimed() -> None:
     assert "a start is needed" in result.reasons[0]
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 @pytest.mark.skipif(not DATA.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(

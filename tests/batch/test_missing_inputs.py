@@ -13,6 +13,7 @@ from sst_graph.cli import main
 from sst_graph.simulator import simulate, write_drive
 
 
+@pytest.mark.slow
 def test_a_drive_with_gaps_is_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_drive(simulate(STREET), tmp_path / "street")
     (folder / "semantic_2/000001.png").unlink()

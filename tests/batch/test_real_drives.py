@@ -14,6 +14,7 @@ DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 STOP, PARKED = DATA / "kitti_2011_09_26_stop", DATA / "kitti_2011_09_26_parked"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(("shift", "statuses"), [(0, ("ok",)), (3, ("not_converged", "unobservable"))])
 def test_a_slow_drive_with_a_stop(shift: int, statuses: tuple[str, ...]) -> None:
@@ -28,6 +29,7 @@ def test_a_slow_drive_with_a_stop(shift: int, statuses: tuple[str, ...]) -> None
     assert errors.time_offset_s is not None and abs(errors.time_offset_s) < 0.015
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize(("use_motion", "status"), [("auto", "unobservable"), ("always", "ok")])
 def test_a_steady_drive(use_motion: str, status: str) -> None:

@@ -131,6 +131,7 @@ def of_folders(opened: Counter[str], *folders: str) -> dict[str, int]:
     return {name: count for name, count in opened.items() if Path(name).parent.name in folders}
 
 
+@pytest.mark.slow
 def test_each_file_is_read_once(street: Path) -> None:
     """Scans that the sweep is decided by, too; masks that tell the encoding were read when it was opened.
 

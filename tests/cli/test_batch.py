@@ -40,6 +40,7 @@ def results(out: Path) -> dict[str, bytes]:
     return {str(one.relative_to(out)): one.read_bytes() for one in out.rglob("*") if one.is_file()}
 
 
+@pytest.mark.slow
 def test_a_bad_file_costs_that_drive_alone(
     drives: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -120,7 +121,12 @@ def test_killed_drives_are_tried_again_and_a_killed_batch_goes_on(drives: Path, 
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() and _is_alive(pid) for pid in orphans))
     assert not (out / "summary.csv").exists()
     # 3. Ctrl-C: it ends with a line, and no process stays
-    batch = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    batch = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     wait_for(lambda: running(batch.pid))
     orphans = running(batch.pid)
     batch.send_signal(signal.SIGINT)

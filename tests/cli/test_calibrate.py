@@ -46,6 +46,7 @@ def _strict_json(path: Path) -> Any:
     return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in {path.name}"))
 
 
+@pytest.mark.slow
 def test_from_disk_to_a_calibration(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "result"
     code = _calibrate(street, out, "--set", "observability.time_offset_s=0.05")

@@ -54,14 +54,17 @@ def _holds(row: Row) -> None:
     assert row.runs and row.failures == []
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_nothing_or_all(bench: Bench) -> None:
     _holds(kill(bench, COMMANDS["simulate"], [0.6, 0.9, 1.0]))
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_the_old_or_the_new(bench: Bench) -> None:
     _holds(kill_overwriting(bench, COMMANDS["export"], [0.8, 0.95, 1.0]))
 
 
+@pytest.mark.slow
 def test_a_killed_tracker_resumes_to_the_same_bytes(bench: Bench) -> None:
     row = resume(bench, COMMANDS["track"], [0.8, 3.0])  # near the end; the second has finished
     _holds(row)
@@ -100,6 +103,7 @@ def test_a_signal_after_the_work_changes_nothing() -> None:
     assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["export", "calibrate"])
 def test_a_full_disk_is_named_and_leaves_nothing(bench: Bench, command: str) -> None:
     row = full_disk(bench, COMMANDS[command], [200])
@@ -112,10 +116,12 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(bench: Bench,
     _holds(read_only(bench, COMMANDS[command]))
 
 
+@pytest.mark.slow
 def test_broken_streams(bench: Bench) -> None:
     _holds(streams(bench, COMMANDS["evaluate"]))
 
 
+@pytest.mark.slow
 def test_a_full_stdout_does_not_change_what_a_calibration_is_worth(bench: Bench) -> None:
     for unbuffered in ("", "1"):
         desk = bench.desk()
@@ -148,6 +154,7 @@ def test_of_two_writers_one_is_refused(bench: Bench) -> None:
     _holds(two_writers(bench, COMMANDS["simulate"], 1))
 
 
+@pytest.mark.slow
 def test_same_input_same_bytes_with_one_thread_and_two(bench: Bench) -> None:
     digests = []
     for threads, seed in (("1", "1"), ("2", "2")):

@@ -95,6 +95,7 @@ def shown_in(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir() if not path.name.startswith(".")}
 
 
+@pytest.mark.slow
 def test_plots(tmp_path: Path, result: CalibrationResult, capsys: pytest.CaptureFixture[str]) -> None:
     plots = tmp_path / "plots"
     assert main(["inspect", written(tmp_path, result), "--plots", str(plots)]) == 0

@@ -72,6 +72,7 @@ def test_nothing_is_said_in_a_process_of_others(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_a_terminal_has_a_bar_and_quiet_has_none(tmp_path: Path) -> None:
     for options, has_bar in (([], True), (["-q"], False)):
         main_end, process_end = pty.openpty()

@@ -22,6 +22,7 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rig"
     options = ["--camera", "image_2", "image_3", "--rig", "dataset", "--one-trigger"]

@@ -50,6 +50,7 @@ def _lines(text: str) -> list[dict[str, Any]]:
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
+@pytest.mark.slow
 def test_one_line_a_frame(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "calibration.json"
     code = main(["track", str(street), *SOON, "--out", str(out)])
@@ -88,6 +89,7 @@ def test_a_parameter_is_estimated(street: Path, tmp_path: Path, capsys: pytest.C
     assert "'k3'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_killed_and_resumed(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """SIGKILL at some frame after a checkpoint; what is resumed does what an unbroken run does."""
     whole, rest, checkpoint = tmp_path / "whole.json", tmp_path / "rest.json", tmp_path / "tracker.npz"
@@ -175,6 +177,7 @@ def test_resumed_on_another_drive(
         assert captured.out == "" and "another drive (another scan of" in captured.err
 
 
+@pytest.mark.slow
 def test_resumed_without_options_or_with_the_same(
     street: Path, saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

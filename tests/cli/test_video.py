@@ -50,6 +50,7 @@ def _read(path: Path) -> tuple[list[NDArray[np.uint8]], float]:
     return pictures, video.get(cv2.CAP_PROP_FPS)
 
 
+@pytest.mark.slow
 def test_the_video_has_the_picture_of_each_frame(
     street: Path, result: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

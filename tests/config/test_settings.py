@@ -243,6 +243,7 @@ def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, m
         with_overrides(CalibrationConfig(), [setting])
 
 
+@pytest.mark.slow
 def test_the_bounds_of_some_settings_end_in_a_result_or_a_typed_error() -> None:
     """A sample of what ``benchmarks/settings_walk.py`` goes through."""
     quick = [case for case in cases() if not case.settings[-1].startswith("search.")]

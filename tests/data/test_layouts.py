@@ -54,6 +54,7 @@ def test_a_folder_brings_the_frames_of_kitti_odometry(kitti_drive: Path, tmp_pat
     assert_same_drive(source, open_source(kitti_drive))
 
 
+@pytest.mark.slow
 def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
     folder = as_folder(written(CROWDED_STREET) / "sequences" / "00", tmp_path / "street")
     plain = open_source(folder)
@@ -68,6 +69,7 @@ def test_a_folder_of_a_lens_that_distorts_is_rectified(tmp_path: Path) -> None:
         assert found.image.mask.shape == (drive.camera.height, drive.camera.width)
 
 
+@pytest.mark.slow
 def test_motion_needs_neither_labels_nor_tr(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """KITTI odometry with clouds, pictures, stamps and intrinsics alone."""
     street = written(CROWDED_STREET) / "sequences" / "00"
@@ -138,6 +140,7 @@ def test_nuscenes_brings_the_points_and_pictures_of_kitti_odometry(kitti_drive: 
     assert source.camera == wanted.camera
 
 
+@pytest.mark.slow
 def test_every_layout_gives_the_same_calibration(tmp_path: Path) -> None:
     """Raw stamps count from 1970: nine digits more than those of the odometry layout."""
     odometry = written(CROWDED_STREET) / "sequences" / "00"

@@ -75,6 +75,7 @@ LAYOUTS: dict[str, Callable[[Path, Path], Path]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_the_calibration_does_not_depend_on_the_layout(
     layout: str, odometry: Path, wanted: CalibrationResult, tmp_path: Path
@@ -84,6 +85,7 @@ def test_the_calibration_does_not_depend_on_the_layout(
     assert_same(calibrate(source, source.nominal), wanted)
 
 
+@pytest.mark.slow
 def test_motion_from_nuscenes_is_that_from_kitti(odometry: Path, tmp_path: Path) -> None:
     """nuScenes has no masks of images, so neither side has labels here."""
     bare = beginning(odometry, tmp_path / "bare", ("velodyne", "image_2"))

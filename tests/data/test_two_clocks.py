@@ -141,6 +141,7 @@ def errors(result: CalibrationResult, drive: SimulatedDrive) -> tuple[float, flo
     return float(np.degrees(np.linalg.norm(step[:3]))), float(np.linalg.norm(step[3:])), abs(time_offset_s)
 
 
+@pytest.mark.slow
 def test_a_camera_of_30_hz_with_a_lidar_of_10_hz() -> None:
     drive = simulated(FAST_STREET)
     result = calibrate(street(drive), drive.nominal)

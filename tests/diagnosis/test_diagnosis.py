@@ -154,11 +154,13 @@ def test_single_stamps_that_are_off_are_no_second_clock() -> None:
     assert two_clocks(replace(prepared(), images=images)) is None
 
 
+@pytest.mark.slow
 def test_masks_of_another_size_are_refused() -> None:
     with pytest.raises(DataError, match="a mask of 310x94 px, expected 621x188 px"):
         causes(INPUT_FAULTS["half-size masks"](drive(), other()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["Tr inverted", "y flipped"])
 def test_what_would_make_the_labels_agree_names_the_cause(fault: str) -> None:
     wrong = INPUT_FAULTS[fault](drive(), other())
@@ -182,6 +184,7 @@ def test_the_best_change_is_named_and_not_the_first_that_fits() -> None:
     assert found is not None and NAMED["half the focal length"] in found.cause
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["masks of another drive", "clouds in camera axes"])
 def test_checks_that_run_only_where_a_result_is_not_ok(fault: str) -> None:
     """Neither is certain by itself: masks may be coarse, and a scanner may be mounted on its side."""

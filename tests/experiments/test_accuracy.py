@@ -83,6 +83,7 @@ def test_starts_are_within_their_limits() -> None:
     assert 20.0 < max(turns) <= 20.0 * np.sqrt(3.0)
 
 
+@pytest.mark.slow
 def test_one_small_run() -> None:
     search = dataclasses.replace(CalibrationConfig().search, enabled=False)
     config = AccuracyConfig(

@@ -58,6 +58,7 @@ def test_the_offset_of_a_drive_at_standstill_is_left_out() -> None:
     assert [float(cell) for cell in cells[3:7]] == pytest.approx([1.0] * 4) and cells[7].count("%") == 3
 
 
+@pytest.mark.slow
 def test_a_small_run() -> None:
     drive = {"motion": "standing", "frames": 2, "time_offset_s": 0.0, "width": 621, "height": 188}
     small = {"standing": ("tiny", {**drive, "azimuth_step_deg": 0.35})}

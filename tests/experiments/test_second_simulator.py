@@ -28,6 +28,7 @@ def test_points_and_masks_agree() -> None:
         assert np.mean(found[expected == label] == label) > 0.98
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("street", "away"),
     [

@@ -37,6 +37,7 @@ def test_the_table_holds_medians_and_counts_the_better() -> None:
     assert lines[6] == "| fog | both better | " + " | ".join(["2 of 3"] * 6) + " |"
 
 
+@pytest.mark.slow
 def test_a_small_street() -> None:
     config = dataclasses.replace(
         SlamConfig(),

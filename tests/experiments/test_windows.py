@@ -83,6 +83,7 @@ def test_a_row_for_each_number_of_windows(tmp_path: Path) -> None:
     assert all(0.0 < float(error) < 2.0 for error in cells[6].split(", ")[:1])
 
 
+@pytest.mark.slow
 def test_several_drives_have_rows_of_their_own_and_one_together(tmp_path: Path) -> None:
     folders = []
     for motion in ("no_stop", "mixed"):

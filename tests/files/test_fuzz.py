@@ -21,6 +21,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_no_mutated_input_brings_anything_down(inputs: Path) -> None:
     kinds = [kind for kind, (_, weight) in fuzz.KINDS.items() if weight]
     cases = list(fuzz.cases(inputs, fuzz.Trials(SEED), fuzz.plan(SEED, COUNT, kinds)))

@@ -104,6 +104,7 @@ def test_without_noise_all_seven_come_back(guess: gtsam.Pose3 | None) -> None:
     assert np.abs(error[3:6]).max() < 0.1 and abs(error[6]) < 1e-3
 
 
+@pytest.mark.slow
 def test_covariance_fits_the_errors() -> None:
     """NEES of rotation and offset over drives whose noise is as modelled."""
     config = 0.06
@@ -116,6 +117,7 @@ def test_covariance_fits_the_errors() -> None:
     assert max(nees) < 20.0
 
 
+@pytest.mark.slow
 def test_few_pairs_do_not_widen_the_covariance_without_need() -> None:
     """Twelve frames have eleven pairs, but 55 residuals: few clusters are not few residuals."""
     nees, some = [], [0, 1, 2, 6]
@@ -158,6 +160,7 @@ def test_too_few_frames() -> None:
     assert result.T_camera_lidar.equals(off(3.0), 1e-12)
 
 
+@pytest.mark.slow
 def test_two_drives_are_better_than_one() -> None:
     one, two = made_drive(weaving, seed=1), made_drive(weaving, seed=2)
     alone, both = (solve_motion(drives, TRUE, 0.1)[0] for drives in ([one], [one, two]))
@@ -244,6 +247,7 @@ def street() -> Path:
     return written(config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", ["dataset", "none"])
 def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None:
     out = tmp_path / "result"
@@ -259,6 +263,7 @@ def test_from_the_command_line(street: Path, tmp_path: Path, start: str) -> None
     assert len(result.frames_used) >= 12 and "method joint" in " ".join(result.reasons)
 
 
+@pytest.mark.slow
 def test_the_joint_method_hears_the_motion(street: Path) -> None:
     source = open_source(street, frames="0:12")
     # Labels that determine the offset to 11 ms, not to 3: the motion alone determines it to 32 ms.

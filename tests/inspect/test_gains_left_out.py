@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
+import pytest
 from scipy.stats import spearmanr
 from stored import simulated
 
@@ -26,6 +27,7 @@ def bits(without: np.ndarray, full: np.ndarray) -> float:
     return float(0.5 * (np.linalg.slogdet(without)[1] - np.linalg.slogdet(full)[1]) / np.log(2.0))
 
 
+@pytest.mark.slow
 def test_bits_and_sigmas_agree_with_leaving_the_frame_out() -> None:
     source = simulated(
         SimulationConfig(

@@ -55,6 +55,7 @@ def scans_of(source: Source) -> list[Scan]:
     return [frame.scan for frame in source if frame.scan is not None]
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 def test_visual_speed_and_standing_frames_of_the_stop_drive() -> None:
     folder = drive(STOP)

@@ -197,6 +197,7 @@ def test_the_sweep_of_a_hall(
         assert abs((turned + 180.0) % 360.0 - 180.0) <= 10.0
 
 
+@pytest.mark.slow
 def test_the_start_of_a_fast_turn_is_found() -> None:
     """2 m in a turn: points between a wrong start and the right one are off by as much, and match nothing."""
     found = decide_sweep(_hall(20.0, 1.0, -100.0), 14)
@@ -255,6 +256,7 @@ def test_groups_of_matches_add_up_to_the_registration() -> None:
     assert 0.008 < np.sqrt(window.errors.own) < 0.03 and np.sqrt(window.errors.shared) < 0.01
 
 
+@pytest.mark.slow
 def test_nothing_is_decided_without_evidence() -> None:
     still = decide_sweep(_hall(0.0, -1.0, 180.0), 14)
     assert still.kind == "standstill" and still.timing.instant
@@ -270,6 +272,7 @@ def test_nothing_is_decided_without_evidence() -> None:
 # --- streets ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("output", "sense", "kind"),
     [
@@ -283,6 +286,7 @@ def test_the_sweep_of_a_street(output: Any, sense: Any, kind: str) -> None:
     assert found.kind == kind, found.sentence
 
 
+@pytest.mark.slow
 def test_a_source_is_read_once_and_its_own_times_are_kept() -> None:
     class Counting:
         name, camera, nominal, truth = "hall", None, None, None

@@ -111,6 +111,7 @@ def test_the_images_of_a_further_camera_are_read_and_not_its_scans() -> None:
     assert right.statistics is not None and len(right.statistics.images) == 6
 
 
+@pytest.mark.slow
 def test_each_camera_is_as_good_as_alone() -> None:
     """Without anything known, the calibration of a camera is that of the camera by itself."""
     result = solved()
@@ -162,6 +163,7 @@ def test_a_known_pose_improves_the_weaker_camera() -> None:
         assert own @ np.linalg.solve(after.of_camera(NAMES[k]), own) < 24.4  # 99.9 % of 7
 
 
+@pytest.mark.slow
 def test_a_wrong_known_pose_is_named() -> None:
     """Left and right mixed up: the estimates stay what they are, and nothing is ok."""
     wrong = KnownRig((KnownPose("right", "left", _true_pose().inverse()),))
@@ -174,6 +176,7 @@ def test_a_wrong_known_pose_is_named() -> None:
     assert not result.diagnostics["known_poses"][0]["used"]
 
 
+@pytest.mark.slow
 def test_a_camera_without_masks_has_its_pose_from_the_other() -> None:
     """It has no estimate of its own; the known pose and the common trigger give it one, and ok."""
     blind = [replace(drives()["right"][0], images=_without_masks())]
@@ -197,6 +200,7 @@ def _without_masks():
     )
 
 
+@pytest.mark.slow
 def test_a_start_beyond_the_search_is_found_by_the_other_camera() -> None:
     """The guess of the right camera is 60 deg off: solved again from where the known pose puts it."""
     turned = gtsam.Pose3(gtsam.Rot3.Ry(np.radians(60.0)), np.zeros(3))

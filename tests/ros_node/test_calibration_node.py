@@ -106,6 +106,7 @@ def _diagnostics(node: CalibrationNode, now_ns: int) -> dict[str, Any]:
     return {one.name.removeprefix("sst_graph: "): one for one in array.status}
 
 
+@pytest.mark.slow
 def test_it_ends_where_track_ends(
     bag: Any, plain: list[Published], capsys: pytest.CaptureFixture[str]
 ) -> None:

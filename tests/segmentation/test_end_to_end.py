@@ -63,6 +63,7 @@ def overlap(found: np.ndarray, exact: np.ndarray) -> float:
     return float((a & b).sum() / (a | b).sum())
 
 
+@pytest.mark.slow
 def test_networks_find_the_vehicles_of_a_street_they_do_not_know(networks: Path) -> None:
     frame: Frame = open_source(written(STREET))[5]
     assert frame.image is not None
@@ -73,6 +74,7 @@ def test_networks_find_the_vehicles_of_a_street_they_do_not_know(networks: Path)
     assert overlap(classes, frame.scan.classes) > 0.8
 
 
+@pytest.mark.slow
 def test_a_drive_without_labels_is_calibrated_by_networks(
     networks: Path,
     unlabelled: Path,

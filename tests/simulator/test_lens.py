@@ -82,6 +82,7 @@ def test_a_rectified_street_is_the_pinholes(name: str) -> None:
     assert (ours == SemanticClass.VEHICLE).sum() == pytest.approx(inside.sum(), rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most_deg"), [("barrel", 0.3), ("fisheye", 0.5)])
 def test_a_street_through_a_lens_calibrates(name: str, most_deg: float) -> None:
     """From 1.5 degrees and 5 cm off, half the usual size: a pixel of the fisheye is 0.3 degrees wide."""

@@ -179,6 +179,7 @@ def solution(steady: Street) -> RematchSolution:
     return solve_with_terms(*steady.whole(steady.start(1)), terms)
 
 
+@pytest.mark.slow
 def test_forward_against_time_offset_is_weak(steady: Street, solution: RematchSolution) -> None:
     weak = [w for w in solution.warnings if w.kind is WarningKind.WEAK_DIRECTION]
     assert len(weak) == 1 and weak[0].value > 2.0 and weak[0].limit == 1.0

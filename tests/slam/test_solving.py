@@ -53,6 +53,7 @@ def solver_of(kind: str, lag_s: float) -> Solver:
 # --- Levenberg-Marquardt
 
 
+@pytest.mark.slow
 def test_levenberg_marquardt_comes_to_the_truth(street: Street, solution: RematchSolution) -> None:
     rotation_deg, translation_m, time_offset_s = street.errors(solution.values)
     assert solution.converged
@@ -259,6 +260,7 @@ def stop() -> Street:
     return real(STOP)
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 @pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize("kind", ["lm", "isam2", "smoother"])
@@ -278,6 +280,7 @@ def test_a_real_drive(stop: Street, kind: str) -> None:
     assert (sigmas[:3] < np.radians(0.5)).all() and (sigmas[3:6] < 0.05).all() and sigmas[6] < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.drives
 @pytest.mark.skipif(not PARKED.is_dir(), reason="no ../shared")
 @pytest.mark.parametrize("with_bias", [False, True])

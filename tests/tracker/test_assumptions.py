@@ -104,6 +104,7 @@ def _state(tracker: Tracker) -> State:
     return dataclasses.replace(state, object_biases_px={**state.object_biases_px, **biases})
 
 
+@pytest.mark.slow
 def test_what_the_tracker_considers_is_what_the_batch_does(optimized: Tracker) -> None:
     """The batch's function on the window's own matches, at the tracker's state."""
     assert optimized.estimate.smoother is not None
@@ -241,6 +242,7 @@ def test_a_wrong_principal_point_is_named(street: KeptDrive) -> None:
     assert np.all(current_update(tracker).sigmas < update.sigmas)
 
 
+@pytest.mark.slow
 def test_what_is_estimated_agrees_with_the_batch(
     street: KeptDrive, distorted: KeptDrive, optimized: Tracker, estimating: Tracker
 ) -> None:

@@ -129,6 +129,7 @@ def _whole(scan: Scan) -> Scan:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 @pytest.mark.parametrize("seed", range(2))
 def test_nothing_that_a_frame_brings_raises(running: Path, frames: list[Frame], seed: int) -> None:
@@ -251,6 +252,7 @@ def _later(scan: Scan | None, by_ns: int) -> Scan:
     return dataclasses.replace(scan, stamp_ns=scan.stamp_ns + by_ns)
 
 
+@pytest.mark.slow
 def test_a_scan_that_cannot_be_estimated_with_is_taken_back(running: Path, frames: list[Frame]) -> None:
     """Cars of a hair's breadth, on which every distance is the same: whatever stage fails, all is as it was.
 

@@ -22,6 +22,7 @@ from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_object", [True, False])
 def test_the_tracker_ends_where_the_batch_does(by_object: bool) -> None:
     """With a mask bias for each object and moving cars left out, and with one bias a class."""

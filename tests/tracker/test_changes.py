@@ -35,6 +35,7 @@ def _warmed_up(tracker: Tracker) -> Tracker:
     return tracker
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["knock", "clock"])
 def test_a_step_raises_the_alarm_and_is_estimated(
     street: SimulatedDrive, frames: list[Frame], kind: str
@@ -277,6 +278,7 @@ def test_a_suspected_change_that_is_given_up_is_no_confirmation(
     assert update.status == "unconfirmed"
 
 
+@pytest.mark.slow
 def test_drift_mode_keeps_the_history(street: SimulatedDrive, frames: list[Frame]) -> None:
     drift = DriftConfig(enabled=True)
     tracker = tracker_from_truth(street, dataclasses.replace(EARLY_START, window=10, drift=drift))
@@ -293,6 +295,7 @@ def test_drift_mode_keeps_the_history(street: SimulatedDrive, frames: list[Frame
     assert np.diag(tracker.estimate.covariance)[:7].sum() > np.diag(steady.estimate.covariance)[:7].sum()
 
 
+@pytest.mark.slow
 def test_a_slow_drift_is_followed(street: SimulatedDrive, frames: list[Frame]) -> None:
     """The camera yaws by 0.25 deg/s: the history follows within its sigmas, one calibration cannot."""
     drift = DriftConfig(enabled=True, rotation_deg=0.2)

@@ -35,6 +35,7 @@ def _size(tracker: Tracker) -> int:
     return len(str(node)) + len(data)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", ["images", "scans", "both", "scans die", "images die"])
 def test_what_is_kept_is_bounded(sensors: str) -> None:
     tracker = Tracker(CAMERA, TrackerConfig())

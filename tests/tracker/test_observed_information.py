@@ -40,6 +40,7 @@ def tracker() -> Tracker:
     return tracker
 
 
+@pytest.mark.slow
 def test_the_observed_information_predicts_the_gradient_elsewhere(tracker: Tracker) -> None:
     """The same matches, biases moved by 0.4 px: the gradient is nearer to the one by the curvatures."""
     assert tracker.estimate.smoother is not None

@@ -40,6 +40,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Frame]]:
     return path, [street[k] for k in range(seen, len(street))]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_keeps_the_relinearization(begun: tuple[Path, list[Frame]]) -> None:
     tracker = Tracker.load(begun[0])
     assert tracker.estimate.relinearization is not None and tracker.inputs.window.growing

@@ -25,6 +25,7 @@ def spread_over(street: SimulatedDrive, work_per_frame: int | None) -> Tracker:
     return tracker
 
 
+@pytest.mark.slow
 def test_the_estimate_comes_some_frames_later_and_is_the_same(
     street: SimulatedDrive, frames: list[Frame]
 ) -> None:
@@ -41,6 +42,7 @@ def test_the_estimate_comes_some_frames_later_and_is_the_same(
     assert sigmas_apart(at_once, spread.estimate.point.cTl, spread.estimate.point.time_offset_s) < 0.3
 
 
+@pytest.mark.slow
 def test_stored_and_rolled_back_on_the_way(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:

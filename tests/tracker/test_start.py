@@ -36,6 +36,7 @@ def test_a_better_pose_that_has_not_converged_prevents_a_start(
         solution._check_not_converged(_solved(0.0, 3.0), [EstimationError("no match"), reached])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PARKED.exists(), reason="no real drives here")
 def test_a_real_drive_three_images_off_starts_in_the_right_basin() -> None:
     """At 11 m/s, the guessed time offset 310 ms off: from 12 frames alone it would be 6 degrees off."""

@@ -45,6 +45,7 @@ def test_from_the_first_frame_to_the_truth(street: SimulatedDrive, frames: list[
     )  # chi-square of 7: 24
 
 
+@pytest.mark.slow
 def test_the_covariance_is_the_batch_s(running: Path) -> None:
     """Of the same matches: those towards the ground included, where the tracker makes any."""
     tracker = Tracker.load(running)
@@ -168,6 +169,7 @@ def test_an_update_that_fails_changes_nothing(running: Path, frames: list[Frame]
     assert tracker.add(frames[20]).accepted
 
 
+@pytest.mark.slow
 def test_a_checkpoint_resumes_to_the_same_estimates(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:
@@ -195,6 +197,7 @@ def test_a_checkpoint_resumes_to_the_same_estimates(
     )
 
 
+@pytest.mark.slow
 def test_saving_hardly_moves_what_follows(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:

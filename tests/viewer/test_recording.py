@@ -137,6 +137,7 @@ def test_a_frame_that_cannot_be_used_is_passed_over(
     assert "frame 1 is not shown" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_tracker_is_logged_and_not_changed(
     street: SimulatedDrive, frames: list[Frame], tmp_path: Path
 ) -> None:

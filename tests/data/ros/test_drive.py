@@ -75,6 +75,7 @@ def assert_same_frames(source: TwoClockSource, drive: KittiSource) -> None:
         np.testing.assert_array_equal(found.image.mask, true.image.mask)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_frames_of_each_kind_of_bag(kind: Kind, bags: dict[Kind, Path], drive: KittiSource) -> None:
     source = opened(bags[kind])
@@ -109,6 +110,7 @@ def test_frames_in_any_order_and_slices(kind: Kind, bags: dict[Kind, Path], driv
     assert pickle.loads(pickle.dumps(part))[2] == source[6]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_calibration_from_the_bag_is_that_of_the_drive(
     kind: Kind, bags: dict[Kind, Path], drive: KittiSource
@@ -121,6 +123,7 @@ def test_calibration_from_the_bag_is_that_of_the_drive(
     np.testing.assert_allclose(from_bag.covariance, from_drive.covariance, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_images_stamped_later_change_the_time_offset_alone(drive: KittiSource, tmp_path: Path) -> None:
     source = opened(bag_of(drive, tmp_path / "later", image_later_ns=40_000_000))
     assert len(source) == 2 * len(drive)
@@ -154,6 +157,7 @@ def test_without_masks_nothing_is_labelled_and_motion_is_estimated(
         assert found.aTb.equals(true.aTb, 0.02)
 
 
+@pytest.mark.slow
 def test_the_sweep_is_decided_by_scans_between_images(tmp_path: Path) -> None:
     street = written(
         SimulationConfig(
