@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sst_graph.data.arrays import read_labels
 from sst_graph.data.images import read_mask
 from sst_graph.data.kitti.odometry import KittiSource
+from sst_graph.data.ros.messages import BagWriter, MessageMaker
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.types import Scan
 
@@ -30,45 +30,17 @@ EPOCH_NS = 1_700_000_000_000_000_000
 IMAGE, CLOUD, INFO, MASK = "/front/image_rect", "/lidar/points", "/front/camera_info", "/front/mask"
 CAMERA_FRAME, LIDAR_FRAME = "front_optical", "lidar"
 
-_POINT_TYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-_TF = "tf2_msgs/msg/TFMessage"
 
-
-class Messages:
-    """Messages of ROS 1 or 2."""
-
-    def __init__(self, ros1: bool = False) -> None:
-        self.ros1 = ros1
-        self.types = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-        if ros1:
-            self.types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", _TF))
-
-    def make(self, name: str, /, **fields: Any) -> Any:
-        return self.types.types[name](**fields)
-
-    def header(self, stamp_ns: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        time = self.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        number = {"seq": 0} if self.ros1 else {}
-        return self.make("std_msgs/msg/Header", stamp=time, frame_id=frame, **number)
+class Messages(MessageMaker):
+    """Messages of one camera and one LiDAR."""
 
     def image(
         self, stamp_ns: int, pixels: NDArray[np.uint8], encoding: str = "bgr8", padding: int = 0
     ) -> Any:
-        """pixels: (h, w) or (h, w, channels); padding: bytes behind each row."""
-        height, width = pixels.shape[:2]
-        rows = pixels.reshape(height, -1)
-        padded = np.concatenate([rows, np.full((height, padding), 77, np.uint8)], axis=1)
-        return self.make(
-            "sensor_msgs/msg/Image",
-            header=self.header(stamp_ns, CAMERA_FRAME),
-            height=height,
-            width=width,
-            encoding=encoding,
-            is_bigendian=0,
-            step=padded.shape[1],
-            data=padded.ravel(),
-        )
+        """padding: bytes behind each row."""
+        message = super().image(self.header(stamp_ns, CAMERA_FRAME), pixels, encoding)
+        rows = np.pad(message.data.reshape(message.height, -1), [(0, 0), (0, padding)], constant_values=77)
+        return dataclasses.replace(message, step=rows.shape[1], data=rows.ravel())
 
     def compressed(self, stamp_ns: int, data: bytes, form: str = "png") -> Any:
         header = self.header(stamp_ns, CAMERA_FRAME)
@@ -76,85 +48,15 @@ class Messages:
         return self.make("sensor_msgs/msg/CompressedImage", header=header, format=form, data=bytes_)
 
     def cloud(self, stamp_ns: int, table: NDArray[Any], big: bool = False) -> Any:
-        """table: (n,) or (height, width) structured, as its dtype lays it out."""
-        rows = table.reshape(1, -1) if table.ndim == 1 else table
-        fields = [
-            self.make(
-                "sensor_msgs/msg/PointField",
-                name=name,
-                offset=table.dtype.fields[name][1],
-                datatype=_POINT_TYPES[table.dtype[name].str[1:]],
-                count=1,
-            )
-            for name in table.dtype.names
-        ]
-        step = table.dtype.itemsize
-        return self.make(
-            "sensor_msgs/msg/PointCloud2",
-            header=self.header(stamp_ns, LIDAR_FRAME),
-            height=rows.shape[0],
-            width=rows.shape[1],
-            fields=fields,
-            is_bigendian=big,
-            point_step=step,
-            row_step=step * rows.shape[1],
-            data=np.frombuffer(np.ascontiguousarray(rows).tobytes(), np.uint8),
-            is_dense=False,
-        )
+        message = super().cloud(self.header(stamp_ns, LIDAR_FRAME), table)
+        return dataclasses.replace(message, is_bigendian=big)
 
     def info(self, camera: PinholeCamera, stamp_ns: int = EPOCH_NS, **changes: Any) -> Any:
-        P = np.column_stack([camera.matrix, np.zeros(3)])
-        fields = {"D": np.zeros(5), "K": camera.matrix.ravel(), "R": np.eye(3).ravel(), "P": P.ravel()}
-        roi = self.make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        values = {
-            "header": self.header(stamp_ns, CAMERA_FRAME),
-            "height": camera.height,
-            "width": camera.width,
-            "distortion_model": "plumb_bob",
-            "binning_x": 0,
-            "binning_y": 0,
-            "roi": roi,
-            **{name if self.ros1 else name.lower(): value for name, value in fields.items()},
-        }
-        return self.make("sensor_msgs/msg/CameraInfo", **{**values, **changes})
+        message = self.camera_info(self.header(stamp_ns, CAMERA_FRAME), camera)
+        return dataclasses.replace(message, **changes)
 
-    def transforms(self, poses: Mapping[tuple[str, str], gtsam.Pose3]) -> Any:
-        """poses: of the child in the parent, by (parent, child)."""
-        return self.make(_TF, transforms=[self._transform(*edge, pose) for edge, pose in poses.items()])
-
-    def _transform(self, parent: str, child: str, pose: gtsam.Pose3) -> Any:
-        q, t = pose.rotation().toQuaternion(), pose.translation()
-        return self.make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self.header(EPOCH_NS, parent),
-            child_frame_id=child,
-            transform=self.make(
-                "geometry_msgs/msg/Transform",
-                translation=self.make("geometry_msgs/msg/Vector3", x=t[0], y=t[1], z=t[2]),
-                rotation=self.make("geometry_msgs/msg/Quaternion", x=q.x(), y=q.y(), z=q.z(), w=q.w()),
-            ),
-        )
-
-
-@dataclass
-class BagWriter:
-    """A bag that is being written."""
-
-    messages: Messages
-    writer: Any
-    connections: dict[str, Any]
-
-    def add(self, topic: str, message: Any, received_ns: int) -> None:
-        name = message.__msgtype__
-        if topic not in self.connections:
-            self.connections[topic] = self.writer.add_connection(topic, name, typestore=self.messages.types)
-        types = self.messages.types
-        data = (
-            types.serialize_ros1(message, name) if self.messages.ros1 else types.serialize_cdr(message, name)
-        )
-        self.writer.write(self.connections[topic], received_ns, bytes(data))
+    def transforms(self, poses: Mapping[tuple[str, str], gtsam.Pose3], stamp_ns: int = EPOCH_NS) -> Any:
+        return super().transforms(poses, stamp_ns)
 
 
 @contextmanager
@@ -162,11 +64,11 @@ def writing(path: Path, kind: Kind) -> Iterator[BagWriter]:
     """A writer of the bag ``path`` (a file for ros1, else a folder)."""
     if kind == "ros1":
         with Writer1(path) as writer:
-            yield BagWriter(Messages(ros1=True), writer, {})
+            yield BagWriter(Messages(is_ros1=True), writer)
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
         with Writer2(path, version=9, storage_plugin=plugin) as writer:
-            yield BagWriter(Messages(), writer, {})
+            yield BagWriter(Messages(), writer)
 
 
 def table_of(scan: Scan, labels: NDArray[np.uint32]) -> NDArray[Any]:

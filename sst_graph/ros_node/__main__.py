@@ -11,7 +11,7 @@ from typing import Any
 
 from sst_graph.config import with_overrides
 from sst_graph.ros_node.calibration_node import CalibrationNode, image_type
-from sst_graph.ros_node.published import MessageMaker, Published
+from sst_graph.ros_node.published import NodeMessages, Published
 from sst_graph.ros_node.settings import NodeSettings
 from sst_graph.tracker.config import TrackerConfig
 
@@ -32,7 +32,7 @@ def main() -> None:
     values = {name: node.declare_parameter(name, value).value for name, value in defaults.items()}
     overrides = node.declare_parameter("tracker_settings", [""]).value
     config = with_overrides(TrackerConfig(), [one for one in overrides if one])
-    core, make = CalibrationNode(NodeSettings(**values), config), MessageMaker()
+    core, make = CalibrationNode(NodeSettings(**values), config), NodeMessages()
     publishers = {
         "status": node.create_publisher(String, "~/status", 10),
         "transforms": node.create_publisher(TFMessage, "/tf", 100),

@@ -20,7 +20,7 @@ from sst_graph.data.ros.transforms import Transforms
 from sst_graph.data.source import TURNS
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.reference import load_initial
-from sst_graph.ros_node.published import WARN, Diagnosis, MessageMaker, Published, diagnosis_of
+from sst_graph.ros_node.published import WARN, Diagnosis, NodeMessages, Published, diagnosis_of
 from sst_graph.ros_node.sensor import SensorRecord
 from sst_graph.ros_node.settings import INIT_NONE, INIT_TF, NodeSettings
 from sst_graph.ros_node.stamp_queue import StampQueue, Waiting
@@ -63,7 +63,7 @@ class CalibrationNode:
         self.masks = SensorRecord("masks", settings.mask_topic)
         self.tracker: Tracker | None = None
         self.update: TrackUpdate | None = None
-        self._make = MessageMaker()
+        self._make = NodeMessages()
         self._queue = StampQueue(settings.hold_s, settings.queue)
         self._halves: dict[int, dict[str, tuple[Any, str]]] = {}
         self._unpaired = 0
@@ -285,8 +285,8 @@ class CalibrationNode:
         assert self._geometry is not None
         oTl = gtsam.Pose3(self._geometry.cRo, np.zeros(3)).inverse() * cTl
         if self.settings.parent == "lidar":
-            return self._make.transform(oTl.inverse(), lidar, camera, update.stamp_ns)
-        return self._make.transform(oTl, camera, lidar, update.stamp_ns)
+            return self._make.transforms({(lidar, camera): oTl.inverse()}, update.stamp_ns)
+        return self._make.transforms({(camera, lidar): oTl}, update.stamp_ns)
 
 
 def image_type(topic: str) -> str:

@@ -7,9 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
-
-from sst_graph.data.ros.bag import TF_MESSAGE, message_types
+from sst_graph.data.ros.messages import MessageMaker
 from sst_graph.tracker.track_update import TrackUpdate
 
 DIAGNOSTICS, STRING = "diagnostic_msgs/msg/DiagnosticArray", "std_msgs/msg/String"
@@ -45,66 +43,30 @@ class Diagnosis:
     values: Mapping[str, object]
 
 
-class MessageMaker:
-    """Makes messages, and their bytes for ROS 2."""
-
-    def __init__(self) -> None:
-        self._types = message_types()
-
-    def decoded(self, data: bytes, type_name: str) -> Any:
-        """A message from its CDR bytes; raises what rosbags raises."""
-        return self._types.deserialize_cdr(data, type_name)
-
-    def encoded(self, message: Any) -> bytes:
-        """CDR bytes of a message."""
-        return bytes(self._types.serialize_cdr(message, message.__msgtype__))
+class NodeMessages(MessageMaker):
+    """Makes the messages of ROS 2 that the node publishes."""
 
     def status(self, update: TrackUpdate) -> Any:
         """String of an update."""
-        return self._make(STRING, data=json.dumps(update.to_dict(), allow_nan=False))
-
-    def transform(self, pose: gtsam.Pose3, parent: str, child: str, stamp_ns: int) -> Any:
-        """TFMessage with the pose of ``child`` in ``parent``."""
-        q: Any = pose.rotation().toQuaternion()
-        t = pose.translation()
-        transform = self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._make("geometry_msgs/msg/Vector3", x=float(t[0]), y=float(t[1]), z=float(t[2])),
-            rotation=self._make("geometry_msgs/msg/Quaternion", x=q.x(), y=q.y(), z=q.z(), w=q.w()),
-        )
-        stamped = self._make(
-            "geometry_msgs/msg/TransformStamped",
-            header=self._header(stamp_ns, parent),
-            child_frame_id=child,
-            transform=transform,
-        )
-        return self._make(TF_MESSAGE, transforms=[stamped])
+        return self.make(STRING, data=json.dumps(update.to_dict(), allow_nan=False))
 
     def diagnostics(self, found: list[Diagnosis], stamp_ns: int) -> Any:
         """DiagnosticArray; hardware_id is left empty."""
         statuses = [
-            self._make(
+            self.make(
                 "diagnostic_msgs/msg/DiagnosticStatus",
                 level=one.level,
                 name=f"sst_graph: {one.name}",
                 message=one.message,
                 hardware_id="",
                 values=[
-                    self._make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
+                    self.make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value))
                     for key, value in one.values.items()
                 ],
             )
             for one in found
         ]
-        return self._make(DIAGNOSTICS, header=self._header(stamp_ns, ""), status=statuses)
-
-    def _header(self, stamp_ns: int, frame: str) -> Any:
-        seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
-        time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-        return self._make("std_msgs/msg/Header", stamp=time, frame_id=frame)
-
-    def _make(self, type_name: str, **fields: Any) -> Any:
-        return self._types.types[type_name](**fields)
+        return self.make(DIAGNOSTICS, header=self.header(stamp_ns, ""), status=statuses)
 
 
 def diagnosis_of(update: TrackUpdate) -> Diagnosis:

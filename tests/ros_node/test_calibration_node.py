@@ -145,9 +145,9 @@ def test_the_transform_is_the_calibration(bag: Any, config: TrackerConfig, plain
 
 
 def test_what_is_published_can_be_serialized(bag: Any, config: TrackerConfig) -> None:
-    from sst_graph.ros_node.published import MessageMaker
+    from sst_graph.ros_node.published import NodeMessages
 
-    node, make = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config), MessageMaker()
+    node, make = CalibrationNode(dataclasses.replace(SETTINGS, publish="latest"), config), NodeMessages()
     last = _play(node, _messages(bag)[:FEW])[-1]
     for message in (last.status, last.transforms, node.tick(EPOCH_NS).diagnostics):
         again = make.decoded(make.encoded(message), message.__msgtype__)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sst_graph.data.arrays import MAX_COORDINATE_M, MAX_POINTS
 from sst_graph.errors import DataError
 
-_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+POINT_FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy's names of sensor_msgs/PointField datatypes."""
 
 TIME_FIELDS = ("t", "offset_time", "time", "timestamp", "time_stamp")
@@ -77,13 +77,19 @@ def cloud_of(message: Any, stamp_ns: int, place: str, times: bool = True, labels
 
 def _table(message: Any, place: str) -> NDArray[Any]:
     """The points as a table (n,) of named columns."""
-    fields = {field.name: field for field in message.fields if int(field.datatype) in _TYPES and field.name}
+    fields = {
+        field.name: field
+        for field in message.fields
+        if int(field.datatype) in POINT_FIELD_TYPES and field.name
+    }
     if missing := [axis for axis in "xyz" if axis not in fields]:
         found = f"fields {', '.join(fields) or 'none'} without {', '.join(missing)}"
         raise DataError(place, found, "a cloud with x, y, z")
     order, step = ">" if message.is_bigendian else "<", int(message.point_step)
     width, height, row = int(message.width), int(message.height), int(message.row_step)
-    ends = [field.offset + np.dtype(_TYPES[int(field.datatype)]).itemsize for field in fields.values()]
+    ends = [
+        field.offset + np.dtype(POINT_FIELD_TYPES[int(field.datatype)]).itemsize for field in fields.values()
+    ]
     if step < max(ends) or not 0 <= width * height <= MAX_POINTS:
         found = f"{width}x{height} points of {step} bytes"
         raise DataError(place, found, f"at least {max(ends)} bytes a point, at most {MAX_POINTS} points")
@@ -100,7 +106,7 @@ def _table(message: Any, place: str) -> NDArray[Any]:
     table = np.dtype(
         {
             "names": list(fields),
-            "formats": [order + _TYPES[int(field.datatype)] for field in fields.values()],
+            "formats": [order + POINT_FIELD_TYPES[int(field.datatype)] for field in fields.values()],
             "offsets": [int(field.offset) for field in fields.values()],
             "itemsize": step,
         }

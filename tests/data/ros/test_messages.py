@@ -204,7 +204,7 @@ def test_intrinsics_of_raw_and_rectified_images() -> None:
     rectified = image_geometry(info, "/cam/image_rect_color", (640, 360), "here")
     assert rectified.model == BrownConradyCamera(PinholeCamera(650.0, 651.0, 300.0, 170.0, 640, 360))
     assert rectified.cRo.equals(R, 1e-9)
-    ros1 = Messages(ros1=True).info(CAMERA)
+    ros1 = Messages(is_ros1=True).info(CAMERA)
     assert image_geometry(ros1, "/cam/image_raw", (640, 360), "here").model.intrinsics == CAMERA
 
 
