@@ -34,6 +34,24 @@ TRACKED_STREET = SimulationConfig(
 )
 """A drive for the tracker, at half the usual size."""
 
+SHORT_STREET = SimulationConfig(
+    seed=4,
+    frames=20,
+    width=414,
+    height=125,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.35,
+    vehicle_density=0.3,
+    time_offset_s=0.0,
+    rotation_error_deg=0.3,
+    translation_error_m=0.02,
+    motion="no_stop",
+    speed_mps=6.0,
+)
+"""A short drive in small pictures."""
+SOON = ("start_scans=8", "calibration.search.enabled=false")
+"""Settings with which a tracker starts early on it."""
+
 
 @cache
 def standing_street(label_noise: float = 1.0) -> SimulatedDrive:

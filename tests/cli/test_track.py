@@ -16,33 +16,19 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+import streets
 from stored import written
 
 from sst_graph.cli import main
 from sst_graph.result import read_result
-from sst_graph.simulator import SimulationConfig
 
-SOON = ["--set", "start_scans=8", "--set", "calibration.search.enabled=false"]
+SOON = [word for setting in streets.SOON for word in ("--set", setting)]
 
 
 @pytest.fixture(scope="module")
 def street() -> Path:
-    """A short drive on disk whose nominal calibration is the true one, in small pictures."""
-    config = SimulationConfig(
-        seed=4,
-        frames=20,
-        width=414,
-        height=125,
-        azimuth_limit_deg=50.0,
-        azimuth_step_deg=0.35,
-        vehicle_density=0.3,
-        time_offset_s=0.0,
-        rotation_error_deg=0.3,
-        translation_error_m=0.02,
-        motion="no_stop",
-        speed_mps=6.0,
-    )
-    return written(config)
+    """A short drive on disk."""
+    return written(streets.SHORT_STREET)
 
 
 def _lines(text: str) -> list[dict[str, Any]]:

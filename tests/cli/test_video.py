@@ -13,33 +13,10 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from stored import written
-from streets import TRACKED_STREET
 
 from sst_graph.cli import main
-from sst_graph.data import open_source
-from sst_graph.result import CalibrationResult
 
 FRAMES = 6
-
-
-@pytest.fixture(scope="module")
-def street() -> Path:
-    return written(TRACKED_STREET)
-
-
-@pytest.fixture(scope="module")
-def result(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The street's true calibration, started from its nominal one."""
-    source = open_source(street)
-    truth = source.truth
-    assert truth is not None and truth.time_offset_s is not None
-    path = tmp_path_factory.mktemp("result") / "calibration.json"
-    calibration = CalibrationResult(
-        truth.cTl, truth.time_offset_s, 1e-6 * np.eye(7), "ok", source.camera, initial=source.nominal
-    )
-    path.write_text(calibration.to_json())
-    return path
 
 
 def _read(path: Path) -> tuple[list[NDArray[np.uint8]], float]:
@@ -115,7 +92,15 @@ def test_bad_names(
 
 def test_calibrate_writes_one_into_its_folder_or_beside_it(street: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    command = ["calibrate", str(street), "--frames", "0:3", "--set", "search.enabled=false", "--no-report"]
+    command = [
+        "calibrate",
+        str(street),
+        "--frames",
+        "0:3",
+        "--set",
+        "search.enabled=false",
+        "--no-report",
+    ]
     assert main([*command, "--out", str(out), "--video", str(out / "drive.mp4")]) in (0, 3)
     names = json.loads((out / ".sst-graph-manifest.json").read_text())
     assert len(_read(out / "drive.mp4")[0]) == 3 and "drive.mp4" in json.dumps(names)
@@ -147,7 +132,16 @@ def test_without_the_extra_the_message_names_it(street: Path, result: Path, tmp_
     (tmp_path / "imageio_ffmpeg.py").write_text("raise ImportError('not here')")
     path = os.pathsep.join([str(tmp_path), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-m", "sst_graph.cli", "overlay", result, street, "--video", tmp_path / "a.mp4"],
+        [
+            sys.executable,
+            "-m",
+            "sst_graph.cli",
+            "overlay",
+            result,
+            street,
+            "--video",
+            tmp_path / "a.mp4",
+        ],
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,

@@ -7,37 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gtsam
-import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from stored import written
-from streets import TRACKED_STREET
 
 from sst_graph.cli import main
-from sst_graph.data import open_source
-from sst_graph.result import CalibrationResult
 
 FEW = ["--frames", "0:5"]
-
-
-@pytest.fixture(scope="module")
-def street() -> Path:
-    return written(TRACKED_STREET)
-
-
-@pytest.fixture(scope="module")
-def result(street: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The street's true calibration."""
-    source = open_source(street)
-    truth = source.truth
-    assert truth is not None and truth.time_offset_s is not None
-    path = tmp_path_factory.mktemp("result") / "calibration.json"
-    calibration = CalibrationResult(
-        truth.cTl, truth.time_offset_s, 1e-6 * np.eye(7), "ok", source.camera, initial=gtsam.Pose3()
-    )
-    path.write_text(calibration.to_json())
-    return path
 
 
 def _entities(path: Path) -> set[str]:

@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from stored import written
+from streets import SHORT_STREET, SOON
 
 pytest.importorskip("rosbags")
 
@@ -21,29 +22,13 @@ from sst_graph.cli import main
 from sst_graph.data import KittiSource, open_source
 from sst_graph.errors import ConfigError
 from sst_graph.ros_node import CalibrationNode, NodeSettings, Published
-from sst_graph.simulator import SimulationConfig
 from sst_graph.tracker.config import TrackerConfig
 
-STREET = SimulationConfig(
-    seed=4,
-    frames=20,
-    width=414,
-    height=125,
-    azimuth_limit_deg=50.0,
-    azimuth_step_deg=0.35,
-    vehicle_density=0.3,
-    time_offset_s=0.0,
-    rotation_error_deg=0.3,
-    translation_error_m=0.02,
-    motion="no_stop",
-    speed_mps=6.0,
-)
 SETTINGS = NodeSettings(
     image_topic=IMAGE, info_topic=INFO, cloud_topic=CLOUD, mask_topic=MASK, sweep="compensated"
 )
 FEW = 44
 """Messages of the first 14 frames."""
-SOON = ["start_scans=8", "calibration.search.enabled=false"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +41,7 @@ def config() -> TrackerConfig:
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The street as a bag: images are received 25 ms after the clouds of the same stamp."""
-    source = open_source(written(STREET))
+    source = open_source(written(SHORT_STREET))
     assert isinstance(source, KittiSource)
     return bag_of(source, tmp_path_factory.mktemp("bag") / "mcap")
 
