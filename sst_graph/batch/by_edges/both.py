@@ -17,6 +17,7 @@ from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
 from sst_graph.batch.total_covariance import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
+from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
 
 ByLabels = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
 
@@ -132,6 +133,8 @@ def _of_both(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
         static = Fused.of(replace(labels, covariance=labels.by_static_objects), edges).covariance
     sweeps = dict.fromkeys((*labels.sweep_reasons, *edges.sweep_reasons))
     shares = np.diag(fused.by_sweeps) / np.diag(fused.covariance)
+    # What a frame brought to the labels' estimate is not what it brought to this one.
+    diagnostics = {name: value for name, value in labels.diagnostics.items() if name != FRAME_INFORMATION}
     facts = {"labels": _facts(labels), "edges": _facts(edges), "chi2_of_7": fused.chi2}
     return replace(
         labels,
@@ -142,7 +145,7 @@ def _of_both(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
         reasons=(*_contradiction(fused), *(sweeps if (shares > MATTERS**2).any() else ())),
         remarks=(*labels.remarks, *edges.remarks),
         by_static_objects=static,
-        diagnostics={**labels.diagnostics, "edges": dict(edges.diagnostics), "both": facts},
+        diagnostics={**diagnostics, "edges": dict(edges.diagnostics), "both": facts},
         solved=None,
     )
 

@@ -17,9 +17,9 @@ from sst_graph.types import SemanticClass, Source
 _LOOKS = 8
 """Most scans and images of a drive that are looked at, spread over it, and as many in succession: labels may
 be in a part of the drive, or in every so many frames."""
-_SOME = 0.25
-"""Share of the frames without labels from which edges are used in them: fewer add less than a tenth to what
-the labels know."""
+_SOME, _FEWEST = 0.25, 4
+"""Edges are used beside labels where so large a share of a drive's frames that are looked at, and so many of
+them, have no labels: edges of few frames know much less than the labels of the others."""
 
 
 def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> CalibrationConfig:
@@ -76,6 +76,11 @@ class _Looks:
         """Whether both sensors have labels."""
         return any(self.scans) and any(self.images)
 
+    def lacks_many(self, classes: frozenset[int]) -> bool:
+        """Whether edges are worth while in the frames without labels."""
+        lacking = 1.0 - self.share(classes)
+        return lacking >= _SOME and lacking * min(len(self.scans), len(self.images)) >= _FEWEST
+
     def share(self, classes: frozenset[int]) -> float:
         """Share of the frames with labels on both sides; 0 where none of the classes is on both."""
         if not classes & frozenset().union(*self.scans) & frozenset().union(*self.images):
@@ -85,12 +90,11 @@ class _Looks:
 
 def _method(looks: Sequence[_Looks], config: CalibrationConfig) -> Method:
     without = [each for each in looks if not each.labelled and each.pictures]
-    aligned = [each.share(frozenset(map(int, config.classes))) for each in looks]
-    if not any(aligned):
+    classes = frozenset(map(int, config.classes))
+    no_labels = not any(each.share(classes) for each in looks)
+    if no_labels or config.time_offset_per_drive or not any(each.pictures for each in looks):
         return "edges" if without else "joint"
-    if config.time_offset_per_drive or not any(each.pictures for each in looks):
-        return "edges" if without else "joint"
-    return "both" if without or 1.0 - min(aligned) >= _SOME else "joint"
+    return "both" if without or any(each.lacks_many(classes) for each in looks) else "joint"
 
 
 def _classes(labels: np.ndarray) -> frozenset[int]:
