@@ -275,6 +275,9 @@ def test_frames_with_pictures_of_another_street_are_left_out() -> None:
     drive = replace(drive, frames=tuple(frames))
     assert drive.truth is not None
     result = calibrate(drive, drive.truth.cTl.retract(AWAY))
-    assert result.status == "ok"
+    # Labels in eight frames, by themselves: not wrong, if less sure.
+    assert result.status != "not_converged"
+    errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
+    assert errors.nees is not None and errors.nees.joint < 2.5 * 7
     assert any(reason.startswith("edges were left out: ") for reason in result.reasons)
     assert all(used.frame % 2 == 0 for used in result.frames_used)
