@@ -10,6 +10,7 @@ import gtsam
 
 from sst_graph.batch.assumption_tests import examine_assumptions
 from sst_graph.batch.baselines import paper_method, semalign_method, static_method
+from sst_graph.batch.by_edges.both import both_method
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
 from sst_graph.batch.by_edges.method import edges_method
 from sst_graph.batch.causes import with_causes
@@ -90,11 +91,13 @@ def prepare_drives(
     needed."""
     config = with_method_for(config, sources)
     prepare = preparation_of(config)
-    with_lower_edges = config.method == "joint" and config.lower_edges != "never"
+    with_lower_edges = config.method in ("joint", "both") and config.lower_edges != "never"
     depth = config.method in _NEED_DEPTH
     classes = config.classes
     if config.method == "edges":
         sources, classes = [GeometricallyLabelled(source) for source in sources], (SemanticClass.OBJECT,)
+    elif config.method == "both":
+        classes = (*classes, SemanticClass.OBJECT)
     # One drive after the other, for the frames that the sweep is decided by are kept until they are read.
     return [
         prepare_drive(source, classes, prepare, progress, depth, with_lower_edges)
@@ -207,7 +210,16 @@ def solve_problem(problem: CalibrationProblem) -> MethodEstimate:
         | joint_diagnostics(problem, motion.estimate, lower),
         JointOutcome(problem, motion.estimate, assumptions.considered),
         fit,
+        total.by_sweeps,
+        total.reasons,
     )
+
+
+def labels_and_edges(
+    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+) -> MethodEstimate:
+    """The joint method where frames have labels, edges in the others."""
+    return both_method(joint_method, drives, guess, config, progress)
 
 
 _Method = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
@@ -218,8 +230,9 @@ _METHODS: dict[Method, _Method] = {
     "semalign": semalign_method,
     "motion": motion_method,
     "edges": edges_method,
+    "both": labels_and_edges,
 }
-_NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges")
+_NEED_IMAGE_TRACKS = ("paper", "static", "motion", "edges", "both")
 """Methods whose camera velocity comes from visual odometry."""
 _TRACK_INTERVAL_S = 0.07
 """Shortest motion of the camera that is compared with the LiDAR's [s]: the rotation between two images is

@@ -37,7 +37,7 @@ def with_causes(
     result: CalibrationResult, drives: Sequence[Drive], guess: Guess, config: CalibrationConfig
 ) -> CalibrationResult:
     """The result with what is probably wrong with the data as its first reasons; with any, it is not ok."""
-    by_labels = config.method not in ("motion", "edges")
+    by_labels = config.method not in ("motion", "edges", "both")
     found = preflight(drives, guess.cTl, config.classes if by_labels else ())
     estimated = bool(result.frames_used)
     if not found and estimated:

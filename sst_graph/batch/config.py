@@ -18,7 +18,7 @@ from sst_graph.initialization.global_search import SearchConfig
 from sst_graph.odometry.lidar import LidarOdometryConfig
 from sst_graph.types import SemanticClass
 
-Method = Literal["auto", "joint", "paper", "static", "semalign", "motion", "edges"]
+Method = Literal["auto", "joint", "paper", "static", "semalign", "motion", "edges", "both"]
 UseMotion = Literal["auto", "always", "never"]
 UseLowerEdges = Literal["auto", "always", "never"]
 
@@ -40,8 +40,9 @@ class CalibrationConfig(Settings):
 
     method: Method = setting(
         "auto",
-        doc="What estimates: auto (joint where both sensors have labels, else edges), joint (outlines of "
-        "labelled objects), edges (LiDAR edges against pictures, no labels), motion (LiDAR against visual "
+        doc="What estimates: auto (joint where both sensors have labels, both where a part of the frames has "
+        "them, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, no "
+        "labels), both (joint where frames have labels, edges in the others), motion (LiDAR against visual "
         "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
     )
     classes: tuple[SemanticClass, ...] = setting(

@@ -77,6 +77,8 @@ class MethodEstimate:
         diagnostics: JSON-able numbers about the run.
         solved: the problem of the joint graph with its matches; None of methods without such a graph.
         fit: how the estimate fits its data, of methods that measure it.
+        by_sweeps: (7, 7) part of the covariance by sweeps that the scans leave undecided.
+        sweep_reasons: those of the reasons that say that such sweeps matter.
     """
 
     cTl: gtsam.Pose3
@@ -91,6 +93,8 @@ class MethodEstimate:
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     solved: JointOutcome | None = None
     fit: Fit | None = None
+    by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
+    sweep_reasons: tuple[str, ...] = ()
 
 
 def result_of(

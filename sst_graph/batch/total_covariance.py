@@ -7,7 +7,7 @@ leave undecided: for these the problem is solved again with the point times of e
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -38,6 +38,7 @@ class TotalCovariance:
         by_drive: where drives have an offset each, of the extrinsic and that offset.
         budget: sigmas (7) by each part, JSON-able.
         reasons: sweeps that nothing decides and that matter.
+        by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
     """
 
     unknowns: FloatArray
@@ -45,6 +46,7 @@ class TotalCovariance:
     by_drive: tuple[DriveCovariance, ...]
     budget: dict[str, list[float]]
     reasons: tuple[str, ...] = ()
+    by_sweeps: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
 
 
 def total_covariance(
@@ -67,7 +69,8 @@ def total_covariance(
     sweeps = sweep_effects(problem, solution, known)
     total = known + sweeps.covariance
     by_drive = _by_drive(problem, estimate, unknowns)
-    return TotalCovariance(unknowns, total, by_drive, parts | remainder(total, unknowns), sweeps.reasons)
+    spent = parts | remainder(total, unknowns)
+    return TotalCovariance(unknowns, total, by_drive, spent, sweeps.reasons, sweeps.covariance)
 
 
 def _unknown_motion(problem: CalibrationProblem, solution: JointSolution, variance_s2: float) -> FloatArray:

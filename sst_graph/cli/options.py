@@ -171,9 +171,10 @@ def _add_method(command: _Parser) -> None:
     """How one drive or several are calibrated."""
     command.add_argument(
         "--method",
-        choices=("auto", "joint", "edges", "motion", "paper", "static", "semalign"),
-        help="auto: joint where both sensors have labels, else edges (default); joint: extrinsic and offset "
-        "by outlines of labelled objects; edges: the same by LiDAR edges and pictures, no labels needed; "
+        choices=("auto", "joint", "edges", "both", "motion", "paper", "static", "semalign"),
+        help="auto: joint where both sensors have labels, both where some frames have, else edges "
+        "(default); joint: extrinsic and offset by outlines of labelled objects; edges: the same by LiDAR "
+        "edges and pictures, no labels needed; both: joint in frames with labels, edges in the others; "
         "motion: LiDAR odometry against visual odometry, no labels needed; paper: SST-Calib as printed; "
         "static: its first stage, the extrinsic alone; semalign: sampled starts, the extrinsic alone",
     )

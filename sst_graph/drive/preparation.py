@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.config import Settings, internal
+from sst_graph.drive.geometric_labels import labelled_by_geometry
 from sst_graph.drive.input_statistics import InputStatistics, StatisticsCollector
 from sst_graph.drive.trajectory import GrowingTrack, TwistTrack
 from sst_graph.errors import DataError
@@ -81,6 +82,8 @@ class ScanFeatures:
         depth_lPs, depth_offsets_s: points for depth of image features (all classes); none where image
             features are not tracked [m], [s].
         lower_edges: boundary points of each class towards the ground, of objects that have others too.
+        by_geometry: of a scan with labels, where objects without a class were looked for too, the same scan
+            by these alone.
     """
 
     stored_apart: ClassVar[bool] = True
@@ -94,6 +97,7 @@ class ScanFeatures:
     depth_lPs: NDArray[np.float32]
     depth_offsets_s: NDArray[np.float32]
     lower_edges: dict[SemanticClass, Boundaries] = field(default_factory=dict)
+    by_geometry: ScanFeatures | None = None
 
     def stored_in(self, store: ArrayStore) -> ScanFeatures:
         """The same with its points in an array store, in the precision of the scan's."""
@@ -104,6 +108,7 @@ class ScanFeatures:
             offsets_s=store.put(self.offsets_s.astype(np.float32), np.float64),
             depth_lPs=store.put(self.depth_lPs),
             depth_offsets_s=store.put(self.depth_offsets_s),
+            by_geometry=None if self.by_geometry is None else self.by_geometry.stored_in(store),
         )
 
 
@@ -215,6 +220,8 @@ class Drive:
         statistics: of the raw frames, for the search for causes; None where they were not collected.
         sweep: decision about the times of the points; None where there was none.
         origin_ns: stamp of an image from which assumptions about clocks count time; None: the first one's.
+        labelled_ns: stamps of the scans and of the images whose labels are aligned. Objects without a class
+            are not matched between two of these.
     """
 
     name: str
@@ -227,6 +234,12 @@ class Drive:
     statistics: InputStatistics | None = None
     sweep: SweepDecision | None = None
     origin_ns: int | None = None
+    labelled_ns: tuple[frozenset[int], frozenset[int]] = (frozenset(), frozenset())
+
+    def have_labels(self, scan: int, image: int) -> bool:
+        """Whether a scan and an image, by position, both have labels that are aligned."""
+        scans, images = self.labelled_ns
+        return self.scans[scan].stamp_ns in scans and self.images[image].stamp_ns in images
 
     @property
     def scan_stamps_ns(self) -> list[int]:
@@ -349,7 +362,19 @@ def scan_features(
     depth: bool = True,
     with_lower_edges: bool = True,
 ) -> ScanFeatures:
-    """Boundaries of a scan and a sample of its points; the arguments are those of :func:`prepare_drive`."""
+    """Boundaries of a scan and a sample of its points; the arguments are those of :func:`prepare_drive`.
+
+    Objects without a class are found by geometry where ``classes`` has them and the scan does not.
+    """
+    if SemanticClass.OBJECT in classes and not (scan.classes == int(SemanticClass.OBJECT)).any():
+        named = [c for c in classes if c != SemanticClass.OBJECT]
+        objects = labelled_by_geometry(scan)
+        some = (SemanticClass.OBJECT,) if (objects.classes == int(SemanticClass.OBJECT)).any() else ()
+        by_geometry = scan_features(index, objects, some, config, depth, False)
+        if not named or not scan.has_labels:
+            return by_geometry
+        by_labels = scan_features(index, scan, named, config, depth, with_lower_edges)
+        return replace(by_labels, by_geometry=by_geometry)
     offsets = np.zeros(len(scan.points), np.float32) if scan.offsets_s is None else scan.offsets_s
     chosen = _sample(scan)
     deep = np.zeros(0, dtype=np.intp)

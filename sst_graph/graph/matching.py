@@ -340,6 +340,7 @@ class DriveEdges:
             for g, (k, c) in enumerate(zip(self.scans, self.classes, strict=True))
             for number in numbers.get(k, ())
             if c in drive.images[pairs[number].image].contours
+            and not (c == SemanticClass.OBJECT and drive.have_labels(k, pairs[number].image))
         ]
         if not groups:
             return None

@@ -52,7 +52,7 @@ def test_auto_takes_labels_where_both_sensors_have_some() -> None:
     for method, sources in drives.items():
         for source in sources:
             assert with_method_for(config, [source]).method == method
-    assert with_method_for(config, [labelled(), unlabelled()]).method == "edges"
+    assert with_method_for(config, [labelled(), unlabelled()]).method == "both"
     chosen = CalibrationConfig(method="joint")
     assert with_method_for(chosen, [unlabelled()]) is chosen
 

@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.covariance import edges_covariance
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons
@@ -95,22 +96,46 @@ class _Problem:
         return edges_of(self.some.drives, self.some.tracks, self.some.config.graph)
 
 
+@dataclass(frozen=True)
+class LabelsSay:
+    """What labels of other frames say.
+
+    Attributes:
+        state: their estimate; edges begin there, without a search. None where it is not known well enough.
+        has_motion: motion is in their estimate, and must not count twice.
+    """
+
+    state: State | None = None
+    has_motion: bool = False
+
+
 def edges_method(
-    drives: Sequence[Drive], guess: Guess, config: CalibrationConfig, progress: Progress | None
+    drives: Sequence[Drive],
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None,
+    labels: LabelsSay | None = None,
 ) -> MethodEstimate:
-    """Extrinsic and time offset from edges; drives are prepared with geometric labels.
+    """Extrinsic and time offset from edges; drives are prepared with objects without a class.
+
+    Args:
+        labels: where other frames have some.
 
     Raises:
         EstimationError: no start: neither a guess nor motion, or nothing in view.
     """
+    labels = labels or LabelsSay()
     # 1. What motion says, before any edge is compared.
     motion = _motion_alone(drives, guess, config, progress)
     calibration = CalibrationProblem.of(drives, guess, config, progress)
-    problem = _problem(calibration, motion)
-    # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
-    candidates = _refined(problem, _starts(problem))
-    # 3. All frames, from the best, and from turns about the camera's axis.
-    solution = _solved(problem, candidates, progress)
+    problem = _problem(calibration, motion, labels)
+    if labels.state is None:
+        # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
+        candidates = _refined(problem, _starts(problem))
+        # 3. All frames, from the best, and from turns about the camera's axis.
+        solution = _solved(problem, candidates, progress)
+    else:
+        candidates, solution = [], _settled(problem, labels.state, progress)
     # 4. Covariance, with what halves of the objects disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
     covariance, spread, unsure = edges_covariance(problem.whole, estimate, calibration.objects)
@@ -129,6 +154,8 @@ def edges_method(
         (*reasons, *unsure, *sweeps.reasons),
         by_static_objects=covariance,
         diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
+        by_sweeps=sweeps.covariance,
+        sweep_reasons=sweeps.reasons,
     )
 
 
@@ -152,13 +179,15 @@ def _motion_alone(
     return possible[0]
 
 
-def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> _Problem:
+def _problem(calibration: CalibrationProblem, motion: MotionSolution | None, labels: LabelsSay) -> _Problem:
     """The problem, with the search around what guess and motion say together.
 
     Raises:
         EstimationError: neither says anything.
     """
     guess = calibration.guess
+    if labels.state is not None:
+        guess = Guess(labels.state.cTl, labels.state.time_offsets_s[0])
     if guess.cTl is None and motion is None:
         raise EstimationError(
             "without labels, a start is needed: a guess within 5 deg (--init), or a drive whose motion "
@@ -167,17 +196,28 @@ def _problem(calibration: CalibrationProblem, motion: MotionSolution | None) -> 
     drives = [thinned(drive, POINTS_A_SCAN) for drive in calibration.drives]
     joint = replace(calibration.joint(), drives=drives)
     region = _region(guess, motion, _time_offsets(calibration, motion))
+    if labels.state is not None:
+        region = replace(region, cTl=labels.state.cTl, time_offsets_s=labels.state.time_offsets_s)
     translation = np.zeros(3) if guess.cTl is None else np.asarray(guess.cTl.translation())
     pose = gtsam.Pose3(region.cTl.rotation(), translation)
-    known = motion is not None and _tells_offset(motion)
+    known = labels.state is None and motion is not None and _tells_offset(motion)
     centre = State(pose, (region.time_offsets_s[0] if known else guess.time_offset_s,))
-    prior = _prior(centre, motion, guess.cTl is not None)
+    guessed = labels.state is None and guess.cTl is not None
+    prior = _prior(centre, None if labels.has_motion else motion, guessed)
     whole = replace(joint, centre=centre, prior=prior)
-    scans = [spread_evenly(len(drive.scans), SEARCH_SCANS) for drive in drives]
+    scans = [_some_scans(drive, guess.time_offset_s) for drive in drives]
     parts = [drive.part(own) for drive, own in zip(drives, scans, strict=True)]
     tracks = [joint.tracks.part(number, own) for number, own in enumerate(scans)]
     some = replace(whole, drives=parts, tracks=Tracks.joined(tracks))
     return _Problem(whole, some, replace(region, cTl=pose), centre, motion)
+
+
+def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:
+    """Scans that starts are compared on, of those without labels beside their images."""
+    found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
+    scans = sorted({pair.scan for pair in found if not drive.have_labels(pair.scan, pair.image)})
+    scans = scans or list(range(len(drive.scans)))
+    return [scans[k] for k in spread_evenly(len(scans), SEARCH_SCANS)]
 
 
 def _tells_offset(motion: MotionSolution) -> bool:
@@ -285,7 +325,12 @@ def _solved(
     again = _refined(problem, rolled)
     candidates += [one for one in again if angle_deg(one[1].state.cTl, best[1].state.cTl) > _SAME_DEG]
     candidates.sort(key=lambda pair: -pair[0])
-    solution = solve_joint(problem.whole, candidates[0][1].state, KERNELS_PX, progress)
+    return _settled(problem, candidates[0][1].state, progress)
+
+
+def _settled(problem: _Problem, start: State, progress: Progress | None) -> JointSolution:
+    """The solution on all frames from a start that is nearly right."""
+    solution = solve_joint(problem.whole, start, KERNELS_PX, progress)
     # Soft matches follow the pose, so that steps are too short: from wide scales again, until nothing moves.
     for _ in range(_ROUNDS):
         before, solution = solution, solve_joint(problem.whole, solution.state, KERNELS_PX, progress)

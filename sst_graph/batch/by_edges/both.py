@@ -1,0 +1,172 @@
+"""``--method both``: labels where both sensors have some, edges in the other frames, one estimate."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sst_graph.batch.by_edges.fusion import Fused, state_of
+from sst_graph.batch.by_edges.label_parts import parted
+from sst_graph.batch.by_edges.method import LabelsSay, edges_method
+from sst_graph.batch.config import CalibrationConfig
+from sst_graph.batch.method_estimate import Guess, MethodEstimate
+from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
+from sst_graph.batch.total_covariance import MATTERS
+from sst_graph.drive.preparation import Drive, Progress
+from sst_graph.errors import EstimationError
+from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION
+
+ByLabels = Callable[[Sequence[Drive], Guess, CalibrationConfig, Progress | None], MethodEstimate]
+
+_Part = MethodEstimate | str
+"""An estimate, or why there is none."""
+_START_SIGMAS = np.array([*np.radians([0.3] * 3), 0.15, 0.15, 0.15, 0.03])
+"""(7,) labels that know the calibration this well give edges their start: within the widest kernel [rad, m,
+s]."""
+
+
+def both_method(
+    by_labels: ByLabels,
+    drives: Sequence[Drive],
+    guess: Guess,
+    config: CalibrationConfig,
+    progress: Progress | None,
+) -> MethodEstimate:
+    """Extrinsic and time offset from labels and edges.
+
+    Args:
+        by_labels: the method for frames with labels.
+        drives: prepared with their labels and with objects without a class.
+
+    Raises:
+        EstimationError: neither labels nor edges give an estimate.
+    """
+    with_labels, without = parted(drives)
+    as_joint = replace(config, method="joint")
+
+    def align(begin: Guess) -> _Part:
+        if not with_labels:
+            return "no class has labels on both sides"
+        return _attempt(lambda: by_labels(with_labels, begin, as_joint, progress))
+
+    # 1. Labels; they give edges their start where they know enough.
+    labels = align(guess)
+    # 2. Edges in the other frames.
+    edges: _Part = "every frame has labels"
+    if without:
+        edges = _attempt(lambda: edges_method(without, guess, config, progress, _says(labels)))
+    # 3. Labels that found nothing by themselves once more, from there.
+    if not _sound(labels) and _sound(edges):
+        assert isinstance(edges, MethodEstimate)
+        labels = align(Guess(edges.cTl, edges.time_offset_s))
+    # 4. Both as one.
+    return as_one(labels, edges)
+
+
+def _attempt(run: Callable[[], MethodEstimate]) -> _Part:
+    """An estimate, or why there is none."""
+    try:
+        return run()
+    except EstimationError as error:
+        return str(error)
+
+
+def _sound(part: _Part) -> bool:
+    return isinstance(part, MethodEstimate) and not _wrong(part)
+
+
+def _wrong(part: MethodEstimate) -> tuple[str, ...]:
+    """Reasons against a part; whether sweeps matter is seen of both together."""
+    return tuple(reason for reason in part.reasons if reason not in part.sweep_reasons)
+
+
+def _says(labels: _Part) -> LabelsSay:
+    if isinstance(labels, str) or _wrong(labels):
+        return LabelsSay()
+    sure = bool((np.sqrt(np.diag(labels.covariance)) < _START_SIGMAS).all())
+    has_motion = bool(labels.diagnostics["motion"].get("fused", False))
+    return LabelsSay(state_of(labels) if sure else None, has_motion)
+
+
+def as_one(labels: _Part, edges: _Part) -> MethodEstimate:
+    """The estimate from both parts, or from the one that is sound.
+
+    Raises:
+        EstimationError: neither is an estimate.
+    """
+    if isinstance(labels, str) and isinstance(edges, str):
+        raise EstimationError(f"by labels: {labels}; by edges: {edges}")
+    if isinstance(edges, str) or (_wrong(edges) and _sound(labels)):
+        assert not isinstance(labels, str)
+        return _alone(labels, ("edges", edges))
+    if isinstance(labels, str) or (_wrong(labels) and _sound(edges)):
+        return _alone(edges, ("labels", labels))
+    if _wrong(labels):  # neither is sound
+        reasons = [*(f"by labels: {each}" for each in labels.reasons)]
+        reasons += [f"by edges: {each}" for each in edges.reasons]
+        return replace(labels, reasons=tuple(reasons), solved=None)
+    return _of_both(labels, edges)
+
+
+def _alone(used: MethodEstimate, left_out: tuple[str, _Part]) -> MethodEstimate:
+    """One part, and why the other, of a name, was left out."""
+    name, part = left_out
+    why = part if isinstance(part, str) else _wrong(part)[0]
+    remark = f"{name} were left out: {why}"
+    facts = {} if isinstance(part, str) else {name: _facts(part)}
+    return replace(
+        used,
+        remarks=(*used.remarks, remark),
+        diagnostics={**used.diagnostics, "both": {"left_out": remark, **facts}},
+        solved=None,
+    )
+
+
+def _of_both(labels: MethodEstimate, edges: MethodEstimate) -> MethodEstimate:
+    """The fused estimate; it may be wrong where the two contradict each other."""
+    fused = Fused.of(labels, edges)
+    static = edges.covariance
+    if labels.by_static_objects is not None:
+        static = Fused.of(replace(labels, covariance=labels.by_static_objects), edges).covariance
+    sweeps = dict.fromkeys((*labels.sweep_reasons, *edges.sweep_reasons))
+    shares = np.diag(fused.by_sweeps) / np.diag(fused.covariance)
+    # What a frame brought to the labels' estimate is not what it brought to this one.
+    diagnostics = {name: value for name, value in labels.diagnostics.items() if name != FRAME_INFORMATION}
+    facts = {"labels": _facts(labels), "edges": _facts(edges), "chi2_of_7": fused.chi2}
+    return replace(
+        labels,
+        cTl=fused.state.cTl,
+        time_offset_s=fused.state.time_offsets_s[0],
+        covariance=fused.covariance,
+        frames=tuple(dict.fromkeys((*labels.frames, *edges.frames))),
+        reasons=(*_contradiction(fused), *(sweeps if (shares > MATTERS**2).any() else ())),
+        remarks=(*labels.remarks, *edges.remarks),
+        by_static_objects=static,
+        diagnostics={**diagnostics, "edges": dict(edges.diagnostics), "both": facts},
+        solved=None,
+    )
+
+
+def _contradiction(fused: Fused) -> tuple[str, ...]:
+    if fused.chi2 <= MAX_DISAGREEMENT_CHI2:
+        return ()
+    degrees, metres = (float(np.linalg.norm(fused.step[own])) for own in (slice(0, 3), slice(3, 6)))
+    return (
+        f"labels and edges of different frames contradict each other: {np.degrees(degrees):.2f} deg, "
+        f"{100.0 * metres:.1f} cm and {1e3 * fused.step[6]:+.1f} ms apart "
+        f"(chi-squared {fused.chi2:.0f} of 7)",
+    )
+
+
+def _facts(part: MethodEstimate) -> dict[str, Any]:
+    """What a part says by itself, JSON-able."""
+    return {
+        "T_camera_lidar": part.cTl.matrix().tolist(),
+        "time_offset_s": part.time_offset_s,
+        "sigmas": np.sqrt(np.diag(part.covariance)).tolist(),
+        "frames": len(part.frames),
+        "reasons": list(part.reasons),
+    }

@@ -1,0 +1,74 @@
+"""Two estimates of one calibration from different frames, as one.
+
+Matches of one kind share errors that no single match shows: masks on one side of an object in all frames,
+edges inside an object that draw its outline inwards. So the graph of both has a copy of extrinsic and time
+offset for each kind, which its matches are on, and between the copy and the calibration a factor with the
+covariance of what the kind's matches share beyond their own errors. The two kinds are of different frames,
+and share no other variable: what each says of the calibration is one Gaussian, its estimate and whole
+covariance, and the estimate of that graph is their product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.method_estimate import MethodEstimate
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import difference
+
+FloatArray = NDArray[np.float64]
+
+UNLIKELY_CHI2 = 14.07
+"""95 % quantile of chi-squared with 7 degrees of freedom: beyond it the covariance grows by Birge's ratio,
+squared."""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """The product of two Gaussians on extrinsic and time offset.
+
+    Attributes:
+        state: its mean.
+        covariance: (7, 7) larger where the two differ by more than theirs allow.
+        by_sweeps: (7, 7) part of it by sweeps that the scans leave undecided.
+        gain: (7, 7) how the mean follows the second of the two.
+        step: (7,) from the first to the second.
+        chi2: of 7, of that step under the sum of the covariances.
+    """
+
+    state: State
+    covariance: FloatArray
+    by_sweeps: FloatArray
+    gain: FloatArray
+    step: FloatArray
+    chi2: float
+
+    @classmethod
+    def of(cls, first: MethodEstimate, second: MethodEstimate) -> Fused:
+        """Of two estimates that share no match.
+
+        Undecided sweeps move both at once. Their parts of the covariance are added once more, which is enough
+        however the two correlate.
+        """
+        a = state_of(first)
+        step = difference(a, state_of(second))
+        total = first.covariance + second.covariance
+        gain = np.asarray(np.linalg.solve(total, first.covariance).T)
+        chi2 = float(step @ np.linalg.solve(total, step))
+        moved, rest = gain @ step, np.eye(7) - gain
+        covariance = rest @ first.covariance @ rest.T + gain @ second.covariance @ gain.T
+        by_sweeps = rest @ first.by_sweeps @ rest.T + gain @ second.by_sweeps @ gain.T
+        covariance += by_sweeps
+        if chi2 > UNLIKELY_CHI2:
+            covariance *= chi2 / 7.0
+        state = State(a.cTl.retract(moved[:6]), (a.time_offsets_s[0] + float(moved[6]),))
+        return cls(state, 0.5 * (covariance + covariance.T), 2.0 * by_sweeps, gain, step, chi2)
+
+
+def state_of(estimate: MethodEstimate) -> State:
+    """Extrinsic and time offset of an estimate."""
+    return State(gtsam.Pose3(estimate.cTl), (estimate.time_offset_s,))
