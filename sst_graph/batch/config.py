@@ -40,8 +40,8 @@ class CalibrationConfig(Settings):
 
     method: Method = setting(
         "auto",
-        doc="What estimates: auto (joint where both sensors have labels, both where a part of the frames has "
-        "them, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, no "
+        doc="What estimates: auto (joint where both sensors have labels, both where one of several drives "
+        "has none, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, no "
         "labels), both (joint where frames have labels, edges in the others), motion (LiDAR against visual "
         "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
     )

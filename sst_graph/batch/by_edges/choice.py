@@ -1,4 +1,4 @@
-"""``method=auto``: by labels where both sensors have some, by edges where none are, both where some frames
+"""``method=auto``: by labels where both sensors have some, by edges where none are, both where some drives
 have labels."""
 
 from __future__ import annotations
@@ -15,11 +15,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.types import SemanticClass, Source
 
 _LOOKS = 8
-"""Most scans and images of a drive that are looked at, spread over it, and as many in succession: labels may
-be in a part of the drive, or in every so many frames."""
-_SOME, _FEWEST = 0.25, 4
-"""Edges are used beside labels where so large a share of a drive's frames that are looked at, and so many of
-them, have no labels: edges of few frames know much less than the labels of the others."""
+"""Most scans and images of a drive that are looked at, spread over it."""
 
 
 def with_method_for(config: CalibrationConfig, sources: Sequence[Source]) -> CalibrationConfig:
@@ -76,25 +72,18 @@ class _Looks:
         """Whether both sensors have labels."""
         return any(self.scans) and any(self.images)
 
-    def lacks_many(self, classes: frozenset[int]) -> bool:
-        """Whether edges are worth while in the frames without labels."""
-        lacking = 1.0 - self.share(classes)
-        return lacking >= _SOME and lacking * min(len(self.scans), len(self.images)) >= _FEWEST
-
-    def share(self, classes: frozenset[int]) -> float:
-        """Share of the frames with labels on both sides; 0 where none of the classes is on both."""
-        if not classes & frozenset().union(*self.scans) & frozenset().union(*self.images):
-            return 0.0
-        return min(sum(map(bool, side)) / len(side) for side in (self.scans, self.images))
+    def on_both_sides(self, classes: frozenset[int]) -> bool:
+        """Whether scans and images have labels of one of the classes."""
+        return bool(classes & frozenset().union(*self.scans) & frozenset().union(*self.images))
 
 
 def _method(looks: Sequence[_Looks], config: CalibrationConfig) -> Method:
     without = [each for each in looks if not each.labelled and each.pictures]
     classes = frozenset(map(int, config.classes))
-    no_labels = not any(each.share(classes) for each in looks)
-    if no_labels or config.time_offset_per_drive or not any(each.pictures for each in looks):
-        return "edges" if without else "joint"
-    return "both" if without or any(each.lacks_many(classes) for each in looks) else "joint"
+    if not without:
+        return "joint"
+    some_labels = any(each.on_both_sides(classes) for each in looks)
+    return "both" if some_labels and not config.time_offset_per_drive else "edges"
 
 
 def _classes(labels: np.ndarray) -> frozenset[int]:
@@ -103,9 +92,6 @@ def _classes(labels: np.ndarray) -> frozenset[int]:
 
 
 def _some(positions: Sequence[int]) -> list[int]:
-    """Evenly spread ones, and some in succession."""
     count = len(positions)
-    chosen = np.linspace(0, count - 1, min(count, _LOOKS)).round().astype(int) if count else np.zeros(0, int)
-    middle = max(0, (count - _LOOKS) // 2)
-    run = np.arange(middle, min(count, middle + _LOOKS))
-    return [positions[int(k)] for k in np.unique(np.concatenate([chosen, run]))]
+    chosen = np.linspace(0, count - 1, min(count, _LOOKS)).round().astype(int) if count else ()
+    return [positions[int(k)] for k in chosen]

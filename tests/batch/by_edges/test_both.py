@@ -105,7 +105,7 @@ def test_a_whole_drive_goes_one_way() -> None:
 
 
 @pytest.mark.slow
-def test_auto_takes_both_where_some_frames_have_labels() -> None:
+def test_auto_takes_both_where_some_drives_have_labels() -> None:
     config = CalibrationConfig()
 
     def auto(*sources: KeptDrive) -> str:
@@ -113,10 +113,8 @@ def test_auto_takes_both_where_some_frames_have_labels() -> None:
 
     whole, some, none = (with_labels_in(SMALL, every) for every in (1, 3, 100))
     none = replace(none, frames=tuple(map(bare, none.frames)))
-    assert (auto(whole), auto(some), auto(none)) == ("joint", "both", "edges")
+    assert (auto(whole), auto(some), auto(none)) == ("joint", "joint", "edges")
     assert auto(whole, none) == "both" and auto(none, none) == "edges"
-    one_less = replace(whole, frames=(*whole.frames[:-1], bare(whole.frames[-1])))
-    assert auto(one_less) == "joint"
     dark = some.with_images(lambda image: replace(image, pixels=np.zeros((0, 0, 3), np.uint8)))
     assert auto(dark) == "joint"
     # Masks of persons only: by edges beside a drive with labels; alone, joint says what is wrong.
@@ -124,7 +122,7 @@ def test_auto_takes_both_where_some_frames_have_labels() -> None:
         lambda image: replace(image, mask=np.where(image.mask == VEHICLE, SemanticClass.PERSON, image.mask))
     )
     assert auto(persons) == "joint" and auto(whole, persons) == "both"
-    assert with_method_for(replace(config, time_offset_per_drive=True), [some]).method == "joint"
+    assert with_method_for(replace(config, time_offset_per_drive=True), [whole, none]).method == "edges"
     assert with_method_of(config, [prepared()]).method == "both"
     assert with_method_of(config, [parts()[0]]).method == "joint"
     assert with_method_of(config, [parts()[1]]).method == "edges"
