@@ -12,11 +12,12 @@ sys.path[:0] = [str(DOCS.parent), str(DOCS)]
 
 import make_api  # noqa: E402
 import make_command_line  # noqa: E402
+import make_notebooks  # noqa: E402
 
 project = "sst-graph"
 author = "the sst-graph developers"
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx_copybutton",
     "sphinx_design",
     "sphinx.ext.autodoc",
@@ -27,6 +28,14 @@ exclude_patterns: list[str] = []
 # Pages that are made here and not kept in git.
 make_api.write_section_pages(DOCS / "reference" / "api")
 make_command_line.write_page(DOCS / "reference" / "command-line.md")
+sources = make_notebooks.sources_digest()
+make_notebooks.write_pages(DOCS / "notebooks", sources)
+
+nb_execution_mode = "cache"  # a notebook runs again when its code or the package has changed
+nb_execution_cache_path = str(DOCS.parent / "build" / "notebooks" / sources)
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
 
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3

@@ -42,7 +42,7 @@ street = SimulationConfig(
     vehicle_density=0.25,
     time_offset_s=0.1,
 )
-write_drive(simulate(street), folder)
+sequence = write_drive(simulate(street), folder)
 
 # %% [markdown]
 # ## Three lines
@@ -84,7 +84,8 @@ figure.tight_layout()
 
 # %%
 fit = result.fit
-print(fit.quality)
+quality = fit.quality
+print(f"{quality.points} points; within 1.5 px: {quality.share:.0%}, attainable: {quality.attainable:.0%}")
 figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2))
 left.hist(fit.points.residuals_px, bins=np.arange(-8, 8.1, 0.5))
 left.axvspan(-1.5, 1.5, color="tab:green", alpha=0.15, label="within 1.5 px")
@@ -108,7 +109,8 @@ figure.tight_layout()
 
 # %%
 errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
-print(errors)
+print(f"rotation {errors.qad_deg:.3f} deg, translation {100 * errors.atd_m:.2f} cm (ATD)")
+print(f"time offset {1e3 * errors.time_offset_s:.1f} ms, NEES {errors.nees.joint:.1f} of 7")
 step = drive.truth.cTl.localCoordinates(result.T_camera_lidar)
 error = np.append(step, result.time_offset_s - drive.truth.time_offset_s)
 sigma = np.sqrt(np.diag(result.covariance))

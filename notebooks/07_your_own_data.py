@@ -46,7 +46,7 @@ street = SimulationConfig(
     time_offset_s=0.06,
 )
 drive = simulate(street)
-write_bag(drive, bag)
+written = write_bag(drive, bag)
 
 # %% [markdown]
 # ## What is in it
@@ -56,7 +56,7 @@ write_bag(drive, bag)
 
 # %%
 topics = ["--image-topic", "/camera/image_rect", "--mask-topic", "/camera/mask"]
-main(["info", bag, *topics])
+print("exit code", main(["info", bag, *topics]))
 
 # %% [markdown]
 # Read the end first: it says for which method something is missing. Without masks and labels, `--method
@@ -127,7 +127,7 @@ ax.legend()
 figure.tight_layout()
 
 # %%
-main(["inspect", result, "--next", "6"])
+print("exit code", main(["inspect", result, "--next", "6"]))
 
 # %% [markdown]
 # `main(["export", result, "--to", "ros-tf"])` and its siblings write it for others.

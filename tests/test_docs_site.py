@@ -42,6 +42,7 @@ class _Links(HTMLParser):
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     command = ["-m", "sphinx", "-W", "--keep-going", "-q", "-E", "-d", str(folder / "doctrees")]
+    command += ["-D", "nb_execution_mode=off"]  # tests/test_notebooks.py runs them
     done = subprocess.run(
         [sys.executable, *command, str(DOCS), str(folder / "html")], cwd=ROOT, capture_output=True, text=True
     )

@@ -8,6 +8,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from sst_graph.cli.messages import complain
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
@@ -15,7 +16,6 @@ from sst_graph.cli.progress import ProgressBar, ProgressStage
 from sst_graph.data.frame_parts import RecentReader
 from sst_graph.errors import ConfigError
 from sst_graph.files import FileKind, OutputKind
-from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.inspection import inspect_result, to_dict
 from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, markdown_report
@@ -107,22 +107,15 @@ def _written(
     return [RESULT_NAME, REPORT_NAME, "report.md", *pictures]
 
 
-def result_json(result: CalibrationResult, against: Comparison | None, written: Mapping[str, object]) -> str:
-    """The result as one JSON object: pose, offset, what ``inspect --json`` prints, errors where known.
-
-    Args:
-        written: further entries.
-    """
-    errors = None if against is None else dataclasses.asdict(against.errors)
-    document = {
+def result_numbers(result: CalibrationResult, against: Comparison | None) -> dict[str, Any]:
+    """What ``--json`` prints of a result: pose, offset, what ``inspect --json`` prints, known errors."""
+    return {
         "T_camera_lidar": result.T_camera_lidar.matrix(),
         "time_offset_s": result.time_offset_s,
         **to_dict(inspect_result(result)),
-        "errors": errors,
+        "errors": None if against is None else dataclasses.asdict(against.errors),
         "errors_against": None if against is None else against.name,
-        **written,
     }
-    return strict_json(document)
 
 
 def exit_code(result: CalibrationResult) -> int:

@@ -15,19 +15,25 @@ import numpy as np
 from sst_graph.batch import CalibrationConfig
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
-from sst_graph.cli.messages import complain, mention
-from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, write_calibration
+from sst_graph.cli.messages import complain, mention, say
+from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, result_numbers, write_calibration
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
+from sst_graph.cli.video import video_of, videos_beside
 from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
+from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.reasons import short_reasons
-from sst_graph.inspect.report import summary
+from sst_graph.inspect.report import Comparison, summary
+from sst_graph.result import CalibrationResult
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
 from sst_graph.rig.known import ROTATION_SIGMA_DEG, TRANSLATION_SIGMA_M, poses_by_nominal
 from sst_graph.rig.known_files import read_known_poses
 from sst_graph.rig.result import RIG_NAME, folder_names
 from sst_graph.types import Source
+
+_PRINTED = ("status", "reasons", "covariance", "camera_poses", "known")
+"""What ``--json`` prints of ``rig.json``."""
 
 
 def given_cameras(args: argparse.Namespace) -> list[str]:
@@ -68,41 +74,90 @@ def refuse_rig_options(args: argparse.Namespace) -> None:
 def run_rig(args: argparse.Namespace, cameras: Sequence[str]) -> int:
     """Calibrate the cameras of ``args.data`` together, print the summaries, write a folder for each."""
     config = calibration_settings(args)
-    rig_file = None if args.rig in (None, "dataset") else args.rig
-    inputs = {"DATA": None, "--init": args.init, "--config": args.config, "--rig": rig_file}
-    for path in args.data:
-        check_apart({**inputs, "DATA": path}, {"--out": args.out})
-    rotation_deg, translation_m = _sigmas(args)
-    with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
-        # 1. The drives of each camera, their starts, and what is known of the rig.
-        of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
-        sources, read_as = _opened(of_camera)
-        check_classes(next(iter(sources.values())), config.classes, args.classes)
-        initial, offsets_s = _starts(args.init, sources, read_as)
-        known = KnownRig(
-            _known_poses(args.rig, sources, rotation_deg, translation_m), one_trigger=args.one_trigger
-        )
-        # 2. Calibrate.
-        rig = _calibrated(sources, initial, offsets_s, config, known)
-        results = {
-            name: dataclasses.replace(result, read_as=read_as[name]) for name, result in rig.cameras.items()
+    folders = folder_names(tuple(cameras))
+    paths = [] if args.video is None else [video_of(args.video, folders[name]) for name in cameras]
+    _check_apart(args, paths)
+    sigmas = _sigmas(args)
+    with videos_beside(paths, args.out, args.overwrite) as videos:
+        with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
+            sources, rig = _calibrated(args, cameras, config, sigmas)
+            against = {name: comparison(result, sources[name]) for name, result in rig.cameras.items()}
+            # The numbers first: what follows may find the disk full.
+            if not args.json:
+                _mention_rig(rig, against)
+            files = {
+                name: _write_camera(folder / folders[name], result, sources[name], against[name], args)
+                for name, result in rig.cameras.items()
+            }
+            (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
+            written = [RIG_NAME, *(f"{folders[name]}/{file}" for name in files for file in files[name])]
+            for name, video in zip(cameras, videos, strict=False):
+                written += video.write_inside(folder, rig[name], sources[name])
+        if not args.json:
+            mention(f"{'wrote':<15} {args.out}: {', '.join(written)}")
+        for name, video in zip(cameras, videos, strict=False):
+            for path in video.write_beside(rig[name], sources[name]):
+                if not args.json:
+                    mention(f"{'wrote':<15} {path}")
+    if args.json:
+        of_camera = {
+            name: {
+                **result_numbers(result, against[name]),
+                "out": str(args.out / folders[name]),
+                "files": files[name],
+            }
+            for name, result in rig.cameras.items()
         }
-        rig = dataclasses.replace(rig, cameras=results)
-        # 3. The numbers first: what follows may find the disk full.
-        written = []
-        against = {name: comparison(result, sources[name]) for name, result in results.items()}
-        for name, result in results.items():
-            mention(f"{'camera':<15} {name}\n{summary(result, against[name])}\n")
-        mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))
-        for name, own_folder in folder_names(results).items():
-            (folder / own_folder).mkdir()
-            names = write_calibration(
-                folder / own_folder, results[name], sources[name], against[name], not args.no_report
-            )
-            written += [f"{own_folder}/{file}" for file in names]
-        (folder / RIG_NAME).write_text(rig.to_json(), encoding="utf-8")
-    mention(f"{'wrote':<15} {args.out}: {RIG_NAME}, {', '.join(written)}")
+        document = {key: value for key, value in rig.to_dict().items() if key in _PRINTED}
+        say(strict_json({**document, "cameras": of_camera, "out": str(args.out), "files": written}))
     return _exit_code(rig)
+
+
+def _check_apart(args: argparse.Namespace, videos: Sequence[Path]) -> None:
+    rig_file = None if args.rig in (None, "dataset") else args.rig
+    inputs = {"--init": args.init, "--config": args.config, "--rig": rig_file}
+    outputs = {"--out": args.out, **{f"--video for {path.name}": path for path in videos}}
+    for path in args.data:
+        check_apart({"DATA": path, **inputs}, outputs)
+
+
+def _calibrated(
+    args: argparse.Namespace,
+    cameras: Sequence[str],
+    config: CalibrationConfig,
+    sigmas: tuple[float, float],
+) -> tuple[dict[str, list[Source]], RigResult]:
+    """The drives of each camera, and their calibration, with progress on stderr."""
+    of_camera = {name: argparse.Namespace(**{**vars(args), "camera": name}) for name in cameras}
+    sources, read_as = _opened(of_camera)
+    check_classes(next(iter(sources.values())), config.classes, args.classes)
+    initial, offsets_s = _starts(args.init, sources, read_as)
+    known = KnownRig(_known_poses(args.rig, sources, *sigmas), one_trigger=args.one_trigger)
+    with ProgressBar() as progress:
+        rig = calibrate_rig(
+            sources, initial, config, known, initial_time_offsets_s=offsets_s, progress=progress
+        )
+    results = {
+        name: dataclasses.replace(result, read_as=read_as[name]) for name, result in rig.cameras.items()
+    }
+    return sources, dataclasses.replace(rig, cameras=results)
+
+
+def _mention_rig(rig: RigResult, against: Mapping[str, Comparison | None]) -> None:
+    for name, result in rig.cameras.items():
+        mention(f"{'camera':<15} {name}\n{summary(result, against[name])}\n")
+    mention("\n".join(f"{name:<15} {text}".rstrip() for name, text in rig_lines(rig)))
+
+
+def _write_camera(
+    folder: Path,
+    result: CalibrationResult,
+    sources: Sequence[Source],
+    against: Comparison | None,
+    args: argparse.Namespace,
+) -> list[str]:
+    folder.mkdir()
+    return write_calibration(folder, result, sources, against, not args.no_report)
 
 
 def _opened(
@@ -129,19 +184,6 @@ def _opened(
                 read_as[name]["frames"] = f"{cuts[0].start}:{cuts[0].stop}"
         first = first or list(sources[name])
     return sources, read_as
-
-
-def _calibrated(
-    sources: Mapping[str, Sequence[Source]],
-    initial: Mapping[str, gtsam.Pose3 | None],
-    offsets_s: Mapping[str, float],
-    config: CalibrationConfig,
-    known: KnownRig,
-) -> RigResult:
-    with ProgressBar() as progress:
-        return calibrate_rig(
-            sources, initial, config, known, initial_time_offsets_s=offsets_s, progress=progress
-        )
 
 
 def _starts(

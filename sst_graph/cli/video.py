@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,60 +35,63 @@ _RATES_HZ = 1.0, 60.0
 
 @dataclass(frozen=True)
 class VideoOutput:
-    """The video that ``calibrate`` was asked for.
+    """The video of one camera that ``calibrate`` was asked for.
 
     Attributes:
         path: as it was named.
-        inside: its name in the folder of the calibration, where it is to stand there.
-        beside: the file, where it is to stand elsewhere.
+        beside: the file, where it is to stand elsewhere than in the folder of the calibration.
     """
 
     path: Path
-    inside: str | None
     beside: OutputFile | None
 
-    def write(self, place: Path, result: CalibrationResult, sources: Sequence[Source]) -> str:
-        """Write the video of a result's drives to a place, with progress on stderr; its name."""
+    def write_inside(self, folder: Path, result: CalibrationResult, sources: Sequence[Source]) -> list[str]:
+        """Write it into the folder of the calibration; its name, where it is to stand there."""
+        if self.beside is not None:
+            return []
+        self._write(folder / self.path.name, result, sources)
+        return [self.path.name]
+
+    def write_beside(self, result: CalibrationResult, sources: Sequence[Source]) -> list[Path]:
+        """Write the file of its own; its path, where it is to be one."""
+        if self.beside is None:
+            return []
+        self._write(self.beside.partial, result, sources)
+        self.beside.publish()
+        return [self.path]
+
+    def _write(self, place: Path, result: CalibrationResult, sources: Sequence[Source]) -> None:
         swept = (with_sweep_of(source, result.diagnostics) for source in sources)
         drives = [(source, placement_before(result, source)) for source in swept]
         with ProgressBar() as progress:
             write_drive_video(place, self.path, result, drives, progress.stage("video"))
-        return self.path.name
+
+
+def video_of(path: Path, folder: str) -> Path:
+    """The video of one camera of a rig: drive_image_3.mp4 for drive.mp4 and the folder image_3."""
+    return path.with_name(f"{path.stem}_{folder}{path.suffix}")
 
 
 @contextmanager
-def video_beside(args: argparse.Namespace) -> Iterator[VideoOutput | None]:
-    """The video that ``--video`` asks for beside or in ``--out``, its name taken; None where it does not.
+def videos_beside(paths: Sequence[Path], out: Path, overwrite: bool) -> Iterator[list[VideoOutput]]:
+    """Videos beside or in the folder ``out``, their names taken.
 
     Raises:
         ConfigError: no name of a video, or a file that may not be replaced.
         MissingDependencyError: videos cannot be made.
     """
-    path: Path | None = args.video
-    if path is None:
-        yield None
-        return
+    with ExitStack() as stack:
+        yield [_video_beside(stack, path, out, overwrite) for path in paths]
+
+
+def _video_beside(stack: ExitStack, path: Path, out: Path, overwrite: bool) -> VideoOutput:
     check_video_name(path, "--video")
-    if os.path.realpath(path.parent) == os.path.realpath(args.out):
-        yield VideoOutput(path, path.name, None)
-        return
-    check_apart({"--out": args.out}, {"--video": path})
-    if Path(os.path.realpath(args.out)) in Path(os.path.realpath(path)).parents:
-        raise ConfigError(f"--video {path}: expected a name in {args.out} itself, or elsewhere")
-    with output_file(path, args.overwrite, VIDEO_FILE) as beside:
-        yield VideoOutput(path, None, beside)
-
-
-def refuse_video_of_rig(args: argparse.Namespace) -> None:
-    """A video shows one camera.
-
-    Raises:
-        ConfigError: one is asked for.
-    """
-    if args.video is not None:
-        raise ConfigError(
-            "--video: expected with one camera (afterwards: sst-graph overlay OUT/CAMERA DATA --video FILE)"
-        )
+    if os.path.realpath(path.parent) == os.path.realpath(out):
+        return VideoOutput(path, None)
+    check_apart({"--out": out}, {"--video": path})
+    if Path(os.path.realpath(out)) in Path(os.path.realpath(path)).parents:
+        raise ConfigError(f"--video {path}: expected a name in {out} itself, or elsewhere")
+    return VideoOutput(path, stack.enter_context(output_file(path, overwrite, VIDEO_FILE)))
 
 
 def write_drive_video(

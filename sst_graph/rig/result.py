@@ -103,29 +103,27 @@ class RigResult:
         """
         return self.marginal().relative_pose(camera, reference)
 
+    def to_dict(self) -> dict[str, Any]:
+        """What ``rig.json`` holds."""
+        folders = folder_names(self.cameras)
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "cameras": [
+                {"name": name, "folder": folders[name], "status": result.status}
+                for name, result in self.cameras.items()
+            ],
+            "covariance": self.covariance,
+            "status": self.status,
+            "reasons": self.reasons,
+            "camera_poses": [_pose_document(p) for p in self.marginal().relative_poses()],
+            "known": _known_document(self.known),
+            "diagnostics": self.diagnostics,
+        }
+
     def to_json(self) -> str:
         """The text of ``rig.json``."""
-        return (
-            strict_json(
-                {
-                    "format": FORMAT,
-                    "version": VERSION,
-                    "cameras": [
-                        {"name": name, "folder": folder, "status": result.status}
-                        for (name, result), folder in zip(
-                            self.cameras.items(), folder_names(self.cameras).values(), strict=True
-                        )
-                    ],
-                    "covariance": self.covariance,
-                    "status": self.status,
-                    "reasons": self.reasons,
-                    "camera_poses": [_pose_document(p) for p in self.marginal().relative_poses()],
-                    "known": _known_document(self.known),
-                    "diagnostics": self.diagnostics,
-                }
-            )
-            + "\n"
-        )
+        return strict_json(self.to_dict()) + "\n"
 
     @staticmethod
     def from_json(

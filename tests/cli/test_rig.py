@@ -26,7 +26,8 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rig"
     options = ["--camera", "image_2", "image_3", "--rig", "dataset", "--one-trigger"]
-    code = main(["calibrate", str(street), *options, "--out", str(out)])
+    videos = ["--video", str(tmp_path / "drive.gif")]
+    code = main(["calibrate", str(street), *options, "--out", str(out), *videos])
     captured = capsys.readouterr()
     assert (code, captured.err) == (0, "")
     # 1. What is printed: each camera against the truth, and the pose between them.
@@ -47,6 +48,8 @@ def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.Cap
     document = json.loads((out / "rig.json").read_text())
     assert document["known"]["one_trigger"] and len(document["covariance"]) == 14
     assert document["diagnostics"]["known_poses"][0]["used"]
+    for name in rig.cameras:
+        assert (tmp_path / f"drive_{name}.gif").read_bytes().startswith(b"GIF8")
     # 3. The other commands take each camera's folder.
     picture = tmp_path / "overlay.png"
     assert main(["overlay", str(out / "image_3"), str(street), "--out", str(picture)]) == 0
@@ -61,6 +64,27 @@ def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.Cap
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.slow
+def test_as_json_with_videos_inside(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "rig"
+    options = ["--camera", "image_2", "image_3", "--frames", "0:6", "--set", "search.enabled=false"]
+    written = ["--out", str(out), "--no-report", "--video", str(out / "drive.gif"), "--json"]
+    assert main(["calibrate", str(street), *options, *written]) in (0, 3)
+    document = json.loads(capsys.readouterr().out)
+    rig = read_rig(out)
+    assert document["status"] == rig.status and document["camera_poses"][0]["camera"] == "image_3"
+    assert document["covariance"] == rig.covariance.tolist()
+    assert list(document["cameras"]) == ["image_2", "image_3"]
+    for name, printed in document["cameras"].items():
+        assert printed["T_camera_lidar"] == rig[name].T_camera_lidar.matrix().tolist()
+        assert printed["time_offset_s"] == rig[name].time_offset_s
+        assert printed["errors"]["qad_deg"] > 0 and printed["out"] == str(out / name)
+        assert all((out / name / file).is_file() for file in printed["files"])
+    assert {"rig.json", "drive_image_2.gif", "drive_image_3.gif"} < set(document["files"])
+    pictures = [(out / file).read_bytes() for file in document["files"] if file.endswith(".gif")]
+    assert pictures[0].startswith(b"GIF8") and pictures[0] != pictures[1]
+
+
 @pytest.mark.parametrize(
     ("options", "found"),
     [
@@ -73,6 +97,7 @@ def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.Cap
         (["--camera", "image_2", "image_3", "--rig", "dataset", "--rig-sigma", "a"], "expected DEG,CM"),
         (["--camera", "image_2", "image_3", "--rig", "none.yaml"], "none.yaml"),
         (["--camera", "image_2", "image_3", "--method", "motion"], "need method joint, found motion"),
+        (["--camera", "image_2", "image_3", "--video", "a.avi"], "a_image_2.avi: expected a name that ends"),
     ],
 )
 def test_what_is_refused(

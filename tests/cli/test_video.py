@@ -122,9 +122,6 @@ def test_calibrate_refuses_before_it_works(
         assert main(["calibrate", str(street), "--out", str(out), "--video", str(video)]) == 2
         captured = capsys.readouterr()
         assert captured.err.count("\n") == 1 and message in captured.err
-    cameras = ["--camera", "image_2", "image_3"]
-    assert main(["calibrate", str(street), *cameras, "--video", str(tmp_path / "a.mp4")]) == 2
-    assert "--video: expected with one camera" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 

@@ -19,15 +19,15 @@ from sst_graph.cli.outputs import (
     check_apart,
     comparison,
     exit_code,
-    result_json,
+    result_numbers,
     write_calibration,
 )
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.cli.rig import given_cameras, refuse_rig_options, run_rig
-from sst_graph.cli.video import refuse_video_of_rig, video_beside
-from sst_graph.errors import ConfigError
+from sst_graph.cli.video import videos_beside
 from sst_graph.files import atomic_directory
+from sst_graph.files.strict_json import strict_json
 from sst_graph.inspect.report import Comparison, summary
 from sst_graph.result import WALL_CLOCK, CalibrationResult
 from sst_graph.types import Source
@@ -39,9 +39,6 @@ def run(args: argparse.Namespace) -> int:
     """Calibrate ``args.data``, print the summary of the result, write it."""
     cameras = given_cameras(args)
     if len(cameras) > 1:
-        refuse_video_of_rig(args)
-        if args.json:
-            raise ConfigError("--json: expected with one camera (a rig's numbers are in rig.json)")
         return run_rig(args, cameras)
     args.camera = cameras[0] if cameras else None
     refuse_rig_options(args)
@@ -49,7 +46,8 @@ def run(args: argparse.Namespace) -> int:
     inputs = {"DATA": None, "--init": args.init, "--config": args.config}
     for path in args.data:
         check_apart({**inputs, "DATA": path}, {"--out": args.out, "--video": args.video})
-    with video_beside(args) as video:
+    paths = [] if args.video is None else [args.video]
+    with videos_beside(paths, args.out, args.overwrite) as videos:
         with atomic_directory(args.out, args.overwrite, CALIBRATION) as folder:
             read_as = options_of(args)
             sources = open_drives(args)
@@ -64,17 +62,16 @@ def run(args: argparse.Namespace) -> int:
             if not args.json:
                 mention(summary(result, against))
             names = write_calibration(folder, result, sources, against, not args.no_report)
-            if video is not None and video.inside is not None:
-                names.append(video.write(folder / video.inside, result, sources))
+            for video in videos:
+                names += video.write_inside(folder, result, sources)
         if not args.json:
             mention(f"{'wrote':<15} {args.out}: {', '.join(names)}")
-        if video is not None and video.beside is not None:
-            video.write(video.beside.partial, result, sources)
-            video.beside.publish()
-            if not args.json:
-                mention(f"{'wrote':<15} {args.video}")
+        for video in videos:
+            for path in video.write_beside(result, sources):
+                if not args.json:
+                    mention(f"{'wrote':<15} {path}")
     if args.json:
-        say(result_json(result, against, {"out": str(args.out), "files": names}))
+        say(strict_json({**result_numbers(result, against), "out": str(args.out), "files": names}))
     return exit_code(result)
 
 
