@@ -80,7 +80,16 @@ class PaperConfig(Settings):
         at_most=1000,
         doc="Most frames of SST-Calib's joint stage. Raise it for more data, at a cost in time.",
     )
+    bidirectional: bool = setting(
+        True,
+        doc="Match pixels with points, too, as SST-Calib does. Set to false for its single-directional loss, "
+        "points to pixels only (w_l = 0).",
+    )
     seed: int = internal(0)
+
+    def weight(self, w_l: float) -> float:
+        """Of the loss from pixels to points: w_l, or 0 where it is left out."""
+        return w_l if self.bidirectional else 0.0
 
 
 @dataclass(frozen=True)
@@ -177,17 +186,17 @@ def solve_paper(problem: PaperProblem, guess: Calibration) -> NearestSolution:
             "no standing frame shows the classes to both sensors: the static stage needs the vehicle at rest"
         )
     # 2. The static stage.
-    static, static_remaining = _static_stage(still, guess, problem.progress)
+    static, static_remaining = _static_stage(problem, still, guess)
     # 3. The joint stage.
     moving = problem.moving(motions, stands)
     if not moving:
-        covariance = frozen_covariance(still, static, _STATIC_PHASES[-1][0])
+        covariance = frozen_covariance(still, static, problem.config.weight(_STATIC_PHASES[-1][0]))
         reason = "no moving frame with a known velocity: the joint stage was left out"
         counts: dict[str, object] = {"standstill_frames": len(still)}
         return NearestSolution(static, covariance, static_remaining, tuple(still), (reason,), counts)
     joint, remaining, moving = _joint_stage(problem, moving, static, motions)
     # 4. Covariance: the standing frames hold the extrinsic, in beta's place.
-    covariance = frozen_covariance([*still, *moving], joint, _JOINT_WEIGHT)
+    covariance = frozen_covariance([*still, *moving], joint, problem.config.weight(_JOINT_WEIGHT))
     counts = {"standstill_frames": len(still), "moving_frames": len(moving)}
     # beta holds the extrinsic where the static stage left it, so that stage's remaining step counts.
     remaining[:6] = static_remaining[:6]
@@ -201,8 +210,8 @@ def solve_static(problem: PaperProblem, guess: Calibration) -> NearestSolution:
         EstimationError: no frame shows a class to both sensors, or no point falls on any image.
     """
     still = still_frames(problem, guess)
-    result, remaining = _static_stage(still.frames, guess, problem.progress)
-    covariance = frozen_covariance(still.frames, result, _STATIC_PHASES[-1][0])
+    result, remaining = _static_stage(problem, still.frames, guess)
+    covariance = frozen_covariance(still.frames, result, problem.config.weight(_STATIC_PHASES[-1][0]))
     counts: dict[str, object] = {"frames": len(still.frames)}
     return NearestSolution(result, covariance, remaining, still.frames, still.reasons, counts)
 
@@ -268,18 +277,18 @@ def velocity_at(motions: Sequence[RelativeMotion], image: int) -> FloatArray:
 
 
 def _static_stage(
-    frames: Sequence[MatchFrame], start: Calibration, progress: Progress | None
+    problem: PaperProblem, frames: Sequence[MatchFrame], start: Calibration
 ) -> tuple[Calibration, FloatArray]:
     """The estimate and its remaining step."""
     at, remaining = start, np.zeros(7)
     done, total = 0, sum(iterations for _, iterations in _STATIC_PHASES)
     for weight, iterations in _STATIC_PHASES:
         for _ in range(iterations):
-            last, at = at, step_once(frames, at, weight)
+            last, at = at, step_once(frames, at, problem.config.weight(weight))
             remaining = iterations * last.to(at)
             done += 1
-            if progress is not None:
-                progress("static stage", done, total)
+            if problem.progress is not None:
+                problem.progress("static stage", done, total)
     return at, remaining
 
 
@@ -296,7 +305,8 @@ def _joint_stage(
         if iteration % _VELOCITY_EVERY == 0:
             motions = camera_motions(problem.drives, at, motions)
             moving = [f.moving_at(velocity_at(motions[f.pair.drive], f.pair.image_position)) for f in moving]
-        last, at = at, step_once(moving, at, _JOINT_WEIGHT, beta, offset_free=True)
+        weight = problem.config.weight(_JOINT_WEIGHT)
+        last, at = at, step_once(moving, at, weight, beta, offset_free=True)
         remaining = _JOINT_ITERATIONS * last.to(at)
         if problem.progress is not None:
             problem.progress("joint stage", iteration + 1, _JOINT_ITERATIONS)

@@ -581,16 +581,30 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument(
         "name",
         metavar="NAME",
-        help="accuracy, assumptions, consistency, drives, fit, motion, paper-table, rigs, slam or windows; "
-        "any other name prints what each of them shows; drives and windows need real drives: "
-        "--set 'data=[\"DATA\"]'",
+        help="accuracy, assumptions, consistency, drives, fit, motion, rigs, slam, windows, or a table of "
+        "SST-Calib: table1, table2, table3, table4; any other name prints what each of them shows; drives "
+        "and windows need --data",
+    )
+    experiment.add_argument(
+        "--data",
+        nargs="+",
+        metavar="DIR",
+        help="real drives with a reference calibration, or a KITTI odometry root, of which table1 to table4 "
+        "take sequence 00 (default: simulated streets)",
     )
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")
     experiment.add_argument("--seed", type=int, help="seed of the first street")
     experiment.add_argument("--methods", metavar="A,B", help="methods to compare, such as paper,joint")
+    experiment.add_argument("--jobs", type=int, metavar="N", help="table1 to table4: processes (default: 1)")
     _add_settings(experiment)
-    experiment.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: the terminal)")
-    experiment.add_argument("--overwrite", action="store_true", help="replace the file")
+    experiment.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="file to write (default: the terminal); table1 to table4 put a CSV, a plot and the runs beside "
+        "it, and go on from those runs",
+    )
+    experiment.add_argument("--overwrite", action="store_true", help="replace the files")
     return experiment
 
 

@@ -15,11 +15,11 @@ from sst_graph.experiments import (
     drives,
     fit,
     motion,
-    paper_table,
     rigs,
     slam,
     windows,
 )
+from sst_graph.experiments.paper.tables import TABLES, PaperTable
 
 
 @dataclass(frozen=True)
@@ -30,11 +30,13 @@ class Experiment:
         summary: what it shows, in a line.
         config: its default settings, a frozen dataclass.
         run: makes its Markdown from settings of that class.
+        table: what else it writes, and what makes it resumable; None where the Markdown is all.
     """
 
     summary: str
     config: Any
     run: Callable[[Any, Progress | None], str]
+    table: PaperTable | None = None
 
 
 EXPERIMENTS: Mapping[str, Experiment] = {
@@ -68,11 +70,6 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         motion.MotionTableConfig(),
         motion.run,
     ),
-    "paper-table": Experiment(
-        "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
-        paper_table.PaperTableConfig(),
-        paper_table.run,
-    ),
     "rigs": Experiment(
         "several cameras on one LiDAR: errors, joint NEES, and what a known pose between cameras adds",
         rigs.RigTableConfig(),
@@ -83,6 +80,7 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         slam.SlamConfig(),
         slam.run,
     ),
+    **{name: Experiment(one.summary, one.config, one.run, one) for name, one in TABLES.items()},
     "windows": Experiment(
         "real drives cut into windows: the spread of the results against the claimed sigmas",
         windows.WindowsConfig(),

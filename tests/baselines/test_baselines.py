@@ -23,7 +23,13 @@ from sst_graph.baselines.nearest_pixel_frames import (
 )
 from sst_graph.baselines.second_search import SecondSearch
 from sst_graph.baselines.semalign import sampled_poses, truncated_distances
-from sst_graph.baselines.sst_calib import camera_motions, velocity_at
+from sst_graph.baselines.sst_calib import (
+    PaperConfig,
+    PaperProblem,
+    camera_motions,
+    solve_static,
+    velocity_at,
+)
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
 from sst_graph.cli import main
 from sst_graph.data import open_source
@@ -125,6 +131,20 @@ def test_one_step_at_a_time_brings_the_delay(drive: Drive, truth: GroundTruth) -
         assert at.time_offset_s < moved.time_offset_s < 1.2 * OFFSET_S
         assert np.abs(truth.cTl.localCoordinates(moved.cTl)).max() < 0.05
         at = moved
+
+
+def test_the_single_directional_loss_leaves_the_pixels_out(drive: Drive, truth: GroundTruth) -> None:
+    """As many steps as the static stage makes, by hand with w_l = 0."""
+    config = PaperConfig(static_frames=2, bidirectional=False)
+    problem = PaperProblem([drive], (SemanticClass.VEHICLE,), config)
+    start = Calibration(off_start(truth), 0.0)
+    found = solve_static(problem, start)
+    at = start
+    for _ in range(60):
+        at = step_once(found.frames, at, 0.0)
+    assert found.calibration.cTl.equals(at.cTl, 1e-9)
+    both = PaperProblem([drive], (SemanticClass.VEHICLE,), dataclasses.replace(config, bidirectional=True))
+    assert not solve_static(both, start).calibration.cTl.equals(at.cTl, 1e-3)
 
 
 def test_velocities_are_those_of_the_street(drive: Drive, truth: GroundTruth) -> None:

@@ -9,16 +9,23 @@ from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
 from sst_graph.cli.outputs import check_apart
 from sst_graph.cli.progress import ProgressBar
+from sst_graph.experiments.paper.config import PaperTableConfig
+from sst_graph.experiments.paper.tables import STATE, PaperTable
 from sst_graph.experiments.registry import experiment
 from sst_graph.files import output_file
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the experiment ``args.name``; its Markdown goes to ``args.out``, or to the terminal."""
+    """Run the experiment ``args.name``; its Markdown goes to ``args.out``, or to the terminal.
+
+    Tables of the paper have further files beside ``args.out``.
+    """
     chosen = experiment(args.name)
     methods = None if args.methods is None else [m.strip() for m in args.methods.split(",") if m.strip()]
-    flags = {"streets": args.streets, "seed": args.seed, "methods": methods}
-    config = settings(chosen.config, args, flags)
+    flags = {"data": args.data, "streets": args.streets, "seed": args.seed, "methods": methods}
+    config = settings(chosen.config, args, flags | {"jobs": args.jobs})
+    if chosen.table is not None and args.out is not None:
+        return _write_table(chosen.table, config, args)
     check_apart({"--config": args.config}, {"--out": args.out})
     with ExitStack() as outputs:
         out = None if args.out is None else outputs.enter_context(output_file(args.out, args.overwrite))
@@ -29,4 +36,19 @@ def run(args: argparse.Namespace) -> int:
             return 0
         out.write_text(text)
     mention(f"{'wrote':<15} {args.out}")
+    return 0
+
+
+def _write_table(table: PaperTable, config: PaperTableConfig, args: argparse.Namespace) -> int:
+    """All files of a table of the paper; what is done stays in its file of runs, whatever ends the rest."""
+    paths = table.paths(config, args.out)
+    named = {"--out": args.out, **{f"the {path.suffix[1:]} beside it": path for path in paths[1:]}}
+    check_apart({"--config": args.config}, {**named, "the file of runs": args.out.parent / STATE})
+    with ExitStack() as outputs:
+        files = {path: outputs.enter_context(output_file(path, args.overwrite)) for path in paths}
+        with ProgressBar() as progress:
+            contents = table.files(config, progress, args.out)
+        for path, text in contents.items():
+            files[path].write_text(text)
+    mention(f"{'wrote':<15} {', '.join(str(path) for path in paths)}")
     return 0
