@@ -41,9 +41,9 @@ class CalibrationConfig(Settings):
     method: Method = setting(
         "auto",
         doc="What estimates: auto (joint where both sensors have labels, both where one of several drives "
-        "has none, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, no "
-        "labels), both (joint where frames have labels, edges in the others), motion (LiDAR against visual "
-        "odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
+        "has none, else edges), joint (outlines of labelled objects), edges (LiDAR edges against pictures, "
+        "no labels), both (joint where frames have labels, edges in the others), motion (LiDAR against "
+        "visual odometry, no labels), paper (SST-Calib as printed), static (its first stage), semalign.",
     )
     classes: tuple[SemanticClass, ...] = setting(
         (SemanticClass.VEHICLE,),

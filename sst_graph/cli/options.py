@@ -173,8 +173,8 @@ def _add_method(command: _Parser) -> None:
         "--method",
         choices=("auto", "joint", "edges", "both", "motion", "paper", "static", "semalign"),
         help="auto: joint where both sensors have labels, both where one of several drives has none, else "
-        "edges (default); joint: extrinsic and offset by outlines of labelled objects; edges: the same by LiDAR "
-        "edges and pictures, no labels needed; both: joint in frames with labels, edges in the others; "
+        "edges (default); joint: extrinsic and offset by outlines of labelled objects; edges: the same by "
+        "LiDAR edges and pictures, no labels needed; both: joint in frames with labels, edges in the others; "
         "motion: LiDAR odometry against visual odometry, no labels needed; paper: SST-Calib as printed; "
         "static: its first stage, the extrinsic alone; semalign: sampled starts, the extrinsic alone",
     )
