@@ -10,7 +10,7 @@ WORKERS ?= 2
 # Many small matrices: threads inside NumPy and OpenCV only get in each other's way.
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: setup test test-slow lint demo bench mutate release-check image docs lock clean
+.PHONY: setup test test-slow lint demo bench guard mutate release-check image docs lock clean
 
 setup: $(INSTALLED)
 
@@ -37,6 +37,10 @@ demo: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -n 0
+
+# Fails when a hot path costs a quarter more than benchmarks/guard.json says.
+guard: $(INSTALLED)
+	$(BIN)/python -m benchmarks.guard
 
 # How many small faults in factors/ its tests find; SAMPLE mutants, at random.
 SAMPLE ?= 600
