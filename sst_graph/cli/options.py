@@ -581,9 +581,9 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument(
         "name",
         metavar="NAME",
-        help="accuracy, assumptions, consistency, drives, fit, motion, rigs, slam, windows, or a table of "
-        "SST-Calib: table1, table2, table3, table4; any other name prints what each of them shows; drives "
-        "and windows need --data",
+        help="accuracy, assumptions, basin, consistency, drives, fit, motion, peers, rigs, slam, windows, or "
+        "a table of SST-Calib: table1, table2, table3, table4; any other name prints what each of them "
+        "shows; drives and windows need --data",
     )
     experiment.add_argument(
         "--data",
@@ -595,7 +595,9 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")
     experiment.add_argument("--seed", type=int, help="seed of the first street")
     experiment.add_argument("--methods", metavar="A,B", help="methods to compare, such as paper,joint")
-    experiment.add_argument("--jobs", type=int, metavar="N", help="table1 to table4: processes (default: 1)")
+    experiment.add_argument(
+        "--jobs", type=int, metavar="N", help="basin, peers, table1 to table4: processes (default: 1)"
+    )
     _add_settings(experiment)
     experiment.add_argument(
         "--out",
