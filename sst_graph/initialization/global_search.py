@@ -168,7 +168,8 @@ class SearchProblem:
             box = np.radians(self.config.rotation_deg)
             axis = _BOX_STEP * np.arange(-round(box / _BOX_STEP), round(box / _BOX_STEP) + 1)
             vectors = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
-            vectors = vectors[np.linalg.norm(vectors, axis=1) <= _REACH * box]
+            # Beyond half a turn are the same rotations again.
+            vectors = vectors[np.linalg.norm(vectors, axis=1) <= min(_REACH * box, np.pi)]
             rotations = rotation_matrices(vectors) @ np.asarray(self.guess.rotation().matrix())
             translation = np.asarray(self.guess.translation(), dtype=np.float64)
         m = len(rotations)
