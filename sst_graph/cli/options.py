@@ -580,13 +580,14 @@ def _add_experiment(commands: argparse._SubParsersAction[_Parser]) -> argparse.A
     experiment.add_argument(
         "name",
         metavar="NAME",
-        help="accuracy, assumptions, consistency, drives, fit, motion, paper-table, rigs, slam or windows; "
-        "any other name prints what each of them shows; drives and windows need real drives: "
-        "--set 'data=[\"DATA\"]'",
+        help="accuracy, assumptions, basin, consistency, drives, fit, motion, paper-table, peers, rigs, slam "
+        "or windows; any other name prints what each of them shows; drives and windows need --data",
     )
     experiment.add_argument("--streets", type=int, metavar="N", help="number of streets")
     experiment.add_argument("--seed", type=int, help="seed of the first street")
     experiment.add_argument("--methods", metavar="A,B", help="methods to compare, such as paper,joint")
+    experiment.add_argument("--data", nargs="+", metavar="DRIVE", help="real drives with a calibration")
+    experiment.add_argument("--jobs", type=int, metavar="N", help="processes at a time")
     _add_settings(experiment)
     experiment.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: the terminal)")
     experiment.add_argument("--overwrite", action="store_true", help="replace the file")

@@ -11,6 +11,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.experiments import (
     accuracy,
     assumptions,
+    basin,
     consistency,
     drives,
     fit,
@@ -20,6 +21,8 @@ from sst_graph.experiments import (
     slam,
     windows,
 )
+from sst_graph.experiments.peers import runs as peer_runs
+from sst_graph.experiments.peers import table as peer_table
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         assumptions.AssumptionTableConfig(),
         assumptions.run,
     ),
+    "basin": Experiment(
+        "starts over the whole sphere of rotations: failures and silent failures, with their bounds",
+        basin.BasinConfig(),
+        basin.run,
+    ),
     "consistency": Experiment(
         "NEES and coverage of the covariance over many short simulated drives",
         consistency.ConsistencyConfig(),
@@ -72,6 +80,11 @@ EXPERIMENTS: Mapping[str, Experiment] = {
         "the paper's table: QAD, AEAD, ATD and failures from wrong starts on simulated streets",
         paper_table.PaperTableConfig(),
         paper_table.run,
+    ),
+    "peers": Experiment(
+        "other methods, re-implemented, beside ours from the same starts: error, failures, time, memory",
+        peer_runs.PeersConfig(),
+        peer_table.run,
     ),
     "rigs": Experiment(
         "several cameras on one LiDAR: errors, joint NEES, and what a known pose between cameras adds",

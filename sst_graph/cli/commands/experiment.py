@@ -18,6 +18,7 @@ def run(args: argparse.Namespace) -> int:
     chosen = experiment(args.name)
     methods = None if args.methods is None else [m.strip() for m in args.methods.split(",") if m.strip()]
     flags = {"streets": args.streets, "seed": args.seed, "methods": methods}
+    flags |= {"data": args.data, "jobs": args.jobs}
     config = settings(chosen.config, args, flags)
     check_apart({"--config": args.config}, {"--out": args.out})
     with ExitStack() as outputs:

@@ -1,0 +1,173 @@
+"""Consistency of the points in each mask: CalibAnything (Luo et al., 2023).
+
+Source: github.com/OpenCalib/CalibAnything, ``calibration.cpp``. A pose is good where the points in a mask
+have like normals (0.3), like intensities (0.2) and are of one segment (0.5). It is sought by rounds of random
+search about the best pose, the first as wide as the starts' error plus 0.5 deg and 5 cm, each next half
+as wide in rotation and 1.5 times less in translation, until 0.3 deg.
+
+Masks are those of the data (an object, a class or the background each) in place of Segment Anything's, and
+do not overlap. Segments are clusters of the points above the ground, and the ground, in place of RANSAC
+planes and Euclidean clusters. Of a mask's normals at most 60 are compared. Without intensities their term is
+constant, as where all returns are equal.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from sst_graph.experiments.peers.frames import PeerFrame, PeerProblem, moved_by
+from sst_graph.types import SemanticClass
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_NORMALS_OF = 40
+"""Neighbours of a normal: the original's."""
+_POINTS = 2500
+"""Most points of a frame, evenly; the original keeps one a voxel of 0.1 m."""
+_CLUSTER_M, _CLUSTER_POINTS = 0.25, 50
+"""Tolerance [m] and least size of a cluster: the original's."""
+_COMPARED = 60
+"""Most normals of a mask that are compared with each other."""
+_STOP_DEG = 0.3
+_SECOND_BEST = 0.5 ** np.arange(64)
+
+
+@dataclass(frozen=True, eq=False)
+class _MaskFrame:
+    """Points of a frame with what is compared.
+
+    Attributes:
+        frame: where they are seen.
+        lPs, normals: (n, 3) [m].
+        intensities: (n,) 0 to 1; 0 where the data tell none.
+        segments: (n,) number of the segment, or -1.
+        masks: (h, w) number of the mask, from 1; sizes (m + 1,) pixels of each.
+        points_a_pixel: points on the image at the start, to a pixel of its lower half.
+    """
+
+    frame: PeerFrame
+    lPs: FloatArray
+    normals: FloatArray
+    intensities: FloatArray
+    segments: IntArray
+    masks: IntArray
+    sizes: IntArray
+    points_a_pixel: float
+
+    def cost(self, cTl: gtsam.Pose3) -> float:
+        """2 - 0.3 normals - 0.2 intensities - 0.5 segments - 0.0001 masks, or 2 where too little is seen."""
+        camera = self.frame.camera
+        inside, uvs = self.frame.pixels(cTl, self.lPs)
+        row = np.clip(uvs[:, 1].astype(np.intp), 0, camera.height - 1)
+        column = np.clip(uvs[:, 0].astype(np.intp), 0, camera.width - 1)
+        bottom = np.count_nonzero(row > 0.9 * camera.height)
+        if bottom < 0.1 * self.points_a_pixel * 0.1 * camera.height * camera.width:
+            return 2.0
+        mask = self.masks[row, column]
+        order = np.argsort(mask, kind="stable")
+        ends = np.searchsorted(mask[order], np.arange(len(self.sizes) + 1))
+        least = min(camera.height * camera.width // 1200, 2000)
+        rows = []
+        for number in range(1, len(self.sizes)):
+            members = inside[order[ends[number] : ends[number + 1]]]
+            expected = self.sizes[number] * self.points_a_pixel
+            if self.sizes[number] >= least and len(members) >= max(10.0, 0.1 * expected):
+                rows.append(self._consistency(members))
+        if not rows:
+            return 2.0
+        normal, intensity, segment, count, in_segments = np.array(rows).T
+        if in_segments.sum() == 0.0:
+            return 2.0
+        weight = count / count.sum()
+        by_segment = float(segment @ in_segments / in_segments.sum())
+        return float(
+            2.0 - 0.3 * normal @ weight - 0.2 * intensity @ weight - 0.5 * by_segment - 1e-4 * len(rows)
+        )
+
+    def _consistency(self, members: IntArray) -> tuple[float, float, float, float, float]:
+        """Of normals, intensities and segments; points, and points in segments."""
+        some = self.normals[members[:: max(1, -(-len(members) // _COMPARED))]]
+        normal = float(np.abs(some @ some.T).mean())
+        known = self.segments[members]
+        counts = np.sort(np.bincount(known[known >= 0]))[::-1]
+        counts = counts[counts > 0][: len(_SECOND_BEST)]
+        total = float(counts.sum())
+        segment = float(counts @ _SECOND_BEST[: len(counts)]) / total if total else 0.0
+        return normal, 1.0 - float(self.intensities[members].std()), segment, float(len(members)), total
+
+
+def solve_mask_consistency(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.Pose3:
+    """The best pose of the random search."""
+    frames = [_mask_frame(frame, start) for frame in problem.frames]
+    rng = np.random.default_rng(problem.seed)
+    width_deg, width_m = problem.range_deg + 0.5, problem.range_m + 0.05
+
+    def cost(pose: gtsam.Pose3) -> float:
+        return sum(frame.cost(pose) for frame in frames)
+
+    cTl, best = start, cost(start)
+    while width_deg > _STOP_DEG:
+        widths = np.repeat([np.radians(width_deg), width_m], 3)
+        centre = cTl
+        for _ in range(problem.samples):
+            pose = moved_by(centre, widths * rng.uniform(-1.0, 1.0, 6))
+            value = cost(pose)
+            if value < best:
+                cTl, best = pose, value
+        width_deg, width_m = width_deg / 2.0, width_m / 1.5
+    return cTl
+
+
+def _mask_frame(frame: PeerFrame, start: gtsam.Pose3) -> _MaskFrame:
+    some, lPs, normals, segments = _segmented(frame)
+    masks, sizes = masks_of(frame)
+    _, uvs = frame.pixels(start, lPs)
+    lower = np.count_nonzero(uvs[:, 1] > 0.5 * frame.camera.height)
+    share = lower / (0.5 * frame.camera.height * frame.camera.width)
+    intensities = np.zeros(len(some)) if frame.intensities is None else frame.intensities[some]
+    return _MaskFrame(frame, lPs, normals, intensities, segments, masks, sizes, share)
+
+
+@functools.lru_cache(maxsize=64)
+def _segmented(frame: PeerFrame) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
+    """Points that are kept (m,), where they are (m, 3) [m], their normals (m, 3), their segments (m,)."""
+    ahead = np.flatnonzero(frame.lPs[:, 0] > 0.0)
+    tree = cKDTree(frame.lPs[ahead])
+    some = ahead[:: max(1, -(-len(ahead) // _POINTS))]
+    lPs = frame.lPs[some]
+    around = frame.lPs[ahead][tree.query(lPs, min(_NORMALS_OF, len(ahead)))[1]]
+    off = around - around.mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(off.transpose(0, 2, 1) @ off)[1][:, :, 0]
+    # Clusters of all points that are not on the ground, then the ground as one more.
+    standing = np.flatnonzero(~np.isin(frame.classes[ahead], (SemanticClass.GROUND, SemanticClass.TERRAIN)))
+    segments = np.full(len(frame.lPs), -1, dtype=np.intp)
+    if len(standing):
+        pairs = cKDTree(frame.lPs[ahead[standing]]).query_pairs(_CLUSTER_M, output_type="ndarray")
+        links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(standing),) * 2)
+        labels = connected_components(links, directed=False)[1]
+        large = np.bincount(labels)[labels] >= _CLUSTER_POINTS
+        segments[ahead[standing]] = np.where(large, labels + 1, -1)
+    ground = np.isin(frame.classes, (SemanticClass.GROUND, SemanticClass.TERRAIN))
+    segments[ground] = 0
+    return some, lPs, normals, segments[some]
+
+
+def masks_of(frame: PeerFrame) -> tuple[IntArray, IntArray]:
+    """(h, w) number of the mask that each pixel lies in, from 1, and (m + 1,) pixels of each.
+
+    An object with an instance number is a mask, what is left of each class another one, the background too.
+    """
+    instances = np.zeros_like(frame.mask, dtype=np.int64) if frame.instances is None else frame.instances
+    both = frame.mask.astype(np.int64) * 65536 + instances
+    numbers, masks = np.unique(both, return_inverse=True)
+    masks = masks.reshape(both.shape).astype(np.intp) + 1
+    return masks, np.bincount(masks.ravel(), minlength=len(numbers) + 1)

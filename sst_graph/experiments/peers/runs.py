@@ -1,0 +1,245 @@
+"""Every method from every start on one drive."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import tracemalloc
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+
+from sst_graph.batch import CalibrationConfig, calibrate_prepared, prepare_drives
+from sst_graph.batch.config import Method
+from sst_graph.config import Settings, setting
+from sst_graph.data import open_source
+from sst_graph.drive.preparation import Drive, prepare_drive
+from sst_graph.errors import ConfigError, EstimationError
+from sst_graph.experiments.peers.frames import PeerProblem, peer_frames
+from sst_graph.experiments.peers.methods import NAMES, OWN, PEERS
+from sst_graph.experiments.starts import start_near
+from sst_graph.metrics import calibration_errors
+from sst_graph.odometry.sweep import with_sweep
+from sst_graph.result import CalibrationResult
+from sst_graph.simulator import SimulationConfig, simulate
+from sst_graph.types import GroundTruth, Source
+
+
+@dataclass(frozen=True)
+class PeersConfig(Settings):
+    """Drives, starts and methods.
+
+    Attributes:
+        streets: number of simulated streets, beside the ``data``.
+        seed: of the first street and of the starts.
+        data: folders of drives that bring a reference calibration.
+        image_shift: with which these are read.
+        methods: that are compared.
+        ranges_deg: half widths of the starts' rotation error, uniform by axis, one after the other [deg].
+        metres_a_degree: half width of the translation error, in proportion to that of the rotation [m/deg].
+        starts: of each drive and range.
+        frames: that the peers are given, evenly over the drive; the package's methods choose their own.
+        samples: poses of each round of CalibAnything's random search; the original leaves it to its user.
+        failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
+        jobs: drives at a time, a process each.
+        records: file that keeps finished drives, from which a further call goes on.
+        figure: SVG to write, of error against start.
+        street: the rest of the streets.
+        calibration: settings of the package's methods.
+    """
+
+    streets: int = setting(2, at_least=0, at_most=10_000)
+    seed: int = setting(800, at_least=0, at_most=10**15)
+    data: tuple[str, ...] = setting((), length=(0, 1000))
+    image_shift: int = setting(1, at_least=-1000, at_most=1000)
+    methods: tuple[str, ...] = setting(NAMES, length=(1, 100), choices=NAMES)
+    ranges_deg: tuple[float, ...] = setting(
+        (1.0, 2.0, 5.0, 10.0, 20.0), at_least=0.0, at_most=180.0, length=(1, 100)
+    )
+    metres_a_degree: float = setting(0.01, at_least=0.0, at_most=1.0)
+    starts: int = setting(1, at_least=1, at_most=10_000)
+    frames: int = setting(3, at_least=1, at_most=1000)
+    samples: int = setting(1000, at_least=1, at_most=10**7)
+    failed_deg: float = setting(1.0, at_least=0.0, at_most=180.0)
+    failed_m: float = setting(0.2, at_least=0.0, at_most=100.0)
+    jobs: int = setting(1, at_least=1, at_most=1000)
+    records: str = ""
+    figure: str = ""
+    street: SimulationConfig = field(
+        default_factory=lambda: SimulationConfig(frames=30, azimuth_limit_deg=60.0, time_offset_s=0.1)
+    )
+    calibration: CalibrationConfig = field(default_factory=lambda: CalibrationConfig(find_causes=False))
+
+    def __post_init__(self) -> None:
+        if self.streets == 0 and not self.data:
+            raise ConfigError("streets, data: found neither, expected streets or drives")
+
+
+@dataclass(frozen=True)
+class PeerTask:
+    """One drive.
+
+    Attributes:
+        place: folder of a drive, or "" for a simulated street.
+        number: of the drive.
+        config: all settings that its runs depend on.
+    """
+
+    place: str
+    number: int
+    config: PeersConfig
+
+
+@dataclass(frozen=True)
+class PeerRun:
+    """One method from one start.
+
+    Attributes:
+        drive: name of the drive.
+        simulated: whether it is a street.
+        method: its name, or "start" for the start itself.
+        range_deg: half width of the start's error.
+        qad_deg, atd_m: errors of the result; None where the method could not be run.
+        status: what the result says of itself; "" of a peer, which says nothing.
+        sigma_deg: claimed standard deviation of the rotation (root of the mean variance), or None.
+        seconds: that it took, without reading and preparing the drive, or None where it could not be run.
+        peak_mb: most memory of Python and NumPy at once beside the prepared drive (tracemalloc); only of the
+            first start.
+        why_not: why it could not be run, or "".
+    """
+
+    drive: str
+    simulated: bool
+    method: str
+    range_deg: float
+    qad_deg: float | None
+    atd_m: float | None
+    status: str
+    sigma_deg: float | None
+    seconds: float | None
+    peak_mb: float | None
+    why_not: str = ""
+
+    def failed(self, config: PeersConfig) -> bool:
+        if self.qad_deg is None or self.atd_m is None:
+            return True
+        rotation_only = self.method in PEERS and PEERS[self.method].rotation_only
+        return self.qad_deg > config.failed_deg or (not rotation_only and self.atd_m > config.failed_m)
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """Where a method ended."""
+
+    cTl: gtsam.Pose3
+    status: str = ""
+    sigma_deg: float | None = None
+
+
+_Solver = Callable[[gtsam.Pose3, float], _Answer]
+"""From a start and the half width of its error [deg]."""
+
+
+def runs_of_drive(task: PeerTask) -> list[PeerRun]:
+    """All methods from all starts on one drive.
+
+    Raises:
+        DataError: the drive cannot be used.
+        ConfigError: it brings no reference calibration.
+    """
+    config = task.config
+    source = _source(task)
+    truth = source.truth
+    if truth is None:
+        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
+    solvers = _solvers(source, truth, config)
+    rng = np.random.default_rng([config.seed, task.number, 25])
+    found = []
+    for range_deg in config.ranges_deg:
+        for number in range(config.starts):
+            start = start_near(truth.cTl, range_deg, config.metres_a_degree * range_deg, rng)
+            plain = PeerRun(source.name, not task.place, "start", range_deg, 0.0, 0.0, "", None, None, None)
+            found.append(_with_errors(plain, start, truth))
+            for method, solve in solvers.items():
+                run = _run(dataclasses.replace(plain, method=method), solve, start, truth)
+                if number == 0 and range_deg == config.ranges_deg[0] and not run.why_not:
+                    # Once more, for tracing makes it slow.
+                    run = dataclasses.replace(run, peak_mb=_peak_mb(solve, start, range_deg))
+                found.append(run)
+    return found
+
+
+def _source(task: PeerTask) -> Source:
+    if task.place:
+        return open_source(task.place, image_shift=task.config.image_shift)
+    return simulate(dataclasses.replace(task.config.street, seed=task.config.seed + task.number))
+
+
+def _solvers(source: Source, truth: GroundTruth, config: PeersConfig) -> dict[str, _Solver]:
+    """Every method on a drive that is read once, twice with method edges."""
+    offset_s = truth.time_offset_s or 0.0
+    swept = with_sweep(source, config.calibration.decide_sweep)
+    drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)
+    frames = peer_frames(swept, drive, offset_s, config.frames)
+    problem = PeerProblem(frames, drive, offset_s, samples=config.samples, seed=config.seed)
+    solvers: dict[str, _Solver] = {}
+    for method in config.methods:
+        if method in PEERS:
+            solvers[method] = _by_peer(problem, method, config)
+        elif method in OWN:
+            own = dataclasses.replace(config.calibration, method=_method(method))
+            prepared = prepare_drives([swept], own)[0] if method == "edges" else drive
+            solvers[method] = _by_package(prepared, own, offset_s)
+    return solvers
+
+
+def _method(name: str) -> Method:
+    names: dict[str, Method] = {"joint": "joint", "edges": "edges", "paper": "paper", "semalign": "semalign"}
+    return names[name]
+
+
+def _by_peer(problem: PeerProblem, method: str, config: PeersConfig) -> _Solver:
+    def solve(start: gtsam.Pose3, range_deg: float) -> _Answer:
+        told = dataclasses.replace(problem, range_deg=range_deg, range_m=config.metres_a_degree * range_deg)
+        return _Answer(PEERS[method].solve(told, start))
+
+    return solve
+
+
+def _by_package(drive: Drive, config: CalibrationConfig, offset_s: float) -> _Solver:
+    def solve(start: gtsam.Pose3, range_deg: float) -> _Answer:
+        result = calibrate_prepared([drive], start, config, initial_time_offset_s=offset_s)
+        return _Answer(result.T_camera_lidar, result.status, _rotation_sigma_deg(result))
+
+    return solve
+
+
+def _rotation_sigma_deg(result: CalibrationResult) -> float:
+    return float(np.degrees(np.sqrt(np.trace(np.asarray(result.covariance)[:3, :3]) / 3.0)))
+
+
+def _run(run: PeerRun, solve: _Solver, start: gtsam.Pose3, truth: GroundTruth) -> PeerRun:
+    began = time.perf_counter()
+    try:
+        answer = solve(start, run.range_deg)
+    except EstimationError as error:
+        return dataclasses.replace(run, qad_deg=None, atd_m=None, why_not=str(error))
+    seconds = time.perf_counter() - began
+    run = dataclasses.replace(run, status=answer.status, sigma_deg=answer.sigma_deg, seconds=seconds)
+    return _with_errors(run, answer.cTl, truth)
+
+
+def _peak_mb(solve: _Solver, start: gtsam.Pose3, range_deg: float) -> float:
+    tracemalloc.start()
+    try:
+        solve(start, range_deg)
+        return 1e-6 * tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def _with_errors(run: PeerRun, cTl: gtsam.Pose3, truth: GroundTruth) -> PeerRun:
+    errors = calibration_errors(cTl, 0.0, GroundTruth(truth.cTl, None))
+    return dataclasses.replace(run, qad_deg=errors.qad_deg, atd_m=errors.atd_m)

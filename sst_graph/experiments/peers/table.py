@@ -1,0 +1,160 @@
+"""The table and the figure of the peers."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from sst_graph.drive.preparation import Progress
+from sst_graph.errors import MissingDependencyError
+from sst_graph.experiments.peers.methods import OWN, PEERS
+from sst_graph.experiments.peers.runs import PeerRun, PeersConfig, PeerTask, runs_of_drive
+from sst_graph.experiments.resumable import Work, rows_of
+from sst_graph.files import atomic_write_bytes
+
+_COLOURS = ("#d1342f", "#2b8a3e", "#1c64c8", "#c77700", "#7b4ab5", "#008b8b", "#9aa2ab", "#b8567f", "#5c5c5c")
+
+
+def run(config: PeersConfig, progress: Progress | None = None) -> str:
+    """The tables as Markdown: simulated streets, then real drives; the figure where it is asked for.
+
+    Raises:
+        ConfigError: the records are of another kind.
+        DataError: a drive cannot be used.
+        MissingDependencyError: a figure is asked for, and matplotlib is not installed.
+    """
+    figure_of = _figure_class() if config.figure else None
+    # What changes nothing of what is found on one drive.
+    own = dataclasses.replace(config, streets=1, data=(), jobs=1, records="", figure="")
+    places = [*("" for _ in range(config.streets)), *config.data]
+    tasks = [PeerTask(place, number, own) for number, place in enumerate(places)]
+    found = rows_of(Work(runs_of_drive, PeerRun, config.jobs, config.records), tasks, progress)
+    runs = [row for rows in found for row in rows]
+    if figure_of is not None:
+        atomic_write_bytes(config.figure, figure(runs, config, figure_of))
+    return markdown(runs, config)
+
+
+def markdown(runs: Sequence[PeerRun], config: PeersConfig) -> str:
+    """The tables: one of streets, one of each real drive."""
+    groups = [("simulated streets", [row for row in runs if row.simulated])]
+    for name in dict.fromkeys(row.drive for row in runs if not row.simulated):
+        groups.append((name, [row for row in runs if row.drive == name and not row.simulated]))
+    parts = [
+        f"Cells: median rotation error [deg] / median ATD [cm] / failed of all (rotation above "
+        f"{config.failed_deg:g}° or ATD above {100.0 * config.failed_m:g} cm, or no result). Starts within "
+        f"± the angle by axis and ±{100.0 * config.metres_a_degree:g} cm a degree. All are given the true "
+        "time offset. *r*: re-implementation. Memory: peak of Python and NumPy beside the "
+        "prepared drive (tracemalloc), first start.",
+    ]
+    for title, own in groups:
+        if own:
+            parts += ["", f"**{title}**", "", *_table(own, config)]
+    return "\n".join(parts) + "\n"
+
+
+def _table(runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
+    head = ["method", *(f"±{r:g}°" for r in config.ranges_deg), "silent", "σ of rotation", "seconds", "MB"]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for method in dict.fromkeys(row.method for row in runs):
+        own = [row for row in runs if row.method == method]
+        label = method if method in ("start", *OWN) else f"{method} *r*"
+        reasons = {row.why_not for row in own}
+        if "" not in reasons:
+            lines.append(f"| {label} | " + " | ".join(["–"] * (len(head) - 2)) + f" | {reasons.pop()} |")
+            continue
+        cells = [_cell([row for row in own if row.range_deg == r], config) for r in config.ranges_deg]
+        lines.append("| " + " | ".join([label, *cells, *_remaining_cells(method, own, config)]) + " |")
+    return lines
+
+
+def _cell(runs: Sequence[PeerRun], config: PeersConfig) -> str:
+    failed = sum(row.failed(config) for row in runs)
+    qad = _median([row.qad_deg for row in runs], 2)
+    rotation_only = any(row.method in PEERS and PEERS[row.method].rotation_only for row in runs)
+    atd = "–" if rotation_only else _median([None if r.atd_m is None else 100.0 * r.atd_m for r in runs], 1)
+    return f"{qad} / {atd} / {failed} of {len(runs)}"
+
+
+def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
+    if method == "start":
+        return ["–"] * 4
+    silent = sum(row.failed(config) and row.status == "ok" for row in runs)
+    return [
+        str(silent) if method in OWN else "says nothing",
+        _median([row.sigma_deg for row in runs], 2, "°") if method in OWN else "none",
+        _median([row.seconds for row in runs], 1),
+        _median([row.peak_mb for row in runs], 0),
+    ]
+
+
+def _median(values: Sequence[float | None], digits: int, unit: str = "") -> str:
+    known = [value for value in values if value is not None]
+    return f"{np.median(known):.{digits}f}{unit}" if known else "–"
+
+
+def _figure_class() -> Callable[..., Any]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingDependencyError(
+            "the figure needs matplotlib, which is not installed: pip install 'sst-graph[plot]'"
+        ) from error
+    return Figure
+
+
+def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[..., Any]) -> bytes:
+    """SVG: median rotation error against the half width of the starts' error; streets and real drives."""
+    from matplotlib import rc_context
+
+    groups = [(name, some) for name, some in _panels(runs) if some]
+    drawing = figure_of(figsize=(4.6 * len(groups) + 1.6, 4.2))
+    panels = drawing.subplots(1, len(groups), sharey=True, squeeze=False)[0]
+    methods = [name for name in dict.fromkeys(row.method for row in runs) if name != "start"]
+    for axes, (title, some) in zip(panels, groups, strict=True):
+        for number, method in enumerate(["start", *methods]):
+            medians = [_median_error(some, method, r) for r in config.ranges_deg]
+            if all(np.isnan(medians)):
+                continue
+            if method == "start":
+                style = {"color": "#000000", "ls": ":"}
+            else:
+                solid = method in OWN
+                style = {"color": _COLOURS[(number - 1) % len(_COLOURS)], "ls": "-" if solid else "--"}
+            axes.plot(config.ranges_deg, medians, marker="o", ms=3, lw=1.4, label=method, **style)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xticks(config.ranges_deg, [f"±{r:g}" for r in config.ranges_deg])
+        axes.minorticks_off()
+        axes.grid(color="#e6e9ec", lw=0.7)
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("start [deg by axis]", fontsize=8)
+        axes.yaxis.set_major_formatter("{x:g}")
+    panels[0].set_ylabel("rotation error, median [deg]", fontsize=8)
+    handles: dict[str, Any] = {}
+    for axes in panels:
+        handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
+    drawing.legend(handles.values(), handles.keys(), fontsize=7, frameon=False, loc="center right")
+    drawing.tight_layout(rect=(0.0, 0.0, 1.0 - 1.5 / (4.6 * len(groups) + 1.6), 1.0))
+    stream = io.BytesIO()
+    # No date and no random names: the same runs give the same bytes.
+    with rc_context({"svg.hashsalt": "peers"}):
+        drawing.savefig(stream, format="svg", metadata={"Date": None})
+    return stream.getvalue()
+
+
+def _panels(runs: Sequence[PeerRun]) -> list[tuple[str, list[PeerRun]]]:
+    return [
+        ("simulated streets", [row for row in runs if row.simulated]),
+        ("real drives", [row for row in runs if not row.simulated]),
+    ]
+
+
+def _median_error(runs: Sequence[PeerRun], method: str, range_deg: float) -> float:
+    values = [row.qad_deg for row in runs if row.method == method and row.range_deg == range_deg]
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else float("nan")
