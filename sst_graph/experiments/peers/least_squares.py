@@ -58,8 +58,7 @@ class _ClassFrame:
             forward[inside] = self.distances[row, column]
             backward = cKDTree(uvs).query(self.pixels)[0]
         ratio = np.sqrt(len(self.lPs) / max(1, len(self.pixels)))
-        distances = np.concatenate([forward, ratio * backward])
-        return np.asarray(np.minimum(distances, _OFF_IMAGE_PX), np.float64)
+        return np.asarray(np.minimum(np.concatenate([forward, ratio * backward]), _OFF_IMAGE_PX))
 
 
 def solve_least_squares(problem: PeerProblem, start: gtsam.Pose3) -> gtsam.Pose3:

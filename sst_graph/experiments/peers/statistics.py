@@ -151,7 +151,7 @@ def joint_by_spline(seen: _Seen, cTl: gtsam.Pose3) -> FloatArray:
     cells = grey * _NID_BINS + level[:, None, None]
     weight = weights[:, 1, :, None] * weights[:, 0, None, :]
     histogram = np.bincount(cells.ravel(), weight.ravel(), _NID_BINS**2)
-    return np.asarray(histogram, np.float64).reshape(_NID_BINS, _NID_BINS)
+    return np.asarray(histogram.reshape(_NID_BINS, _NID_BINS), dtype=np.float64)
 
 
 def joint_by_pixel(seen: _Seen, cTl: gtsam.Pose3) -> FloatArray:
@@ -163,7 +163,7 @@ def joint_by_pixel(seen: _Seen, cTl: gtsam.Pose3) -> FloatArray:
     column = np.clip((uvs[:, 0] + 0.5).astype(np.intp), 0, w - 1)
     grey = (seen.frame.grey[row, column].astype(np.intp) * _MI_BINS) >> 8
     counts = np.bincount(grey * _MI_BINS + level, minlength=_MI_BINS**2)
-    return counts.astype(np.float64).reshape(_MI_BINS, _MI_BINS)
+    return counts.reshape(_MI_BINS, _MI_BINS).astype(np.float64)
 
 
 def mutual_information(joint: FloatArray) -> float:
