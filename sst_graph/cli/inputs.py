@@ -67,7 +67,7 @@ def starting_point(choice: str, source: Source, camera: str) -> tuple[gtsam.Pose
 
 def settings(default: T, args: argparse.Namespace, flags: dict[str, Any]) -> T:
     """``default`` changed by ``--config``, then by flags that were given, then by ``--set``."""
-    config = default if args.config is None else read_config(type(default), args.config)
+    config = default if args.config is None else read_config(type(default), args.config, default)
     given = [f"{name}={json.dumps(value)}" for name, value in flags.items() if value is not None]
     return with_overrides(config, [*given, *args.settings])
 

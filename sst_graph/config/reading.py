@@ -19,8 +19,9 @@ from sst_graph.files.reading import SETTINGS, read_json, read_toml
 T = TypeVar("T")
 
 
-def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
-    """A ``cls`` with the values of ``data``; what is not named keeps its default, in nested tables too.
+def from_dict(cls: type[T], data: Mapping[str, Any], base: T | None = None) -> T:
+    """A ``cls`` with the values of ``data``; what is not named is as in ``base``, or keeps its default, in
+    nested tables too.
 
     Old names of settings (:mod:`sst_graph.config.renamed`) are accepted with a warning in the log.
 
@@ -29,11 +30,11 @@ def from_dict(cls: type[T], data: Mapping[str, Any]) -> T:
     """
     data = with_new_names(cls, data)
     refuse_unknown(cls, data, cls, "")
-    return _built(cls, data, "")
+    return _built(cls, data, "", base)
 
 
-def read_config(cls: type[T], path: Path) -> T:
-    """A ``cls`` from a JSON or TOML file (by its suffix).
+def read_config(cls: type[T], path: Path, base: T | None = None) -> T:
+    """A ``cls`` from a JSON or TOML file (by its suffix), which need not name all: see :func:`from_dict`.
 
     Raises:
         DataError: the file is missing, too large, or no JSON or TOML.
@@ -41,7 +42,7 @@ def read_config(cls: type[T], path: Path) -> T:
     """
     data = _read_table(path)
     try:
-        return from_dict(cls, data)
+        return from_dict(cls, data, base)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from error
 

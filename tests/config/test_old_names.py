@@ -160,4 +160,4 @@ def check_default(default: Any, old: str) -> None:
         value = value[key]
     for key in reversed(old.split(".")):
         value = {key: value}
-    assert from_dict(type(default), value) == default
+    assert from_dict(type(default), value, default) == default

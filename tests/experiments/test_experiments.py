@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
 from sst_graph.cli import main
+from sst_graph.config import read_config
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS, experiment
 
@@ -35,3 +37,13 @@ def test_registry() -> None:
         assert experiment(name) is entry and dataclasses.is_dataclass(entry.config) and entry.summary
     with pytest.raises(ConfigError, match="table4"):
         experiment("nothing")
+
+
+def test_a_file_of_settings_changes_what_it_names_alone(tmp_path: Path) -> None:
+    path = tmp_path / "table.toml"
+    path.write_text("streets = 3\n[calibration]\nseed = 7\n")
+    default = experiment("table1").config
+    found = read_config(type(default), path, default)
+    calibration = dataclasses.replace(default.calibration, seed=7)
+    assert default.standing and not default.calibration.find_causes
+    assert found == dataclasses.replace(default, streets=3, calibration=calibration)
