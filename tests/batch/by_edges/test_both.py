@@ -117,11 +117,11 @@ def test_auto_takes_both_where_some_drives_have_labels() -> None:
     assert auto(whole, none) == "both" and auto(none, none) == "edges"
     dark = some.with_images(lambda image: replace(image, pixels=np.zeros((0, 0, 3), np.uint8)))
     assert auto(dark) == "joint"
-    # Masks of persons only: by edges beside a drive with labels; alone, joint says what is wrong.
+    # Masks of persons only are labels: joint says what is wrong.
     persons = whole.with_images(
         lambda image: replace(image, mask=np.where(image.mask == VEHICLE, SemanticClass.PERSON, image.mask))
     )
-    assert auto(persons) == "joint" and auto(whole, persons) == "both"
+    assert auto(persons) == auto(whole, persons) == "joint"
     assert with_method_for(replace(config, time_offset_per_drive=True), [whole, none]).method == "edges"
     assert with_method_of(config, [prepared()]).method == "both"
     assert with_method_of(config, [parts()[0]]).method == "joint"
@@ -250,7 +250,7 @@ def test_what_is_not_sound_is_left_out() -> None:
 def test_a_street_with_labels_in_every_second_frame() -> None:
     drive = with_labels_in(STREET, 2)
     assert drive.truth is not None
-    result = calibrate(drive, drive.truth.cTl.retract(AWAY))
+    result = calibrate(drive, drive.truth.cTl.retract(AWAY), CalibrationConfig(method="both"))
     assert result.method == "both" and result.status == "ok"
     errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
     assert errors.qad_deg < 0.2 and errors.atd_m < 0.03
@@ -272,7 +272,7 @@ def test_frames_with_pictures_of_another_street_are_left_out() -> None:
         frames.append(replace(frame, image=image))
     drive = replace(drive, frames=tuple(frames))
     assert drive.truth is not None
-    result = calibrate(drive, drive.truth.cTl.retract(AWAY))
+    result = calibrate(drive, drive.truth.cTl.retract(AWAY), CalibrationConfig(method="both"))
     # Labels in eight frames, by themselves: not wrong, if less sure.
     assert result.status != "not_converged"
     errors = calibration_errors(result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance)
