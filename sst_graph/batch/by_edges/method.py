@@ -138,7 +138,9 @@ def edges_method(
         candidates, solution = [], _settled(problem, labels.state, progress)
     # 4. Covariance, with what halves of the objects disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
-    covariance, spread, unsure = edges_covariance(problem.whole, estimate, calibration.objects)
+    covariance, spread, unsure = edges_covariance(
+        problem.whole, estimate, calibration.objects, calibration.config.assumptions
+    )
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
