@@ -42,7 +42,7 @@ SAMPLES = 16
 """Half-samples: the order of a Hadamard matrix."""
 _PAIRS = SAMPLES - 1
 """Pairs of groups of objects, of which each half-sample has one group: each column but the constant one."""
-_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
+NEAR_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
 """Scales of the kernel from the estimate [px]: wide enough to meet other edges, too narrow to leave it."""
 _POINTS_A_SCAN = 500
 """Most boundary points of a scan before half of the objects are taken: each edge keeps some."""
@@ -126,7 +126,7 @@ def _half_sample_steps(
     for kept in half_samples():
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
         try:
-            part = solve_joint(replace(problem, drives=drives), start, _KERNELS_PX, None, _STEP_SIGMAS)
+            part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
         except EstimationError:
             continue
         steps.append(difference(start, part.state))
@@ -141,7 +141,7 @@ def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | N
     """
     drives = [without_kind(drive, Edge.SHALLOW_TOP) for drive in problem.drives]
     try:
-        part = solve_joint(replace(problem, drives=drives), start, _KERNELS_PX, None, _STEP_SIGMAS)
+        part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
     except EstimationError:
         return None
     return difference(start, part.state)

@@ -22,6 +22,7 @@ from sst_graph.batch.by_edges.covariance import (
 )
 from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
 from sst_graph.batch.by_edges.positions import position_columns
+from sst_graph.batch.by_edges.reasons import MAX_DRIFT, drift_reasons
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
@@ -112,6 +113,12 @@ def test_upper_edges_that_may_be_no_outline_are_told_apart(drive: Drive) -> None
         assert 0 < shallow.sum() < (points.edges >= Edge.TOP).sum()
         np.testing.assert_array_equal(others.lPs, points.lPs[~shallow])
         assert (sides_of(points.edges[shallow], np.ones(shallow.sum())) == TOP).all()
+
+
+def test_an_estimate_that_moves_when_it_is_solved_again_is_not_trusted() -> None:
+    assert drift_reasons(0.9 * MAX_DRIFT) == ()
+    (reason,) = drift_reasons(np.array([0.0, -0.0035, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert "0.20 deg" in reason
 
 
 def test_positions_between_beams_in_closed_form() -> None:
