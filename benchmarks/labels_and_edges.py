@@ -65,7 +65,7 @@ def part(source: Source, start: gtsam.Pose3, kept: str) -> None:
     count = len(whole.frames)
     frames = tuple(f if KEPT[kept](k, count) else bare(f) for k, f in enumerate(whole.frames))
     began = time.process_time()
-    result = calibrate(replace(whole, frames=frames), start, CalibrationConfig())
+    result = calibrate(replace(whole, frames=frames), start, CalibrationConfig(method="both"))
     seconds = time.process_time() - began
     said = result.diagnostics.get("both", {})
     for kind in ("labels", "edges"):

@@ -40,10 +40,12 @@ least the second fraction of that step: else the distortion folds the picture ov
 
 SIDES = 4
 """An object has a left, a right, a top and a bottom side."""
-SIDE_OF = np.array([[0, 1], [2, 2], [3, 3]])
+SIDE_OF = np.array([[0, 1], [2, 2], [3, 3], [2, 2]])
 """Side by kind of edge and whether the outward direction points to the right."""
 BOTTOM = int(SIDE_OF[Edge.BOTTOM, 0])
 """The side towards the ground."""
+TOP = int(SIDE_OF[Edge.TOP, 0])
+"""The upper side."""
 LOWER_EDGE_SIGMA_PX = 1.2
 """Error that all matches on an object's lower edge share [px]: masks are least exact there."""
 
@@ -475,6 +477,12 @@ def match_sigmas(lengths_px: FloatArray, cosines: FloatArray, config: MatchConfi
     """(n,) deviation of matches [px]: the mask's, and uniform over half the step to the beam beyond the edge,
     across the contour."""
     return np.asarray(np.hypot(config.mask_sigma_px, 0.5 * lengths_px * cosines / np.sqrt(3.0)))
+
+
+def sampling_sigmas(sigmas_px: FloatArray, config: MatchConfig) -> FloatArray:
+    """(n,) the part of :func:`match_sigmas` that is there because an edge lies anywhere between two beams
+    [px]."""
+    return np.asarray(np.sqrt(np.maximum(sigmas_px**2 - config.mask_sigma_px**2, 0.0)))
 
 
 def sides_of(edges: NDArray[np.uint8], to_the_right: FloatArray) -> IntArray:

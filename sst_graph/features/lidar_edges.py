@@ -29,6 +29,9 @@ _BEHIND_M = 0.5
 _JUMP_M = 0.25
 """The same on objects without a class, of which every near side of a jump counts, on the object's own parts
 too [m]."""
+_OUTLINE_M = 1.0
+"""Upper edges of objects without a class are shallow where the ring above returns from less than this behind:
+a bonnet, a rear window or a hedge may go on there [m]."""
 _MAX_STEPS = 1.6
 """Largest azimuth gap between neighbours, in beam steps: one missing return ends the line."""
 _MAX_ELEVATION_GAP = np.radians(0.9)
@@ -56,6 +59,9 @@ class Edge(IntEnum):
     SIDE = 0
     TOP = 1
     BOTTOM = 2
+    SHALLOW_TOP = 3
+    """At the top of an object without a class, where what is behind is so near that the surface may go on:
+    the outline may lie higher."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +139,9 @@ def find_boundaries(
     for c in present:
         mask = members[c]
         objects = split_objects(points, mask, instances, _MIN_POINTS)
-        seen = _Seen(mask, np.zeros_like(mask), _JUMP_M) if c == SemanticClass.OBJECT else _Seen(mask, mask)
+        seen = _Seen(mask, mask)
+        if c == SemanticClass.OBJECT:
+            seen = _Seen(mask, np.zeros_like(mask), _JUMP_M, _OUTLINE_M)
         parts = [
             _side_edges(points, seen, beams, +1),
             _side_edges(points, seen, beams, -1),
@@ -153,21 +161,24 @@ class _Seen:
         mask: (n,) points that may be the last before an edge.
         inner: (n,) points that are never behind one.
         behind_m: least step in range across an edge [m].
+        outline_m: least step upwards across an edge that is surely the outline [m].
     """
 
     mask: NDArray[np.bool_]
     inner: NDArray[np.bool_]
     behind_m: float = _BEHIND_M
+    outline_m: float = 0.0
 
 
 @dataclass(frozen=True)
 class _Edges:
-    """Edges of one side: index of the object's point, the boundary point, the point across it."""
+    """Edges of one side: index of the object's point, the boundary point, the point across it, and its kind,
+    of :class:`Edge`."""
 
     index: IntArray
     lPs: FloatArray
     outward: FloatArray
-    edge: Edge
+    kinds: NDArray[np.uint8]
 
 
 def _side_edges(points: FloatArray, seen: _Seen, beams: Beams, side: int) -> _Edges:
@@ -193,7 +204,8 @@ def _side_edges(points: FloatArray, seen: _Seen, beams: Beams, side: int) -> _Ed
     known &= steps < _MAX_STEPS * beams.step
     edge = _along_rays(points, beams, last, _extrapolated(beams, last, before, known))
     half = 0.5 * side * beams.step
-    return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), Edge.SIDE)
+    kinds = np.full(len(last), Edge.SIDE, np.uint8)
+    return _Edges(last, _turn(edge, half), _turn(edge, 3.0 * half), kinds)
 
 
 def _extrapolated(beams: Beams, last: IntArray, before: IntArray, known: NDArray[np.bool_]) -> FloatArray:
@@ -254,7 +266,8 @@ def _ring_edges(
     slope_there = (points[following, 2] - tip_there) / beams.rho[following]
     gap = tip_there + slope_there * rho - points[i, 2]
     ok = (up * gap > 0.0) & (up * gap < _MAX_ELEVATION_GAP * rho)
-    i, rho, gap, slope, slope_there = (a[ok] for a in (i, rho, gap, slope, slope_there))
+    i, following, rho, gap = (a[ok] for a in (i, following, rho, gap))
+    slope, slope_there = slope[ok], slope_there[ok]
     before, known = _nearest_in_ring(beams, i, beams.ring[i] - up)
     push = _extrapolated(beams, i, before, known & mask[before])
     if roofs:
@@ -265,7 +278,10 @@ def _ring_edges(
     lPs, outward = edge.copy(), edge.copy()
     lPs[:, 2] += half
     outward[:, 2] += 3.0 * half
-    return _Edges(i, lPs, outward, Edge.TOP if up > 0 else Edge.BOTTOM)
+    kinds = np.full(len(i), Edge.TOP if up > 0 else Edge.BOTTOM, np.uint8)
+    if up > 0:
+        kinds[~_is_behind(beams.rho, i, following, seen.outline_m)] = Edge.SHALLOW_TOP
+    return _Edges(i, lPs, outward, kinds)
 
 
 def _along_roof(half: FloatArray, middle: FloatArray, slope: FloatArray) -> FloatArray:
@@ -331,7 +347,7 @@ def _collect(
     index = np.concatenate([part.index for part in parts])
     lPs = np.concatenate([part.lPs for part in parts])
     outward = np.concatenate([part.outward for part in parts])
-    edges = np.concatenate([np.full(len(part.index), part.edge, dtype=np.uint8) for part in parts])
+    edges = np.concatenate([part.kinds for part in parts])
     keep = (objects[index] >= 0) & (np.linalg.norm(lPs, axis=1) < max_range_m)
     half_gaps = 0.5 * np.linalg.norm(outward - lPs, axis=1)
     return Boundaries(

@@ -1,10 +1,13 @@
-"""Covariance of an estimate by edges: that of the matches, of the choice of objects, and a floor.
+"""Covariance of an estimate by edges.
 
 A match with the picture's edge is soft: it follows the pose, and which edge is met is part of the estimate.
 With the matches frozen a problem seems three to ten times stiffer than it is. So the problem is solved again,
-and matched again, with half of the objects, in eight balanced ways (McCarthy, Pseudo-replication: half
+and matched again, with half of the objects, in sixteen balanced ways (McCarthy, Pseudo-replication: half
 samples, Review of the International Statistical Institute, 1969): the deviation of such an estimate has the
 covariance of the whole one.
+
+What all objects have in common, no choice of them shows. Of it, three parts are known: the assumptions of the
+set-up, where edges lie between the beams, and upper edges that may be no outline.
 """
 
 from __future__ import annotations
@@ -17,41 +20,52 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import hadamard
 
-from sst_graph.batch.by_edges.parts import thinned, with_objects
+from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
+from sst_graph.batch.by_edges.positions import considered_positions
 from sst_graph.batch.problem import JointEstimate
+from sst_graph.covariance.considered import AssumptionConfig, considered_by_matches
 from sst_graph.errors import EstimationError
+from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
 from sst_graph.objects.tracks import ObjectId
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FLOOR = np.array([*np.radians([0.06] * 3), 0.01, 0.01, 0.01, 0.004])
-"""(7,) sigmas that are added [rad, m, s], for what all objects have in common and no choice of them shows:
-edges inside an object draw its outline inwards, its top down, and pitch and height with it. That of the time
-offset is for the 7 and 10 ms that two real drives are off, under a sigma of 2.6 and 4.5 ms with 2 ms here."""
-SAMPLES = 8
+FLOOR = np.array([0.0, 0.0, 0.0, 0.01, 0.01, 0.01, 0.004])
+"""(7,) sigmas that are added [rad, m, s]. That of the translation is for the 2 cm by which two real drives of
+one rig differ to the left; that of the time offset for the 7 and 10 ms that they are off, under a sigma of
+2.6 and 4.5 ms with 2 ms here. No part of the model explains either."""
+SAMPLES = 16
 """Half-samples: the order of a Hadamard matrix."""
 _PAIRS = SAMPLES - 1
 """Pairs of groups of objects, of which each half-sample has one group: each column but the constant one."""
-_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
+NEAR_KERNELS_PX = (3.0, 2.0, 2.0, 1.5, 1.2)
 """Scales of the kernel from the estimate [px]: wide enough to meet other edges, too narrow to leave it."""
 _POINTS_A_SCAN = 500
 """Most boundary points of a scan before half of the objects are taken: each edge keeps some."""
 _STEP_SIGMAS = 0.5
 """A step shorter than this many standard deviations of the frozen problem ends a half-sample's outer loop:
 they are a tenth of its own."""
-FEWEST = 4
+FEWEST = 12
 """Fewest half-samples that a spread is believed of."""
 FEW_OBJECTS = (
     "half of the objects has too few edges in view to calibrate with: how far the estimate may be off "
     "cannot be told; record a richer scene"
 )
+FEW_OUTLINES = (
+    "without upper edges that may lie within an object, too few edges are in view to calibrate with: how far "
+    "the estimate may be off cannot be told; record a richer scene"
+)
 
 
 def edges_covariance(
-    problem: JointProblem, estimate: JointEstimate, objects: Sequence[Mapping[ObjectId, int]]
+    problem: JointProblem,
+    estimate: JointEstimate,
+    objects: Sequence[Mapping[ObjectId, int]],
+    assumptions: AssumptionConfig,
 ) -> tuple[FloatArray, dict[str, Any], tuple[str, ...]]:
     """(7, 7) covariance of extrinsic and time offset; sigmas of its parts, JSON-able; reasons to doubt it.
 
@@ -59,15 +73,41 @@ def edges_covariance(
         problem: that was solved.
         objects: tracks of each drive's objects.
     """
+    solution = estimate.solution
+    # 1. What differs from object to object.
     steps = _half_sample_steps(problem, estimate, objects)
+    # 2. What all of them have in common.
+    considered = considered_by_matches(
+        estimate.robust, solution.pairs, solution.values, solution.state, assumptions
+    )
+    positions = considered_positions(estimate, problem.config.graph)
+    outlines = _step_without_shallow(problem, solution.state)
     parts = {
         "matches": estimate.covariance[:7, :7],
-        "objects": np.cov(steps.T) if len(steps) >= FEWEST else np.zeros((7, 7)),
+        "objects": spread_covariance(steps),
+        "assumptions": considered.covariance(7),
+        "positions": positions.covariance(7),
+        "shallow": np.zeros((7, 7)) if outlines is None else np.outer(outlines, outlines),
         "floor": np.diag(FLOOR**2),
     }
     total = np.asarray(sum(parts.values()), np.float64)
     sigmas = {name: np.sqrt(np.diag(part)).tolist() for name, part in parts.items()}
-    return total, sigmas | {"samples": len(steps)}, () if len(steps) >= FEWEST else (FEW_OBJECTS,)
+    doubts = {FEW_OBJECTS: len(steps) < FEWEST, FEW_OUTLINES: outlines is None}
+    reasons = tuple(reason for reason, holds in doubts.items() if holds)
+    return total, sigmas | {"samples": len(steps)}, reasons
+
+
+def spread_covariance(steps: FloatArray) -> FloatArray:
+    """(7, 7) covariance by the steps (k, 7) of half-samples; 0 of fewer than :data:`FEWEST`.
+
+    The inverse of a sample covariance is too large on average: by (k - 1) / (k - 2 - 7), of k samples in
+    seven dimensions (Hartlap, Simon and Schneider, Astronomy & Astrophysics 464, 2007). With that factor the
+    mean of the NEES is right.
+    """
+    k, size = len(steps), 7
+    if k < FEWEST:
+        return np.zeros((size, size))
+    return np.asarray(np.cov(steps.T) * (k - 1) / (k - 2 - size))
 
 
 def half_samples() -> BoolArray:
@@ -86,8 +126,22 @@ def _half_sample_steps(
     for kept in half_samples():
         drives = [with_objects(*each, kept) for each in zip(some, objects, strict=True)]
         try:
-            part = solve_joint(replace(problem, drives=drives), start, _KERNELS_PX, None, _STEP_SIGMAS)
+            part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
         except EstimationError:
             continue
         steps.append(difference(start, part.state))
     return np.array(steps).reshape(-1, 7)
+
+
+def _step_without_shallow(problem: JointProblem, start: State) -> FloatArray | None:
+    """(7,) step of the estimate where upper edges that may be no outline are left out.
+
+    A surface that goes on in the ring above ends somewhere else than its edge is taken to be, on all objects
+    the same way; whether it does, the scan does not tell. None where too few edges are left.
+    """
+    drives = [without_kind(drive, Edge.SHALLOW_TOP) for drive in problem.drives]
+    try:
+        part = solve_joint(replace(problem, drives=drives), start, NEAR_KERNELS_PX, None, _STEP_SIGMAS)
+    except EstimationError:
+        return None
+    return difference(start, part.state)

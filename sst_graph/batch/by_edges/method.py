@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
-from sst_graph.batch.by_edges.covariance import edges_covariance
+from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, edges_covariance
 from sst_graph.batch.by_edges.parts import thinned
-from sst_graph.batch.by_edges.reasons import EdgeContrast, edge_contrast, edges_reasons
+from sst_graph.batch.by_edges.reasons import EdgeContrast, drift_reasons, edge_contrast, edges_reasons
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate, frames_used
 from sst_graph.batch.motion_factor import gaussian_factor
@@ -138,7 +138,9 @@ def edges_method(
         candidates, solution = [], _settled(problem, labels.state, progress)
     # 4. Covariance, with what halves of the objects disagree by.
     estimate = JointEstimate.of(solution, calibration.objects)
-    covariance, spread, unsure = edges_covariance(problem.whole, estimate, calibration.objects)
+    covariance, spread, unsure = edges_covariance(
+        problem.whole, estimate, calibration.objects, calibration.config.assumptions
+    )
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
@@ -146,6 +148,8 @@ def edges_method(
         problem.some_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
+    again = solve_joint(problem.whole, solution.state, NEAR_KERNELS_PX)
+    reasons += drift_reasons(difference(solution.state, again.state))
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],

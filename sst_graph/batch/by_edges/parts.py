@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.preparation import Drive
+from sst_graph.features.lidar_edges import Edge
 from sst_graph.objects.tracks import ObjectId, numbers_in, of_each
 
 
@@ -35,4 +36,13 @@ def with_objects(drive: Drive, tracks: Mapping[ObjectId, int], kept: NDArray[np.
             if len(chosen):
                 boundaries[c] = chosen
         scans.append(replace(scan, boundaries=boundaries))
+    return replace(drive, scans=tuple(scans))
+
+
+def without_kind(drive: Drive, kind: Edge) -> Drive:
+    """The drive without the boundary points of one kind."""
+    scans = []
+    for scan in drive.scans:
+        kept = {c: points.take(np.flatnonzero(points.edges != kind)) for c, points in scan.boundaries.items()}
+        scans.append(replace(scan, boundaries={c: points for c, points in kept.items() if len(points)}))
     return replace(drive, scans=tuple(scans))

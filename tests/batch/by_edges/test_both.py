@@ -15,7 +15,6 @@ from stored import simulated
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.by_edges.both import as_one
 from sst_graph.batch.by_edges.choice import with_method_for, with_method_of
-from sst_graph.batch.by_edges.covariance import FLOOR
 from sst_graph.batch.by_edges.fusion import Fused
 from sst_graph.batch.by_edges.label_parts import parted
 from sst_graph.batch.calibrate import prepare_drives
@@ -143,6 +142,10 @@ def linear(solution: JointSolution) -> tuple[FloatArray, FloatArray, list[int]]:
     return H[np.ix_(columns, columns)], eta[columns], columns
 
 
+SHARED = np.array([*np.radians([0.06] * 3), 0.01, 0.01, 0.01, 0.004])
+"""(7,) deviations of what matches of one kind share [rad, m, s]."""
+
+
 def test_the_product_is_the_estimate_of_one_graph() -> None:
     """All variables of both kinds in one linear system, with a copy of the calibration for each kind."""
     truth = simulated(SMALL).truth
@@ -153,7 +156,7 @@ def test_the_product_is_the_estimate_of_one_graph() -> None:
         solution = solve_joint(replace(problem.joint(), centre=start), start, kernels)
         H, eta, columns = linear(solution)
         P, mean = np.linalg.inv(H), np.linalg.solve(H, eta)
-        shared = factor * FLOOR.reshape(7, 1) * (np.eye(7) + 0.3) * FLOOR
+        shared = factor * SHARED.reshape(7, 1) * (np.eye(7) + 0.3) * SHARED
         covariance = P[:7, :7] + shared
         values = solution.values
         found = MethodEstimate(

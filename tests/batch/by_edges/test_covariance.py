@@ -10,18 +10,24 @@ from stored import simulated
 
 from benchmarks.edges_poor_scenes import SCENES, START, drive_through
 from sst_graph import CalibrationConfig, calibrate
+from sst_graph.association.edge_matching import TOP, MatchConfig, match_sigmas, sides_of
 from sst_graph.batch.by_edges.covariance import (
     FEW_OBJECTS,
+    FEW_OUTLINES,
     FEWEST,
     SAMPLES,
     edges_covariance,
     half_samples,
+    spread_covariance,
 )
-from sst_graph.batch.by_edges.parts import thinned, with_objects
+from sst_graph.batch.by_edges.parts import thinned, with_objects, without_kind
+from sst_graph.batch.by_edges.positions import position_columns
+from sst_graph.batch.by_edges.reasons import MAX_DRIFT, drift_reasons
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.batch.method_estimate import Guess
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.drive.preparation import Drive
+from sst_graph.features.lidar_edges import Edge
 from sst_graph.graph.outer_loop import solve_joint
 from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
@@ -33,25 +39,39 @@ STREET = SimulationConfig(seed=504, frames=3, motion="no_stop", azimuth_limit_de
 
 def test_half_samples_are_balanced() -> None:
     kept = half_samples()
-    assert kept.shape == (SAMPLES, 14)
+    groups = 2 * (SAMPLES - 1)
+    assert kept.shape == (SAMPLES, groups)
     together = kept.T.astype(int) @ kept.astype(int)
-    pair = np.arange(14) // 2
+    pair = np.arange(groups) // 2
     same = np.equal.outer(pair, pair)
     assert (np.diag(together) == SAMPLES // 2).all()
-    assert (together[same & ~np.eye(14, dtype=bool)] == 0).all()
+    assert (together[same & ~np.eye(groups, dtype=bool)] == 0).all()
     assert (together[~same] == SAMPLES // 4).all()
 
 
 def test_the_spread_of_half_samples_is_the_variance_of_the_mean() -> None:
     """In closed form: independent pairs of equal variance, of which a mean is taken."""
     rng = np.random.default_rng(4)
-    values = rng.normal(0.0, 3.0, (2000, 14))
     kept = half_samples()
+    groups = kept.shape[1]
+    values = rng.normal(0.0, 3.0, (2000, groups))
     means = np.stack([values[:, own].mean(axis=1) for own in kept])
     variances = means.var(axis=0, ddof=1)
-    exact = ((values[:, ::2] - values[:, 1::2]) ** 2).sum(axis=1) / 14**2
+    exact = ((values[:, ::2] - values[:, 1::2]) ** 2).sum(axis=1) / groups**2
     np.testing.assert_allclose(variances, exact * SAMPLES / (SAMPLES - 1))
-    assert variances.mean() == pytest.approx(3.0**2 / 14 * SAMPLES / (SAMPLES - 1), rel=0.05)
+    assert variances.mean() == pytest.approx(3.0**2 / groups * SAMPLES / (SAMPLES - 1), rel=0.05)
+
+
+def test_the_nees_of_a_spread_is_seven_on_average() -> None:
+    """Steps and error of one covariance: the factor makes up for the few samples that it is known by."""
+    rng = np.random.default_rng(8)
+    root = rng.normal(size=(7, 7))
+    nees = []
+    for _ in range(3000):
+        error, *steps = rng.normal(size=(1 + SAMPLES, 7)) @ root
+        nees.append(error @ np.linalg.solve(spread_covariance(np.array(steps)), error))
+    assert np.mean(nees) == pytest.approx(7.0, rel=0.1)
+    assert not spread_covariance(np.ones((FEWEST - 1, 7))).any()
 
 
 @pytest.fixture(scope="module")
@@ -67,14 +87,49 @@ def test_the_covariance_has_the_spread_of_the_half_samples(drive: Drive) -> None
     joint = problem.joint()
     solution = solve_joint(joint, State(truth.cTl, (truth.time_offset_s,)), (3.0, 2.0))
     estimate = JointEstimate.of(solution, problem.objects)
-    covariance, parts, reasons = edges_covariance(joint, estimate, problem.objects)
+    covariance, parts, reasons = edges_covariance(joint, estimate, problem.objects, config.assumptions)
     assert reasons == () and parts["samples"] >= FEWEST
-    squares = [np.square(parts[name]) for name in ("matches", "objects", "floor")]
-    np.testing.assert_allclose(np.diag(covariance), sum(squares))
-    assert (np.array(parts["objects"]) > 0.0).all()
+    names = ("matches", "objects", "assumptions", "positions", "shallow", "floor")
+    np.testing.assert_allclose(np.diag(covariance), sum(np.square(parts[name]) for name in names))
+    assert all((np.array(parts[name]) > 0.0).all() for name in names[:-1])
+    # Pitch hangs on upper edges, yaw on the others, and neither does roll.
+    roll, pitch, yaw = np.degrees(parts["positions"][:3])
+    assert pitch > 0.05 and yaw > 0.03 and roll < 0.5 * yaw
+    # A poorer set-up is less sure.
+    poorer = replace(config.assumptions, cy=3.0)
+    _, poor, _ = edges_covariance(joint, estimate, problem.objects, poorer)
+    assert np.degrees(poor["assumptions"][1]) == pytest.approx(np.degrees(3.0 / drive.camera.fy), rel=0.1)
     starved = replace(joint, config=replace(joint.config, min_matches=10**6))
-    _, parts, reasons = edges_covariance(starved, estimate, problem.objects)
-    assert parts["samples"] == 0 and reasons == (FEW_OBJECTS,)
+    _, parts, reasons = edges_covariance(starved, estimate, problem.objects, config.assumptions)
+    assert parts["samples"] == 0 and reasons == (FEW_OBJECTS, FEW_OUTLINES)
+
+
+def test_upper_edges_that_may_be_no_outline_are_told_apart(drive: Drive) -> None:
+    """Both kinds occur; to leave one out leaves all others as they are, on their side."""
+    kept = without_kind(drive, Edge.SHALLOW_TOP)
+    for scan, some in zip(drive.scans, kept.scans, strict=True):
+        points, others = scan.boundaries[SemanticClass.OBJECT], some.boundaries[SemanticClass.OBJECT]
+        shallow = points.edges == Edge.SHALLOW_TOP
+        assert 0 < shallow.sum() < (points.edges >= Edge.TOP).sum()
+        np.testing.assert_array_equal(others.lPs, points.lPs[~shallow])
+        assert (sides_of(points.edges[shallow], np.ones(shallow.sum())) == TOP).all()
+
+
+def test_an_estimate_that_moves_when_it_is_solved_again_is_not_trusted() -> None:
+    assert drift_reasons(0.9 * MAX_DRIFT) == ()
+    (reason,) = drift_reasons(np.array([0.0, -0.0035, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert "0.20 deg" in reason
+
+
+def test_positions_between_beams_in_closed_form() -> None:
+    config = MatchConfig(mask_sigma_px=1.0)
+    # Beams 2 px apart to either side of the edge, and none: uniform over half of that.
+    sigmas = match_sigmas(np.array([4.0, 4.0, 4.0, 0.0]), np.ones(4), config)
+    columns = position_columns(np.array([0, 1, 2, 1]), sigmas, config)
+    spread = 2.0 / np.sqrt(3.0)
+    np.testing.assert_allclose(
+        columns, np.array([[0.0, -spread, spread], [0.0, spread, spread], [spread, 0.0, 0.0], [0.0] * 3])
+    )
 
 
 def test_both_halves_of_the_objects_are_the_drive(drive: Drive) -> None:
