@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.frame_parts import image_at, number_at, scan_at
+from sst_graph.data.frame_parts import number_at, scan_at
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -111,7 +111,8 @@ def peer_frames(source: Source, drive: Drive, time_offset_s: float, count: int) 
         image, instant_ns = covered[k]
         nearest = drive.scans[int(np.abs(stamps - instant_ns).argmin())]
         scan = scan_at(source, positions[nearest.index])
-        picture = image_at(source, positions[image.index])
+        # Read as a frame: apart, an image may come without its instances.
+        picture = source[positions[image.index]].image
         assert scan is not None and picture is not None
         if picture.has_picture:
             twist = _twist_at(drive.lidar_motions, instant_ns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import MissingDependencyError
 from sst_graph.experiments.peers.methods import OWN, PEERS
-from sst_graph.experiments.peers.runs import PeerRun, PeersConfig, PeerTask, runs_of_drive
+from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of_task, tasks_of
 from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.files import atomic_write_bytes
 
@@ -28,11 +27,7 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
         MissingDependencyError: a figure is asked for, and matplotlib is not installed.
     """
     figure_of = _figure_class() if config.figure else None
-    # What changes nothing of what is found on one drive.
-    own = dataclasses.replace(config, streets=1, data=(), jobs=1, records="", figure="")
-    places = [*("" for _ in range(config.streets)), *config.data]
-    tasks = [PeerTask(place, number, own) for number, place in enumerate(places)]
-    found = rows_of(Work(runs_of_drive, PeerRun, config.jobs, config.records), tasks, progress)
+    found = rows_of(Work(runs_of_task, PeerRun, config.jobs, config.records), tasks_of(config), progress)
     runs = [row for rows in found for row in rows]
     if figure_of is not None:
         atomic_write_bytes(config.figure, figure(runs, config, figure_of))
@@ -62,10 +57,10 @@ def _table(runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for method in dict.fromkeys(row.method for row in runs):
         own = [row for row in runs if row.method == method]
-        label = method if method in ("start", *OWN) else f"{method} *r*"
+        label = method if method in (START, *OWN) else f"{method} *r*"
         reasons = {row.why_not for row in own}
         if "" not in reasons:
-            lines.append(f"| {label} | " + " | ".join(["–"] * (len(head) - 2)) + f" | {reasons.pop()} |")
+            lines.append("| " + " | ".join([label, min(reasons), *["–"] * (len(head) - 2)]) + " |")
             continue
         cells = [_cell([row for row in own if row.range_deg == r], config) for r in config.ranges_deg]
         lines.append("| " + " | ".join([label, *cells, *_remaining_cells(method, own, config)]) + " |")
@@ -81,7 +76,7 @@ def _cell(runs: Sequence[PeerRun], config: PeersConfig) -> str:
 
 
 def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
-    if method == "start":
+    if method == START:
         return ["–"] * 4
     silent = sum(row.failed(config) and row.status == "ok" for row in runs)
     return [
@@ -114,13 +109,13 @@ def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[...
     groups = [(name, some) for name, some in _panels(runs) if some]
     drawing = figure_of(figsize=(4.6 * len(groups) + 1.6, 4.2))
     panels = drawing.subplots(1, len(groups), sharey=True, squeeze=False)[0]
-    methods = [name for name in dict.fromkeys(row.method for row in runs) if name != "start"]
+    methods = [name for name in dict.fromkeys(row.method for row in runs) if name != START]
     for axes, (title, some) in zip(panels, groups, strict=True):
-        for number, method in enumerate(["start", *methods]):
+        for number, method in enumerate([START, *methods]):
             medians = [_median_error(some, method, r) for r in config.ranges_deg]
             if all(np.isnan(medians)):
                 continue
-            if method == "start":
+            if method == START:
                 style = {"color": "#000000", "ls": ":"}
             else:
                 solid = method in OWN

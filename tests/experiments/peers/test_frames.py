@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from stored import simulated
 
 from sst_graph.batch import CalibrationConfig, prepare_drives
+from sst_graph.data import open_source
 from sst_graph.experiments.peers.frames import peer_frames, range_jumps
 from sst_graph.experiments.peers.mask_consistency import masks_of
-from sst_graph.simulator import SimulationConfig
+from sst_graph.simulator import SimulationConfig, write_drive
 from sst_graph.types import SemanticClass
 
 STREET = SimulationConfig(
@@ -66,3 +69,11 @@ def test_every_pixel_has_a_mask() -> None:
     for number in np.unique(masks[vehicles]):
         own = masks == number
         assert len(np.unique(frame.instances[own])) == 1 and (frame.mask[own] == SemanticClass.VEHICLE).all()
+
+
+def test_frames_of_a_written_drive_have_its_instances(tmp_path: Path) -> None:
+    write_drive(simulated(STREET), tmp_path / "drive")
+    source = open_source(str(tmp_path / "drive"))
+    drive = prepare_drives([source], CalibrationConfig(method="joint"))[0]
+    (frame,) = peer_frames(source, drive, 0.0, 1)
+    assert frame.instances is not None and frame.instances.any()
