@@ -91,11 +91,16 @@ def moved_by(cTl: gtsam.Pose3, step: Sequence[float] | FloatArray) -> gtsam.Pose
     return cTl.retract(np.asarray(step, dtype=np.float64))
 
 
-def peer_frames(source: Source, drive: Drive, time_offset_s: float, count: int) -> list[PeerFrame]:
+def peer_frames(
+    source: Source, drive: Drive, time_offset_s: float, count: int, pictures: Source | None = None
+) -> list[PeerFrame]:
     """At most ``count`` frames, evenly over those images whose instant the LiDAR's motion covers.
 
     An image of stamp t shows LiDAR time t + ``time_offset_s``; the scan nearest to it is moved
     there by the LiDAR's odometry.
+
+    Args:
+        pictures: the same drive with its instances, where ``source`` leaves them out.
 
     Raises:
         DataError: no image has a picture and a scan.
@@ -112,7 +117,7 @@ def peer_frames(source: Source, drive: Drive, time_offset_s: float, count: int) 
         nearest = drive.scans[int(np.abs(stamps - instant_ns).argmin())]
         scan = scan_at(source, positions[nearest.index])
         # Read as a frame: apart, an image may come without its instances.
-        picture = source[positions[image.index]].image
+        picture = (pictures or source)[positions[image.index]].image
         assert scan is not None and picture is not None
         if picture.has_picture:
             twist = _twist_at(drive.lidar_motions, instant_ns)

@@ -218,7 +218,7 @@ def _read(place: str, number: int, config: PeersConfig) -> _ReadDrive:
     swept = with_sweep(source, config.calibration.decide_sweep)
     drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)
     offset_s = truth.time_offset_s or 0.0
-    frames = peer_frames(swept, drive, offset_s, config.frames)
+    frames = peer_frames(swept, drive, offset_s, config.frames, source)
     problem = PeerProblem(frames, drive, offset_s, samples=config.samples, seed=config.seed)
     return _ReadDrive(swept, truth, drive, problem)
 
