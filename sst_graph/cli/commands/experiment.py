@@ -73,13 +73,14 @@ def _origin(args: argparse.Namespace) -> str:
 
 def code_version() -> str:
     """Of the package, with the commit where the code runs from a checkout."""
+    package = str(sst_graph.__version__)
     root = Path(sst_graph.__file__).parent.parent
     if not (root / ".git").exists():
-        return sst_graph.__version__
+        return package
     # "-dirty": the code differs from that commit.
     command = ["git", "-C", str(root), "describe", "--always", "--tags", "--dirty"]
     try:
         found = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True)
     except (OSError, subprocess.SubprocessError):
-        return sst_graph.__version__
-    return f"{sst_graph.__version__} ({found.stdout.strip()})"
+        return package
+    return f"{package} ({found.stdout.strip()})"
