@@ -72,7 +72,8 @@ def _origin(args: argparse.Namespace) -> str:
 
 
 def code_version() -> str:
-    """Of the package, with the commit where the code runs from a checkout."""
+    """The commit where the code runs from a checkout, which may differ from what is installed; else the
+    version of the package."""
     package = str(sst_graph.__version__)
     root = Path(sst_graph.__file__).parent.parent
     if not (root / ".git").exists():
@@ -83,4 +84,4 @@ def code_version() -> str:
         found = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True)
     except (OSError, subprocess.SubprocessError):
         return package
-    return f"{package} ({found.stdout.strip()})"
+    return f"commit {found.stdout.strip()}"
