@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import subprocess
 from pathlib import Path
 
 import pytest
 
+import sst_graph
 from sst_graph.cli import main
+from sst_graph.cli.commands import experiment as command
 from sst_graph.config import read_config
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.registry import EXPERIMENTS, experiment
@@ -30,6 +33,22 @@ def test_bad_options(capsys: pytest.CaptureFixture[str], options: list[str], mes
     assert main(["experiment", *options]) == 2
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1 and message in captured.err
+
+
+def test_the_version_is_the_commit_in_a_checkout_and_the_package_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "sst_graph"
+    package.mkdir()
+    (package / "code.py").write_text("A = 1\n")
+    monkeypatch.setattr(sst_graph, "__file__", str(package / "__init__.py"))
+    assert command.code_version() == sst_graph.__version__
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "a"], ["tag", "v9"]):
+        subprocess.run([*git, *words], check=True)
+    assert command.code_version() == "commit v9"
+    (package / "code.py").write_text("A = 2\n")
+    assert command.code_version() == "commit v9-dirty"
 
 
 def test_registry() -> None:

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import subprocess
 from contextlib import ExitStack
+from pathlib import Path
 
+import sst_graph
 from sst_graph.cli.inputs import settings
 from sst_graph.cli.messages import mention, say
 from sst_graph.cli.outputs import check_apart
@@ -18,7 +22,8 @@ from sst_graph.files import output_file
 def run(args: argparse.Namespace) -> int:
     """Run the experiment ``args.name``; its Markdown goes to ``args.out``, or to the terminal.
 
-    Tables of the paper have further files beside ``args.out``.
+    Its last line tells the command and the version of the code. Tables of the paper have further files beside
+    ``args.out``.
     """
     chosen = experiment(args.name)
     methods = None if args.methods is None else [m.strip() for m in args.methods.split(",") if m.strip()]
@@ -30,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     with ExitStack() as outputs:
         out = None if args.out is None else outputs.enter_context(output_file(args.out, args.overwrite))
         with ProgressBar() as progress:
-            text = chosen.run(config, progress)
+            text = chosen.run(config, progress) + _origin(args)
         if out is None:
             say(text, end="")
             return 0
@@ -47,8 +52,36 @@ def _write_table(table: PaperTable, config: PaperTableConfig, args: argparse.Nam
     with ExitStack() as outputs:
         files = {path: outputs.enter_context(output_file(path, args.overwrite)) for path in paths}
         with ProgressBar() as progress:
-            contents = table.files(config, progress, args.out)
+            contents = {**table.files(config, progress, args.out)}
+        contents[args.out] += _origin(args)
         for path, text in contents.items():
             files[path].write_text(text)
     mention(f"{'wrote':<15} {', '.join(str(path) for path in paths)}")
     return 0
+
+
+def _origin(args: argparse.Namespace) -> str:
+    """What made a table, as its last line: figures and the version of their code stay together."""
+    # Outputs and processes make no difference to the figures.
+    flags = {name: getattr(args, name) for name in ("streets", "seed", "methods", "config")}
+    words = [word for name, value in flags.items() if value is not None for word in (f"--{name}", str(value))]
+    words += [word for setting in args.settings for word in ("--set", setting)]
+    data = ["--data", *args.data] if args.data else []
+    command = shlex.join(["sst-graph", "experiment", args.name, *data, *words])
+    return f"\nMade by `{command}`, sst-graph {code_version()}.\n"
+
+
+def code_version() -> str:
+    """The commit where the code runs from a checkout, which may differ from what is installed; else the
+    version of the package."""
+    package = str(sst_graph.__version__)
+    root = Path(sst_graph.__file__).parent.parent
+    if not (root / ".git").exists():
+        return package
+    # "-dirty": the code differs from that commit.
+    command = ["git", "-C", str(root), "describe", "--always", "--tags", "--dirty"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return package
+    return f"commit {found.stdout.strip()}"

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.data.frame_parts import image_at, number_at, scan_at
+from sst_graph.data.frame_parts import number_at, scan_at
 from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
@@ -91,11 +91,16 @@ def moved_by(cTl: gtsam.Pose3, step: Sequence[float] | FloatArray) -> gtsam.Pose
     return cTl.retract(np.asarray(step, dtype=np.float64))
 
 
-def peer_frames(source: Source, drive: Drive, time_offset_s: float, count: int) -> list[PeerFrame]:
+def peer_frames(
+    source: Source, drive: Drive, time_offset_s: float, count: int, pictures: Source | None = None
+) -> list[PeerFrame]:
     """At most ``count`` frames, evenly over those images whose instant the LiDAR's motion covers.
 
     An image of stamp t shows LiDAR time t + ``time_offset_s``; the scan nearest to it is moved
     there by the LiDAR's odometry.
+
+    Args:
+        pictures: the same drive with its instances, where ``source`` leaves them out.
 
     Raises:
         DataError: no image has a picture and a scan.
@@ -111,7 +116,8 @@ def peer_frames(source: Source, drive: Drive, time_offset_s: float, count: int) 
         image, instant_ns = covered[k]
         nearest = drive.scans[int(np.abs(stamps - instant_ns).argmin())]
         scan = scan_at(source, positions[nearest.index])
-        picture = image_at(source, positions[image.index])
+        # Read as a frame: apart, an image may come without its instances.
+        picture = (pictures or source)[positions[image.index]].image
         assert scan is not None and picture is not None
         if picture.has_picture:
             twist = _twist_at(drive.lidar_motions, instant_ns)

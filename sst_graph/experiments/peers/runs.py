@@ -1,8 +1,9 @@
-"""Every method from every start on one drive."""
+"""A method from every start on one drive."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from sst_graph.data import open_source
 from sst_graph.drive.preparation import Drive, prepare_drive
 from sst_graph.errors import ConfigError, EstimationError
 from sst_graph.experiments.peers.frames import PeerProblem, peer_frames
-from sst_graph.experiments.peers.methods import NAMES, OWN, PEERS
+from sst_graph.experiments.peers.methods import NAMES, PEERS
 from sst_graph.experiments.starts import start_near
 from sst_graph.metrics import calibration_errors
 from sst_graph.odometry.sweep import with_sweep
@@ -43,24 +44,24 @@ class PeersConfig(Settings):
         frames: that the peers are given, evenly over the drive; the package's methods choose their own.
         samples: poses of each round of CalibAnything's random search; the original leaves it to its user.
         failed_deg, failed_m: rotation (QAD) or translation (ATD) beyond which a run has failed.
-        jobs: drives at a time, a process each.
-        records: file that keeps finished drives, from which a further call goes on.
+        jobs: tasks at a time, a process each; a task is a method on a drive.
+        records: file that keeps finished tasks, from which a further call goes on.
         figure: SVG to write, of error against start.
         street: the rest of the streets.
         calibration: settings of the package's methods.
     """
 
-    streets: int = setting(2, at_least=0, at_most=10_000)
+    streets: int = setting(3, at_least=0, at_most=10_000)
     seed: int = setting(800, at_least=0, at_most=10**15)
     data: tuple[str, ...] = setting((), length=(0, 1000))
     image_shift: int = setting(1, at_least=-1000, at_most=1000)
     methods: tuple[str, ...] = setting(NAMES, length=(1, 100), choices=NAMES)
     ranges_deg: tuple[float, ...] = setting(
-        (1.0, 2.0, 5.0, 10.0, 20.0), at_least=0.0, at_most=180.0, length=(1, 100)
+        (1.0, 3.0, 10.0, 20.0), at_least=0.0, at_most=180.0, length=(1, 100)
     )
     metres_a_degree: float = setting(0.01, at_least=0.0, at_most=1.0)
     starts: int = setting(1, at_least=1, at_most=10_000)
-    frames: int = setting(3, at_least=1, at_most=1000)
+    frames: int = setting(5, at_least=1, at_most=1000)
     samples: int = setting(1000, at_least=1, at_most=10**7)
     failed_deg: float = setting(1.0, at_least=0.0, at_most=180.0)
     failed_m: float = setting(0.2, at_least=0.0, at_most=100.0)
@@ -77,19 +78,27 @@ class PeersConfig(Settings):
             raise ConfigError("streets, data: found neither, expected streets or drives")
 
 
+START = "start"
+"""What stands in the place of a method for the starts themselves."""
+
+
 @dataclass(frozen=True)
 class PeerTask:
-    """One drive.
+    """A method on a drive.
 
     Attributes:
         place: folder of a drive, or "" for a simulated street.
-        number: of the drive.
+        number: of the drive among the folders, or of the street among the streets.
+        method: its name, or START.
         config: all settings that its runs depend on.
+        traced: whether memory is measured too.
     """
 
     place: str
     number: int
+    method: str
     config: PeersConfig
+    traced: bool = False
 
 
 @dataclass(frozen=True)
@@ -104,9 +113,9 @@ class PeerRun:
         qad_deg, atd_m: errors of the result; None where the method could not be run.
         status: what the result says of itself; "" of a peer, which says nothing.
         sigma_deg: claimed standard deviation of the rotation (root of the mean variance), or None.
-        seconds: that it took, without reading and preparing the drive, or None where it could not be run.
+        seconds: of processor time, without reading and preparing the drive; None where it could not be run.
         peak_mb: most memory of Python and NumPy at once beside the prepared drive (tracemalloc); only of the
-            first start.
+            first start on the first street and the first drive.
         why_not: why it could not be run, or "".
     """
 
@@ -142,57 +151,84 @@ _Solver = Callable[[gtsam.Pose3, float], _Answer]
 """From a start and the half width of its error [deg]."""
 
 
-def runs_of_drive(task: PeerTask) -> list[PeerRun]:
-    """All methods from all starts on one drive.
+def tasks_of(config: PeersConfig) -> list[PeerTask]:
+    """All tasks, drive by drive: streets, then folders.
+
+    Streets and folders are numbered apart: more of the one leave the records of the other as they are.
+    """
+    # What changes nothing of what one method finds on one drive.
+    own = dataclasses.replace(config, streets=1, data=(), methods=NAMES, jobs=1, records="", figure="")
+    places = [("", number) for number in range(config.streets)]
+    places += [(place, number) for number, place in enumerate(config.data)]
+    return [
+        PeerTask(place, number, method, own, traced=number == 0)
+        for place, number in places
+        for method in (START, *config.methods)
+    ]
+
+
+def runs_of_task(task: PeerTask) -> list[PeerRun]:
+    """A method from all starts on a drive.
 
     Raises:
         DataError: the drive cannot be used.
         ConfigError: it brings no reference calibration.
     """
     config = task.config
-    source = _source(task)
-    truth = source.truth
-    if truth is None:
-        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
-    solvers = _solvers(source, truth, config)
+    # Tasks come drive by drive: the one that is read and prepared serves all of its methods.
+    read = _read(task.place, task.number, config)
+    solve = None if task.method == START else _solver(read, task.method, config)
     rng = np.random.default_rng([config.seed, task.number, 25])
     found = []
     for range_deg in config.ranges_deg:
         for number in range(config.starts):
-            start = start_near(truth.cTl, range_deg, config.metres_a_degree * range_deg, rng)
-            plain = PeerRun(source.name, not task.place, "start", range_deg, 0.0, 0.0, "", None, None, None)
-            found.append(_with_errors(plain, start, truth))
-            for method, solve in solvers.items():
-                run = _run(dataclasses.replace(plain, method=method), solve, start, truth)
-                if number == 0 and range_deg == config.ranges_deg[0] and not run.why_not:
-                    # Once more, for tracing makes it slow.
-                    run = dataclasses.replace(run, peak_mb=_peak_mb(solve, start, range_deg))
-                found.append(run)
+            start = start_near(read.truth.cTl, range_deg, config.metres_a_degree * range_deg, rng)
+            name, simulated = read.source.name, not task.place
+            run = PeerRun(name, simulated, task.method, range_deg, 0.0, 0.0, "", None, None, None)
+            if solve is None:
+                found.append(_with_errors(run, start, read.truth))
+                continue
+            run = _run(run, solve, start, read.truth)
+            if task.traced and number == 0 and range_deg == config.ranges_deg[0] and not run.why_not:
+                # Once more, for tracing makes it slow.
+                run = dataclasses.replace(run, peak_mb=_peak_mb(solve, start, range_deg))
+            found.append(run)
     return found
 
 
-def _source(task: PeerTask) -> Source:
-    if task.place:
-        return open_source(task.place, image_shift=task.config.image_shift)
-    return simulate(dataclasses.replace(task.config.street, seed=task.config.seed + task.number))
+@dataclass(frozen=True, eq=False)
+class _ReadDrive:
+    """A drive that is read and prepared once for all methods but edges, which prepares its own."""
+
+    source: Source
+    truth: GroundTruth
+    drive: Drive
+    problem: PeerProblem
 
 
-def _solvers(source: Source, truth: GroundTruth, config: PeersConfig) -> dict[str, _Solver]:
-    """Every method on a drive that is read once, twice with method edges."""
-    offset_s = truth.time_offset_s or 0.0
+@functools.lru_cache(maxsize=1)
+def _read(place: str, number: int, config: PeersConfig) -> _ReadDrive:
+    if place:
+        source = open_source(place, image_shift=config.image_shift)
+    else:
+        source = simulate(dataclasses.replace(config.street, seed=config.seed + number))
+    truth = source.truth
+    if truth is None:
+        raise ConfigError(f"{source.name}: found no reference calibration, expected one")
     swept = with_sweep(source, config.calibration.decide_sweep)
     drive = prepare_drive(swept, config.calibration.classes, config.calibration.prepare)
-    frames = peer_frames(swept, drive, offset_s, config.frames)
+    offset_s = truth.time_offset_s or 0.0
+    frames = peer_frames(swept, drive, offset_s, config.frames, source)
     problem = PeerProblem(frames, drive, offset_s, samples=config.samples, seed=config.seed)
-    solvers: dict[str, _Solver] = {}
-    for method in config.methods:
-        if method in PEERS:
-            solvers[method] = _by_peer(problem, method, config)
-        elif method in OWN:
-            own = dataclasses.replace(config.calibration, method=_method(method))
-            prepared = prepare_drives([swept], own)[0] if method == "edges" else drive
-            solvers[method] = _by_package(prepared, own, offset_s)
-    return solvers
+    return _ReadDrive(swept, truth, drive, problem)
+
+
+def _solver(read: _ReadDrive, method: str, config: PeersConfig) -> _Solver:
+    if method in PEERS:
+        return _by_peer(read.problem, method, config)
+    own = dataclasses.replace(config.calibration, method=_method(method))
+    drive = prepare_drives([read.source], own)[0] if method == "edges" else read.drive
+    return _by_package(drive, own, read.problem.time_offset_s)
 
 
 def _method(name: str) -> Method:
@@ -221,12 +257,12 @@ def _rotation_sigma_deg(result: CalibrationResult) -> float:
 
 
 def _run(run: PeerRun, solve: _Solver, start: gtsam.Pose3, truth: GroundTruth) -> PeerRun:
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         answer = solve(start, run.range_deg)
     except EstimationError as error:
         return dataclasses.replace(run, qad_deg=None, atd_m=None, why_not=str(error))
-    seconds = time.perf_counter() - began
+    seconds = time.process_time() - began
     run = dataclasses.replace(run, status=answer.status, sigma_deg=answer.sigma_deg, seconds=seconds)
     return _with_errors(run, answer.cTl, truth)
 

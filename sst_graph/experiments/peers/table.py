@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,11 +11,24 @@ import numpy as np
 from sst_graph.drive.preparation import Progress
 from sst_graph.errors import MissingDependencyError
 from sst_graph.experiments.peers.methods import OWN, PEERS
-from sst_graph.experiments.peers.runs import PeerRun, PeersConfig, PeerTask, runs_of_drive
+from sst_graph.experiments.peers.runs import START, PeerRun, PeersConfig, runs_of_task, tasks_of
 from sst_graph.experiments.resumable import Work, rows_of
 from sst_graph.files import atomic_write_bytes
 
-_COLOURS = ("#d1342f", "#2b8a3e", "#1c64c8", "#c77700", "#7b4ab5", "#008b8b", "#9aa2ab", "#b8567f", "#5c5c5c")
+_COLOURS = (
+    "#d1342f",
+    "#2b8a3e",
+    "#1c64c8",
+    "#c77700",
+    "#7b4ab5",
+    "#008b8b",
+    "#8a6d3b",
+    "#b8567f",
+    "#5c5c5c",
+    "#9aa2ab",
+)
+_PANEL_IN, _LEGEND_IN = 3.4, 1.5
+"""Widths of a panel, and of the legend [in]."""
 
 
 def run(config: PeersConfig, progress: Progress | None = None) -> str:
@@ -28,11 +40,7 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
         MissingDependencyError: a figure is asked for, and matplotlib is not installed.
     """
     figure_of = _figure_class() if config.figure else None
-    # What changes nothing of what is found on one drive.
-    own = dataclasses.replace(config, streets=1, data=(), jobs=1, records="", figure="")
-    places = [*("" for _ in range(config.streets)), *config.data]
-    tasks = [PeerTask(place, number, own) for number, place in enumerate(places)]
-    found = rows_of(Work(runs_of_drive, PeerRun, config.jobs, config.records), tasks, progress)
+    found = rows_of(Work(runs_of_task, PeerRun, config.jobs, config.records), tasks_of(config), progress)
     runs = [row for rows in found for row in rows]
     if figure_of is not None:
         atomic_write_bytes(config.figure, figure(runs, config, figure_of))
@@ -41,19 +49,16 @@ def run(config: PeersConfig, progress: Progress | None = None) -> str:
 
 def markdown(runs: Sequence[PeerRun], config: PeersConfig) -> str:
     """The tables: one of streets, one of each real drive."""
-    groups = [("simulated streets", [row for row in runs if row.simulated])]
-    for name in dict.fromkeys(row.drive for row in runs if not row.simulated):
-        groups.append((name, [row for row in runs if row.drive == name and not row.simulated]))
     parts = [
         f"Cells: median rotation error [deg] / median ATD [cm] / failed of all (rotation above "
         f"{config.failed_deg:g}° or ATD above {100.0 * config.failed_m:g} cm, or no result). Starts within "
         f"± the angle by axis and ±{100.0 * config.metres_a_degree:g} cm a degree. All are given the true "
         "time offset. *r*: re-implementation. Memory: peak of Python and NumPy beside the "
-        "prepared drive (tracemalloc), first start.",
+        "prepared drive (tracemalloc), first start on the first street and on the first drive. Seconds: of "
+        "processor time, median.",
     ]
-    for title, own in groups:
-        if own:
-            parts += ["", f"**{title}**", "", *_table(own, config)]
+    for title, own in _groups(runs):
+        parts += ["", f"**{title}**", "", *_table(own, config)]
     return "\n".join(parts) + "\n"
 
 
@@ -62,10 +67,10 @@ def _table(runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for method in dict.fromkeys(row.method for row in runs):
         own = [row for row in runs if row.method == method]
-        label = method if method in ("start", *OWN) else f"{method} *r*"
+        label = method if method in (START, *OWN) else f"{method} *r*"
         reasons = {row.why_not for row in own}
         if "" not in reasons:
-            lines.append(f"| {label} | " + " | ".join(["–"] * (len(head) - 2)) + f" | {reasons.pop()} |")
+            lines.append("| " + " | ".join([label, min(reasons), *["–"] * (len(head) - 2)]) + " |")
             continue
         cells = [_cell([row for row in own if row.range_deg == r], config) for r in config.ranges_deg]
         lines.append("| " + " | ".join([label, *cells, *_remaining_cells(method, own, config)]) + " |")
@@ -81,7 +86,7 @@ def _cell(runs: Sequence[PeerRun], config: PeersConfig) -> str:
 
 
 def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:
-    if method == "start":
+    if method == START:
         return ["–"] * 4
     silent = sum(row.failed(config) and row.status == "ok" for row in runs)
     return [
@@ -108,28 +113,31 @@ def _figure_class() -> Callable[..., Any]:
 
 
 def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[..., Any]) -> bytes:
-    """SVG: median rotation error against the half width of the starts' error; streets and real drives."""
+    """SVG: median rotation error against the half width of the starts' error: streets, each real drive."""
     from matplotlib import rc_context
 
-    groups = [(name, some) for name, some in _panels(runs) if some]
-    drawing = figure_of(figsize=(4.6 * len(groups) + 1.6, 4.2))
+    groups = _groups(runs)
+    width = _PANEL_IN * len(groups) + _LEGEND_IN
+    drawing = figure_of(figsize=(width, 3.9))
     panels = drawing.subplots(1, len(groups), sharey=True, squeeze=False)[0]
-    methods = [name for name in dict.fromkeys(row.method for row in runs) if name != "start"]
+    methods = [name for name in dict.fromkeys(row.method for row in runs) if name != START]
     for axes, (title, some) in zip(panels, groups, strict=True):
-        for number, method in enumerate(["start", *methods]):
+        for number, method in enumerate([START, *methods]):
             medians = [_median_error(some, method, r) for r in config.ranges_deg]
             if all(np.isnan(medians)):
                 continue
-            if method == "start":
-                style = {"color": "#000000", "ls": ":"}
+            if method == START:
+                style = {"color": "#000000", "ls": ":", "zorder": 3}
             else:
                 solid = method in OWN
                 style = {"color": _COLOURS[(number - 1) % len(_COLOURS)], "ls": "-" if solid else "--"}
             axes.plot(config.ranges_deg, medians, marker="o", ms=3, lw=1.4, label=method, **style)
+        axes.axhline(config.failed_deg, color="#000000", lw=0.6)
         axes.set_xscale("log")
         axes.set_yscale("log")
         axes.set_xticks(config.ranges_deg, [f"±{r:g}" for r in config.ranges_deg])
         axes.minorticks_off()
+        axes.tick_params(labelsize=8)
         axes.grid(color="#e6e9ec", lw=0.7)
         axes.set_title(title, fontsize=9)
         axes.set_xlabel("start [deg by axis]", fontsize=8)
@@ -138,8 +146,16 @@ def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[...
     handles: dict[str, Any] = {}
     for axes in panels:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    drawing.legend(handles.values(), handles.keys(), fontsize=7, frameon=False, loc="center right")
-    drawing.tight_layout(rect=(0.0, 0.0, 1.0 - 1.5 / (4.6 * len(groups) + 1.6), 1.0))
+    drawing.legend(
+        handles.values(),
+        handles.keys(),
+        fontsize=7,
+        frameon=False,
+        loc="center right",
+        title=f"dashed: re-implemented\nabove {config.failed_deg:g}°: failed",
+        title_fontsize=7,
+    )
+    drawing.tight_layout(rect=(0.0, 0.0, 1.0 - _LEGEND_IN / width, 1.0))
     stream = io.BytesIO()
     # No date and no random names: the same runs give the same bytes.
     with rc_context({"svg.hashsalt": "peers"}):
@@ -147,11 +163,12 @@ def figure(runs: Sequence[PeerRun], config: PeersConfig, figure_of: Callable[...
     return stream.getvalue()
 
 
-def _panels(runs: Sequence[PeerRun]) -> list[tuple[str, list[PeerRun]]]:
-    return [
-        ("simulated streets", [row for row in runs if row.simulated]),
-        ("real drives", [row for row in runs if not row.simulated]),
-    ]
+def _groups(runs: Sequence[PeerRun]) -> list[tuple[str, list[PeerRun]]]:
+    """All streets together, then each real drive, by their titles."""
+    groups: dict[str, list[PeerRun]] = {}
+    for row in runs:
+        groups.setdefault("simulated streets" if row.simulated else row.drive, []).append(row)
+    return list(groups.items())
 
 
 def _median_error(runs: Sequence[PeerRun], method: str, range_deg: float) -> float:

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from sst_graph.cli import main
+from sst_graph.cli.commands.experiment import code_version
 from sst_graph.experiments.paper.tables import STATE
 
 PROGRAM = [sys.executable, "-m", "sst_graph.cli", "experiment"]
@@ -49,6 +50,11 @@ def test_a_kitti_root_gives_the_stretch_of_sequence_00(
         *(("0", "start"), ("0", "joint"), ("1", "start"), ("1", "joint"))
     ]
     assert out.with_suffix(".svg").read_text().startswith("<?xml")
+    # the last line tells what made it, without outputs
+    made = ["Made by `sst-graph experiment table4", "--data", str(kitti), "--methods", "joint", "--set"]
+    last = table.splitlines()[-1]
+    assert last.startswith(" ".join(made)) and last.endswith(f"sst-graph {code_version()}.")
+    assert str(out) not in last
     # outputs are not replaced unasked; runs that are done are not run again
     state = (out.parent / STATE).read_bytes()
     assert main(command) == 2 and "--overwrite" in capsys.readouterr().err

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import cv2
 import numpy as np
 from stored import simulated
 
 from sst_graph.batch import CalibrationConfig, prepare_drives
+from sst_graph.data import open_source
+from sst_graph.drive.preparation import prepare_drive
 from sst_graph.experiments.peers.frames import peer_frames, range_jumps
 from sst_graph.experiments.peers.mask_consistency import masks_of
-from sst_graph.simulator import SimulationConfig
+from sst_graph.odometry.sweep import with_sweep
+from sst_graph.simulator import SimulationConfig, write_drive
 from sst_graph.types import SemanticClass
 
 STREET = SimulationConfig(
@@ -66,3 +72,18 @@ def test_every_pixel_has_a_mask() -> None:
     for number in np.unique(masks[vehicles]):
         own = masks == number
         assert len(np.unique(frame.instances[own])) == 1 and (frame.mask[own] == SemanticClass.VEHICLE).all()
+
+
+def test_frames_of_a_drive_on_disk_have_its_instances(tmp_path: Path) -> None:
+    """Instances are read with a frame only, and a source whose scans are swept leaves them out."""
+    write_drive(simulated(STREET), tmp_path)
+    for picture in sorted(tmp_path.glob("sequences/*/image_2/*.png")):
+        path = picture.parent.parent / "instance_2" / picture.name
+        path.parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(path), np.full((187, 621), 26 * 256 + 7, np.uint16))
+    source = open_source(str(tmp_path))
+    config = CalibrationConfig(method="joint")
+    swept = with_sweep(source, config.decide_sweep)
+    drive = prepare_drive(swept, config.classes, config.prepare)
+    (frame,) = peer_frames(swept, drive, 0.05, 1, source)
+    assert frame.instances is not None and (frame.instances == 7).all()

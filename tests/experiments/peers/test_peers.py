@@ -108,10 +108,25 @@ def test_information_of_independent_and_of_equal_values() -> None:
 def test_weights_of_a_point_add_up_to_one() -> None:
     frame = street()[2][0]
     assert frame.intensities is not None
-    seen = statistics._Seen(frame, frame.lPs, frame.intensities)
+    seen = statistics._Seen(frame, frame.grey, frame.lPs, frame.intensities)
     inside, _ = frame.pixels(street()[0], frame.lPs)
     assert statistics.joint_by_spline(seen, street()[0]).sum() == pytest.approx(len(inside))
     assert statistics.joint_by_pixel(seen, street()[0]).sum() == len(inside)
+
+
+def test_the_gradient_of_nid_is_that_of_its_values() -> None:
+    frame = street()[2][0]
+    assert frame.intensities is not None
+    pose = off(1.0)
+    # Points whose 4 x 4 pixels lie within the image: at its border a step may lose one.
+    inside, uvs = frame.pixels(pose, frame.lPs)
+    some = inside[((uvs > 8.0) & (uvs < np.array([612.0, 178.0]))).all(axis=1)]
+    seen = statistics._Seen(frame, frame.grey, frame.lPs[some], frame.intensities[some])
+    _, gradient = statistics.nid_by_spline(seen, pose)
+    h = 1e-6
+    ahead = [statistics.nid_by_spline(seen, pose.retract(h * e))[0] for e in np.eye(6)]
+    behind = [statistics.nid_by_spline(seen, pose.retract(-h * e))[0] for e in np.eye(6)]
+    np.testing.assert_allclose(gradient, np.subtract(ahead, behind) / (2.0 * h), rtol=1e-4, atol=1e-5)
 
 
 def test_without_intensities_they_refuse() -> None:
@@ -162,7 +177,7 @@ def test_the_table_counts_what_failed_and_what_could_not_be_run() -> None:
         "| joint | 0.10 / 1.0 / 0 of 1 | 3.00 / 1.0 / 1 of 1 | 1 | 0.05° | 2.0 | 30 |",
         "| scipy *r* | 0.10 / 1.0 / 0 of 1 | 0.10 / 50.0 / 1 of 1 | says nothing | none | 2.0 | 30 |",
         "| hand-eye *r* | 0.10 / – / 0 of 1 | – / – / 1 of 1 | says nothing | none | 2.0 | 30 |",
-        "| nid *r* | – | – | – | – | – | no intensities |",
+        "| nid *r* | no intensities | – | – | – | – | – |",
     ]
 
 
