@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -23,6 +22,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -67,8 +67,14 @@ class Series:
         return "\n".join(lines)
 
 
-def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, float]:
-    """In the process that is measured: seconds of both parts, and labelled points of a scan."""
+def peak_mb() -> float:
+    """Largest resident memory of this process; ``ru_maxrss`` has that of the process that started it too."""
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if "VmHWM" in line)
+    return float(line.split()[1]) / 1024.0
+
+
+def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, Any]:
+    """In the process that is measured: seconds of both parts, memory, labelled points of a scan."""
     cv2.setNumThreads(1)
     source, config = open_source(drive)[:frames], CalibrationConfig()
     assert source.nominal is not None
@@ -76,33 +82,30 @@ def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, float]:
     if cameras == 1:
         drives = prepare_drives([source], config)
         prepared = time.process_time()
-        calibrate_prepared(drives, source.nominal, config)
+        status = calibrate_prepared(drives, source.nominal, config).status
     else:
         names = [f"cam{k}" for k in range(cameras)]
         of_rig = prepare_rig({name: [source] for name in names}, config)
         prepared = time.process_time()
         guesses = {name: Guess(source.nominal, 0.0) for name in names}
-        calibrate_rig_prepared(of_rig, guesses, config, KnownRig())
+        status = calibrate_rig_prepared(of_rig, guesses, config, KnownRig()).status
     ended = time.process_time()
-    scan = source[0].scan
+    peak, scan = peak_mb(), source[0].scan
     assert scan is not None
     labelled = int((scan.classes == SemanticClass.VEHICLE).sum())
-    return {"prepare": prepared - began, "solve": ended - prepared, "labelled": labelled}
+    seconds = {"prepare": prepared - began, "solve": ended - prepared}
+    return {**seconds, "peak_mb": peak, "labelled": labelled, "status": status}
 
 
 def measured(drive: Path, frames: int, cameras: int = 1) -> tuple[list[float], float]:
     """The costs of a process of its own, and labelled points of a scan."""
     command = [sys.executable, "-m", "benchmarks.scaling", "--one", str(drive), str(frames), str(cameras)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    text = process.stdout.read()
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"a calibration ended with {process.returncode}")
-    found = json.loads(text.splitlines()[-1])
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
+    if done.returncode:
+        raise SystemExit(f"a calibration ended with {done.returncode}")
+    found = json.loads(done.stdout.splitlines()[-1])
     print(f"{drive.name}, {frames} frames, {cameras} cameras: {found}", file=sys.stderr, flush=True)
-    return [found["prepare"], found["solve"], usage.ru_maxrss / 1024.0], found["labelled"]
+    return [found["prepare"], found["solve"], found["peak_mb"]], found["labelled"]
 
 
 def written(folder: Path, name: str, config: SimulationConfig) -> Path:
