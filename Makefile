@@ -38,7 +38,7 @@ demo: $(INSTALLED)
 bench: $(INSTALLED)
 	$(BIN)/python -m pytest benchmarks --benchmark-enable -n 0
 
-# Fails when a hot path costs a quarter more than benchmarks/guard.json says.
+# Fails when a hot path takes a quarter more instructions than benchmarks/guard.json says; needs valgrind.
 guard: $(INSTALLED)
 	$(BIN)/python -m benchmarks.guard
 

@@ -1,6 +1,7 @@
 """A long run of the tracker: cost of a frame, its growth, memory, alarms. Prints one JSON document.
 
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000
+    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000 --markdown
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --checkpoint-every 10
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --street heavy
     OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
@@ -71,6 +72,19 @@ def _quantiles(costs: NDArray[np.float64]) -> dict[str, float]:
     }
 
 
+def table(costs_ms: NDArray[np.float64], memory_mb: NDArray[np.float64]) -> str:
+    """Cost of a frame and largest memory until then, of all frames and of each fifth of them."""
+    lines = ["| frames | median [ms] | p99 / median | slowest / median | its frame | memory [MB] |"]
+    lines.append("|---|---|---|---|---|---|")
+    for part in (np.arange(len(costs_ms)), *np.array_split(np.arange(len(costs_ms)), 5)):
+        own = costs_ms[part]
+        median, p99, slowest = np.median(own), np.quantile(own, 0.99), own.max()
+        cells = [f"{median:.1f}", f"{p99 / median:.2f}", f"{slowest / median:.2f}"]
+        cells += [str(part[own.argmax()]), f"{memory_mb[part[-1]]:.0f}"]
+        lines.append(f"| {part[0]:,} to {part[-1]:,} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 class Timed:
     """A tracker that saves now and then, and what each frame costs with that."""
 
@@ -131,6 +145,7 @@ def main() -> None:
     parser.add_argument("--drive", help="a drive on disk instead of a street: the cost of all its frames")
     parser.add_argument("--image-shift", type=int, default=0)
     parser.add_argument("--checkpoint-every", type=int, default=0, help="frames between saves; 0: none")
+    parser.add_argument("--markdown", action="store_true", help="a table instead of JSON (streets only)")
     args = parser.parse_args()
     config = TrackerConfig(drift=DriftConfig(enabled=args.drift))
     if args.drive is not None:
@@ -168,6 +183,9 @@ def main() -> None:
             if update.chi2 is not None:
                 chi2.append(update.chi2)
     costs = timed.ms
+    if args.markdown:
+        print(table(np.array(costs), np.array(memory)))
+        return
     steady, settles = np.array(costs[WARM_UP:]), np.array(relinearizing[WARM_UP:])
     block = min(500, len(steady) // 2)
     truth = drive.truth.cTl

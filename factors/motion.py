@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import gtsam
 import numpy as np
@@ -179,6 +179,27 @@ class RigidlyMoved:
         out[3:] = g
 
 
+class _Exponential(NamedTuple):
+    """What Exp(xi) of xis (6, n) and its derivatives are made of: x = theta^2, its coefficients
+    (:func:`exponential_coefficients`), omega x v and omega x (omega x v)."""
+
+    x: FloatArray
+    b: FloatArray
+    c: FloatArray
+    b_x: FloatArray
+    c_x: FloatArray
+    wv: FloatArray
+    wwv: FloatArray
+
+    @classmethod
+    def of(cls, xis: FloatArray) -> _Exponential:
+        omega, v = xis[:3], xis[3:]
+        x = (omega**2).sum(axis=0)
+        b, c, b_x, c_x = exponential_coefficients(x)
+        wv = cross(omega, v)
+        return cls(x, b, c, b_x, c_x, wv, cross(omega, wv))
+
+
 @dataclass(frozen=True)
 class PointwiseMoved:
     """Points with a tau each.
@@ -191,7 +212,7 @@ class PointwiseMoved:
         cRl: (3, 3) rotation of the LiDAR in the camera, before the motion.
         xis: (6, n) twist of the displacement, -tau w.
         rates: (6, n) -d xi / d tau = c_twist - tau c_acceleration.
-        model: see :data:`MotionModel`.
+        exponential: of xis; None for the model "translation".
         l_velocities: (3, n) of the objects [m/s], or None.
     """
 
@@ -202,7 +223,7 @@ class PointwiseMoved:
     cRl: FloatArray
     xis: FloatArray
     rates: FloatArray
-    model: MotionModel
+    exponential: _Exponential | None
     l_velocities: FloatArray | None = None
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
@@ -219,14 +240,11 @@ class PointwiseMoved:
     def _by_motion(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradients by xi (6, k, n), and by the point before the motion, (3, k, n)."""
         by_xi = np.zeros((6, *g.shape[1:]))
-        if self.model == "translation":
+        if self.exponential is None:
             by_xi[3:] = g
             return by_xi, g
         omega, v = self.xis[:3], self.xis[3:]
-        x = (omega**2).sum(axis=0)
-        b, c, b_x, c_x = exponential_coefficients(x)
-        wv = cross(omega, v)
-        wwv = cross(omega, wv)
+        x, b, c, b_x, c_x, wv, wwv = self.exponential
         arms = self.cPs - (v + b * wv + c * wwv)  # R (cTl . lP)
         w = omega[:, None, :]
         wg = cross(w, g)
@@ -275,8 +293,9 @@ def move_points(
     twists, changes = c_twist.reshape(6, -1), c_acceleration.reshape(6, -1) * taus_s
     xis = -taus_s * (twists - 0.5 * changes)
     rates = twists - changes
-    cPs = cPs + xis[3:] if model == "translation" else _move(xis, cPs)
-    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, model, l_velocities)
+    exponential = None if model == "translation" else _Exponential.of(xis)
+    cPs = cPs + xis[3:] if exponential is None else _move(xis, exponential, cPs)
+    return PointwiseMoved(lPs, cPs, None, taus_s, R, xis, rates, exponential, l_velocities)
 
 
 def _move_rigidly(
@@ -303,11 +322,10 @@ def _moved_pose(cTl: gtsam.Pose3, xi: FloatArray, model: MotionModel) -> gtsam.P
     return gtsam.Pose3.Expmap(xi) * cTl
 
 
-def _move(xis: FloatArray, points: FloatArray) -> FloatArray:
+def _move(xis: FloatArray, exponential: _Exponential, points: FloatArray) -> FloatArray:
     """Exp(xi) . p for xis (6, n) and points (3, n)."""
     omega, v = xis[:3], xis[3:]
-    x = (omega**2).sum(axis=0)
-    b, c, _, _ = exponential_coefficients(x)
-    wp, wv = cross(omega, points), cross(omega, v)
+    x, b, c, _, _, wv, wwv = exponential
+    wp = cross(omega, points)
     rotated = points + (1.0 - c * x) * wp + b * cross(omega, wp)
-    return np.asarray(rotated + v + b * wv + c * cross(omega, wv))
+    return np.asarray(rotated + v + b * wv + c * wwv)

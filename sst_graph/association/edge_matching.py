@@ -175,7 +175,7 @@ class PairedEdges:
             columns = columns + taus * self.velocities.T
         groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
         starts = [a for a, _, _ in groups]
-        if not all((taus[a:b] == taus[a]).all() for a, b, _ in groups):
+        if not np.array_equal(taus, np.repeat(taus[starts], [b - a for a, b, _ in groups])):
             each = CameraTwist(*(self.repeated(rows).T for rows in self._motion_rows()))
             return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
         # Every group moves as one rigid body.
