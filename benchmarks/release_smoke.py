@@ -4,8 +4,8 @@
 
 For every Python and for the newest and the oldest versions of the dependencies that pyproject.toml
 allows: ``sst-graph --version``, the import of every module, ``simulate`` and ``calibrate`` (which must end
-with status ok); then, with the extras plot, ros, yaml and onnx added, ``inspect --plots`` and ``info`` of a
-bag. The extra hf (PyTorch) is left out for its size.
+with status ok); with the extra ros, ``info`` and ``calibrate`` of a bag of the same drive (status ok, too);
+with plot, yaml and onnx added, ``inspect --plots``. The extra hf (PyTorch) is left out for its size.
 
 Needs ``build`` and ``uv`` (the extra ``release``) and a package index.
 """
@@ -13,6 +13,7 @@ Needs ``build`` and ``uv`` (the extra ``release``) and a package index.
 from __future__ import annotations
 
 import argparse
+import email
 import json
 import os
 import shutil
@@ -30,7 +31,7 @@ UV = (sys.executable, "-m", "uv")
 PYTHONS = ("3.11", "3.12", "3.13")
 RESOLUTIONS = ("highest", "lowest-direct")
 IMAGE, MASK = "/camera/image_rect", "/camera/mask"  # of write_bag
-EXTRAS = "plot,ros,yaml,onnx"
+EXTRAS = ("ros", "plot", "yaml", "onnx")
 IN_SDIST = (
     "docs/develop/layout.md",
     "notebooks/",
@@ -51,7 +52,7 @@ print(len(names), "modules")
 """
 WRITE_BAG = """
 from sst_graph.simulator import SimulationConfig, simulate, write_bag
-write_bag(simulate(SimulationConfig(frames=2, width=621, height=188)), "bag")
+write_bag(simulate(SimulationConfig(frames=10, seed=3)), "bag")
 """
 
 
@@ -143,7 +144,7 @@ def use(wheel: Path, python: Path, resolution: str, folder: Path) -> str:
     install += ["--only-binary", ":all:"]
     command = [binaries / "sst-graph"]
 
-    run([*install, wheel], folder)
+    run([*install, *named(wheel)], folder)
     version = run([*command, "--version"], folder).split()[-1]
     run([binaries / "python", "-c", IMPORT_ALL], folder)
     run([*command, "simulate", "drive", "--frames", "10", "--seed", "3"], folder)
@@ -152,10 +153,15 @@ def use(wheel: Path, python: Path, resolution: str, folder: Path) -> str:
     if result["versions"]["sst-graph"] != version or version not in wheel.name:
         raise SystemExit(f"versions: {result['versions']['sst-graph']}, {version}, {wheel.name}")
 
-    run([*install, f"{wheel}[{EXTRAS}]"], folder)
-    run([*command, "inspect", "result", "--plots", "plots"], folder)
+    run([*install, *named(wheel, EXTRAS[:1])], folder)
     run([binaries / "python", "-c", WRITE_BAG], folder)
-    run([*command, "info", "bag", "--image-topic", IMAGE, "--mask-topic", MASK], folder)
+    (bag,) = (folder / "bag").glob("*.mcap")
+    topics = ["--image-topic", IMAGE, "--mask-topic", MASK]
+    run([*command, "info", bag, *topics], folder)
+    run([*command, "calibrate", bag, *topics, "--sweep", "compensated", "--out", "of_bag"], folder)
+
+    run([*install, *named(wheel, EXTRAS)], folder)
+    run([*command, "inspect", "result", "--plots", "plots"], folder)
     lines = run([*UV, "pip", "freeze", "-q", "--python", binaries / "python"], folder).split()
     kept = (
         "gtsam",
@@ -170,6 +176,19 @@ def use(wheel: Path, python: Path, resolution: str, folder: Path) -> str:
         "pyyaml",
     )
     return " ".join(line for line in lines if line.startswith(kept))
+
+
+def named(wheel: Path, extras: Sequence[str] = ()) -> list[str]:
+    """The wheel, and what it requires by name: uv takes the oldest of what is named alone."""
+    with zipfile.ZipFile(wheel) as archive:
+        (metadata,) = (name for name in archive.namelist() if name.endswith(".dist-info/METADATA"))
+        required = email.message_from_bytes(archive.read(metadata)).get_all("Requires-Dist", [])
+    chosen = []
+    for requirement in required:
+        dependency, _, marker = requirement.partition(";")
+        if not marker or any(f'extra == "{extra}"' in marker for extra in extras):
+            chosen.append(dependency.strip())
+    return [f"{wheel}[{','.join(extras)}]" if extras else str(wheel), *chosen]
 
 
 def run(command: Sequence[str | Path], folder: Path = ROOT) -> str:

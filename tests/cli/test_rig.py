@@ -22,6 +22,15 @@ def street(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A stereo street of two frames, for what is refused before a frame is looked at."""
+    folder = tmp_path_factory.mktemp("rig") / "street"
+    options = ["--frames", "2", "--stereo", "--set=width=310", "--set=height=94"]
+    assert main(["simulate", str(folder), *options]) == 0
+    return folder
+
+
 @pytest.mark.slow
 def test_a_stereo_rig_from_disk(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rig"
@@ -101,23 +110,23 @@ def test_as_json_with_videos_inside(street: Path, tmp_path: Path, capsys: pytest
     ],
 )
 def test_what_is_refused(
-    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], found: str
+    refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], found: str
 ) -> None:
-    assert main(["calibrate", str(street), *options, "--out", str(tmp_path / "out")]) == 2
+    assert main(["calibrate", str(refused), *options, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert found in error and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
 def test_a_camchain_without_the_camera(
-    street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     chain = tmp_path / "camchain.yaml"
     chain.write_text(
         "cam0: {rostopic: image_2}\ncam1: {T_cn_cnm1: [1], rostopic: /right}\n".replace("[1]", _UNIT)
     )
     options = ["--camera", "image_2", "image_3", "--rig", str(chain), "--out", str(tmp_path / "out")]
-    assert main(["calibrate", str(street), *options]) == 2
+    assert main(["calibrate", str(refused), *options]) == 2
     error = capsys.readouterr().err
     assert "cam0 (image_2), cam1 (/right)" in error and "image_3" in error
 
@@ -125,22 +134,22 @@ def test_a_camchain_without_the_camera(
 _UNIT = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 
 
-def test_a_camera_without_images(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_without_images(refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It is bad input, which is said before anything is calibrated."""
     data = tmp_path / "street"
     sequence = data / "sequences" / "00"
     (sequence / "image_3").mkdir(parents=True)
-    for entry in (street / "sequences" / "00").iterdir():
+    for entry in (refused / "sequences" / "00").iterdir():
         if entry.name != "image_3":
             (sequence / entry.name).symlink_to(entry)
     code = main(["calibrate", str(data), "--camera", "image_2", "image_3", "--out", str(tmp_path / "out")])
     assert code == 2 and "image_3" in capsys.readouterr().err
 
 
-def test_data_after_the_cameras(street: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_data_after_the_cameras(refused: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """``--camera NAME DATA`` takes DATA for what it is; without any DATA the usage says so."""
     out = str(tmp_path / "out")
-    assert main(["calibrate", "--camera", "image_7", str(street), "--out", out]) == 2
+    assert main(["calibrate", "--camera", "image_7", str(refused), "--out", out]) == 2
     assert "camera 'image_7'" in capsys.readouterr().err
     assert main(["calibrate", "--camera", "image_2", "image_3", "--out", out]) == 2
     assert "required: DATA" in capsys.readouterr().err
