@@ -47,13 +47,17 @@ POINTS_A_SCAN = 1000
 START_KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0)
 """Scales of the kernel from a start that is a degree off [px]."""
 KERNELS_PX = (*[5.0] * 6, *[4.0] * 3, *[3.0] * 3, *[2.0] * 2, 1.5, 1.2)
-"""From the best of the starts [px]. Pictures have edges beside the objects'; the last scale is below most of
-their distances."""
+"""From the best of the starts, on all scans [px]. Pictures have edges beside the objects'; the last scale is
+below most of their distances. Then :data:`NEAR_KERNELS_PX` until nothing moves."""
 SCORE_PX = 1.5
 """Blur under which solutions are compared [px]."""
-_ROLLS_DEG = (-1.6, -0.8, 0.8, 1.6)
-"""Turns about the camera's axis from which the estimate is tried again: the weakest direction of a street, in
-which false optima lie close by [deg]."""
+_TURNS_DEG = np.array([[0.0, 0.0, -0.8], [0.0, 0.0, 0.8], [0.0, -0.5, 0.0], [0.0, 0.5, 0.0]])
+"""(n, 3) turns about the camera's axes from which an estimate is solved again: false optima lie close by in
+roll, and in yaw with a shift to the side [deg]."""
+_RESTARTS = 4
+"""Most times that a better optimum is followed."""
+_BETTER = 1.005
+"""Its score is higher by this factor: smaller differences are those of one optimum reached twice."""
 _GUESS_SIGMA_DEG = 3.5
 """Sigma, by axis, of the rotation of a guess that starts are searched around [deg]."""
 _REACH_SIGMAS, _MOST_DEG = 2.2, 25.0
@@ -132,15 +136,19 @@ def edges_method(
     if labels.state is None:
         # 2. Starts by a search over rotations; the best of them after refinement on a few scans.
         candidates = _refined(problem, _starts(problem))
-        # 3. All frames, from the best, and from turns about the camera's axis.
-        solution = _solved(problem, candidates, progress)
+        begin, restarts = candidates[0][1].state, _RESTARTS
     else:
-        candidates, solution = [], _settled(problem, labels.state, progress)
-    # 4. Covariance, with what halves of the objects disagree by.
+        candidates, begin, restarts = [], labels.state, 0
+    # 3. All frames, from the best, and from small turns while one agrees better.
+    solution = _best_optimum(problem, begin, restarts, progress)
+    # 4. Covariance, with what halves of the objects disagree by, and edges that are farther away.
     estimate = JointEstimate.of(solution, calibration.objects)
+    wider = solve_joint(problem.whole, solution.state, _WIDER_PX)
+    drift = difference(solution.state, wider.state)
     covariance, spread, unsure = edges_covariance(
         problem.whole, estimate, calibration.objects, calibration.config.assumptions
     )
+    covariance = covariance + np.outer(drift, drift)
     sweeps = sweep_effects(calibration, solution, covariance)
     covariance = covariance + sweeps.covariance
     # 5. Has it worked?
@@ -148,8 +156,7 @@ def edges_method(
         problem.some_edges, solution.state, [one.state for _, one in candidates], config.seed
     )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
-    again = solve_joint(problem.whole, solution.state, NEAR_KERNELS_PX)
-    reasons += drift_reasons(difference(solution.state, again.state))
+    reasons += drift_reasons(drift)
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],
@@ -157,7 +164,8 @@ def edges_method(
         frames_used(drives, solution),
         (*reasons, *unsure, *sweeps.reasons),
         by_static_objects=covariance,
-        diagnostics=_diagnostics(solution, contrast, motion) | {"spread": spread},
+        diagnostics=_diagnostics(solution, contrast, motion)
+        | {"spread": spread | {"farther_edges": np.abs(drift).tolist()}},
         by_sweeps=sweeps.covariance,
         sweep_reasons=sweeps.reasons,
     )
@@ -320,42 +328,65 @@ def _refined(problem: _Problem, starts: Sequence[State]) -> list[tuple[float, Jo
     return sorted(found, key=lambda pair: -pair[0])
 
 
-def _solved(
-    problem: _Problem, candidates: list[tuple[float, JointSolution]], progress: Progress | None
-) -> JointSolution:
-    """The best candidate on all frames; one that begins at another roll, where that agrees better."""
-    best = candidates[0]
-    rolled = [replace(best[1].state, cTl=_rolled(best[1].state.cTl, np.radians(roll))) for roll in _ROLLS_DEG]
-    again = _refined(problem, rolled)
-    candidates += [one for one in again if angle_deg(one[1].state.cTl, best[1].state.cTl) > _SAME_DEG]
-    candidates.sort(key=lambda pair: -pair[0])
-    return _settled(problem, candidates[0][1].state, progress)
-
-
-def _settled(problem: _Problem, start: State, progress: Progress | None) -> JointSolution:
-    """The solution on all frames from a start that is nearly right."""
-    solution = solve_joint(problem.whole, start, KERNELS_PX, progress)
-    # Soft matches follow the pose, so that steps are too short: from wide scales again, until nothing moves.
-    for _ in range(_ROUNDS):
-        before, solution = solution, solve_joint(problem.whole, solution.state, KERNELS_PX, progress)
-        step = np.abs(difference(before.state, solution.state))
-        if (step < _SETTLED).all():
+def _best_optimum(problem: _Problem, start: State, restarts: int, progress: Progress | None) -> JointSolution:
+    """The solution on all scans that no turn leads away from to a better one."""
+    wide = solve_joint(problem.whole, start, KERNELS_PX, progress)
+    best = _settled(problem.whole, wide.state, progress)
+    for _ in range(restarts):
+        other = _better_on_some(problem, best.state)
+        if other is None:
             break
+        again = _settled(problem.whole, other, progress)
+        if _score(problem.whole, again.state) < _BETTER * _score(problem.whole, best.state):
+            break
+        best = again
+    return best
+
+
+def _better_on_some(problem: _Problem, state: State) -> State | None:
+    """An optimum on a few scans that agrees better than the one at a state; None where none is found."""
+    t = state.cTl.translation()
+    rotations = turned(state.cTl, np.radians(_TURNS_DEG))
+    starts = [state, *(replace(state, cTl=gtsam.Pose3(gtsam.Rot3.ClosestTo(R), t)) for R in rotations)]
+    found = []
+    for start in starts:
+        try:
+            found.append(_settled(problem.some, start, None).state)
+        except EstimationError:
+            if start is state:
+                return None
+    own, *others = [_score(problem.some, each) for each in found]
+    if not others or max(others) < _BETTER * own:
+        return None
+    return found[1 + int(np.argmax(others))]
+
+
+def _score(problem: JointProblem, state: State) -> float:
+    return score(edges_of(problem.drives, problem.tracks, problem.config.graph), state, SCORE_PX)
+
+
+def _settled(problem: JointProblem, start: State, progress: Progress | None) -> JointSolution:
+    """The solution by near edges from a start that is nearly right.
+
+    Soft matches follow the pose, so that steps are too short: the scales are gone through until nothing
+    moves.
+    """
+    state = start
+    for _ in range(_ROUNDS):
+        solution = solve_joint(problem, state, NEAR_KERNELS_PX, progress)
+        if (np.abs(difference(state, solution.state)) < _SETTLED).all():
+            break
+        state = solution.state
     return solution
 
 
-_ROUNDS = 3
-"""Most times that the scales are gone through again."""
+_ROUNDS = 10
+"""Most times that the near scales are gone through."""
 _SETTLED = np.array([*np.radians([0.02] * 3), 0.005, 0.005, 0.005, 0.003])
-"""(7,) a round that changes nothing by more is the last [rad, m, s]."""
-_SAME_DEG = 0.3
-"""Solutions nearer than this are one [deg]."""
-
-
-def _rolled(cTl: gtsam.Pose3, roll_rad: float) -> gtsam.Pose3:
-    """Turned about the camera's optical axis."""
-    R = turned(cTl, np.array([[0.0, 0.0, roll_rad]]))[0]
-    return gtsam.Pose3(gtsam.Rot3.ClosestTo(R), cTl.translation())
+"""(7,) a round that moves by no more is the last [rad, m, s]."""
+_WIDER_PX = (3.0,)
+"""Scale of the kernel under which an estimate is solved once more [px]: where it moves, it hangs on which of
+several edges nearby are met, and the step is a deviation of its covariance."""
 
 
 def _diagnostics(

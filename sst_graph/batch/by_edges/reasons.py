@@ -37,9 +37,7 @@ contradict."""
 _FLOOR = np.array([*np.radians([0.5] * 3), 0.005])
 """Added to the sigmas of that difference [rad, s]."""
 MAX_DRIFT = np.array([*np.radians([0.1] * 3), 0.025, 0.025, 0.025, 0.015])
-"""(7,) farthest that an estimate may move where it is solved again under narrow kernels: five times what
-counts as settled [rad, m, s]. Thirteen right estimates move by up to 0.05 deg about an axis, three false
-optima by 0.12 to 0.21 deg."""
+"""(7,) farthest that an estimate may move where it is solved again with edges up to 3 px away [rad, m, s]."""
 MAX_AWAY_M = 0.35
 """Farthest that an estimate may lie from the guess: it is bound to it [m]."""
 
@@ -85,11 +83,11 @@ def edge_contrast(
 
 
 def drift_reasons(step: FloatArray) -> tuple[str, ...]:
-    """Why an estimate may be wrong that moves by a step (7,) where it is solved again by near edges."""
+    """Why an estimate may be wrong that moves by a step (7,) where edges farther away are met too."""
     if (np.abs(step) <= MAX_DRIFT).all():
         return ()
     return (
-        "solved again with near edges alone the estimate moves by "
+        "solved again with edges farther away the estimate moves by "
         f"{np.degrees(np.linalg.norm(step[:3])):.2f} deg, {100.0 * np.linalg.norm(step[3:6]):.1f} cm and "
         f"{1e3 * step[6]:+.1f} ms: it has not settled on one set of edges",
     )
