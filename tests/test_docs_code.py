@@ -9,6 +9,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from calibrations import turned
 from stored import written
 
 from sst_graph.export import CalibrationMarginal
@@ -62,6 +63,15 @@ def test_the_checker_finds_the_mistake_that_the_page_warns_of() -> None:
     wrong = code_of("graph/extending.md").replace("-gtsam.Rot3.Hat(lP)", "gtsam.Rot3.Hat(lP)")
     with pytest.raises(FactorError, match="by E0"):
         exec(compile(wrong, "extending.md", "exec"), {"check_jacobians": check_jacobians})
+
+
+def test_results_of_several_drives_are_fused(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "calibration.json").write_text(turned(3).to_json())
+    found: dict[str, Any] = {}
+    exec(compile(code_of("how-to/fusing.md"), "fusing.md", "exec"), found)
+    np.testing.assert_allclose(found["fused"].covariance(), turned(3).covariance / 2.0, atol=1e-12)
 
 
 @pytest.mark.slow
