@@ -178,7 +178,8 @@ class Recording:
             sinks.append(rr.FileSink(str(save)))
         if live:
             try:
-                rr.spawn(connect=False)
+                # Without the recording, the global one is asked, and says that it is disabled.
+                rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
             except Exception as error:
                 why = " ".join(str(error).split())
                 raise ConfigError(f"the viewer rerun cannot be opened: {why} (or save a file)") from error
