@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from functools import partial
 from typing import Any
 
@@ -76,4 +75,4 @@ if __name__ == "__main__":
     try:
         main()
     except ModuleNotFoundError as missing:
-        sys.exit(f"sst_graph.ros_node: error: {missing.name} is not installed: source a ROS 2 installation")
+        raise SystemExit(f"sst_graph.ros_node: error: {missing.name} is not installed: source ROS 2") from None
