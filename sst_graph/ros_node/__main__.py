@@ -75,4 +75,4 @@ if __name__ == "__main__":
     try:
         main()
     except ModuleNotFoundError as missing:
-        raise SystemExit(f"sst_graph.ros_node: error: {missing.name} is not installed: source ROS 2") from None
+        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: source ROS 2 first") from None
