@@ -30,10 +30,12 @@ from sst_graph.simulator import SimulationConfig, simulate
 # ## The equation
 #
 # A boundary point `lP` of the LiDAR belongs on the contour of its object's mask, near the pixel `q` where
-# the contour's outward normal is `n`. The camera moves with the twist `w`, and `tau = time_offset + t_image
-# - t_point`:
+# the contour's outward normal is `n`. The camera moves with the twist `w`:
 #
-# $$ r = n \cdot \big( uv(\mathrm{Exp}(-\tau w) \, T_{cl} \, P) - q \big) \quad [\mathrm{px}] $$
+# ```
+# tau = t_image + time_offset - t_point          time from the point to the image [s]
+# r   = n . (uv(Exp(-tau w) T_camera_lidar lP) - q)                          [px]
+# ```
 #
 # ## The sign, on paper
 #

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sst_graph.export import CalibrationMarginal
     from sst_graph.factors import PinholeCamera
     from sst_graph.inspect.inspection import inspect_result
-    from sst_graph.result import CalibrationResult
+    from sst_graph.result import CalibrationResult, read_result
     from sst_graph.rig import KnownPose, KnownRig, RigResult, calibrate_rig, read_rig
     from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
     from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
@@ -53,6 +53,7 @@ __all__ = [
     "calibration_covariance",
     "inspect_result",
     "open_source",
+    "read_result",
     "read_rig",
     "solve_with_terms",
 ]
@@ -86,6 +87,7 @@ _HOMES = {
     "calibration_covariance": "sst_graph.slam.covariance",
     "inspect_result": "sst_graph.inspect.inspection",
     "open_source": "sst_graph.data",
+    "read_result": "sst_graph.result",
     "read_rig": "sst_graph.rig",
     "solve_with_terms": "sst_graph.slam.solving",
 }

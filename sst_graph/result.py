@@ -235,13 +235,19 @@ class CalibrationResult:
             raise DataError(f"{place}: {error.place}", error.found, error.expected) from error
 
 
-def read_result(path: Path) -> CalibrationResult:
-    """The result in a ``calibration.json``.
+def read_result(path: str | Path) -> CalibrationResult:
+    """The result in a folder that ``sst-graph calibrate`` wrote, or in its ``calibration.json``.
 
     Raises:
         DataError: the file is missing, unreadable or not such a file.
     """
-    return CalibrationResult.from_json(read_text(path, CALIBRATION), path)
+    file = result_file(Path(path))
+    return CalibrationResult.from_json(read_text(file, CALIBRATION), file)
+
+
+def result_file(path: Path) -> Path:
+    """The ``calibration.json`` that a file or the folder that holds one stands for."""
+    return path / "calibration.json" if path.is_dir() else path
 
 
 def _check_status(status: str) -> None:

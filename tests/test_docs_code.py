@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
 import pytest
+from calibrations import turned
 from stored import written
 
+from sst_graph.cli import main
 from sst_graph.export import CalibrationMarginal
 from sst_graph.factors import FactorError, check_jacobians
 from sst_graph.simulator import SimulationConfig
@@ -64,6 +67,15 @@ def test_the_checker_finds_the_mistake_that_the_page_warns_of() -> None:
         exec(compile(wrong, "extending.md", "exec"), {"check_jacobians": check_jacobians})
 
 
+def test_results_of_several_drives_are_fused(tmp_path: Path) -> None:
+    for name in ("monday", "tuesday"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "calibration.json").write_text(turned(3).to_json())
+    found: dict[str, Any] = {}
+    exec(compile(code_of("how-to/fusing.md"), "fusing.md", "exec"), found)
+    np.testing.assert_allclose(found["fused"].covariance(), turned(3).covariance / 2.0, atol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
     street = SimulationConfig(
@@ -90,6 +102,38 @@ def test_a_calibration_in_your_own_graph(tmp_path: Path) -> None:
     assert np.linalg.norm(apart[:3]) < 0.25 * np.linalg.norm(start[:3]) and abs(late) < 0.01
     factor, by_hand = found["factor"], found["matches"]
     assert len(by_hand) > 50 and factor.error(solution.values) < len(by_hand)
+
+
+NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["start/first.md", "how-to/inspect.md"])
+def test_the_commands_of_a_page_print_what_it_shows(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Words are the same, and numbers within a tenth: they are rounded, and vary by machine."""
+    blocks = re.findall(r"```\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line for block in blocks for line in block.splitlines()]
+    for line in lines:
+        if line.startswith("sst-graph ") and "--help" not in line:
+            assert main(shlex.split(line)[1:]) in (0, 3), line
+    printed: dict[str, list[str]] = {}
+    for line in capsys.readouterr().out.splitlines():
+        printed.setdefault(_words(line), []).append(line)
+    shown = [line for line in lines if NUMBER.search(line) and "sst-graph" not in line]
+    shown = [line for line in shown if not line.startswith(("python3", ".venv"))]
+    assert len(shown) > 4
+    for line in shown:
+        candidates = printed.get(_words(line), [])
+        assert any(_agree(line, other) for other in candidates), f"{page}: {line}\n{candidates}"
+
+
+def _words(line: str) -> str:
+    return " ".join(NUMBER.sub("#", line).split())
+
+
+def _agree(line: str, other: str) -> bool:
+    values = [[float(x) for x in NUMBER.findall(text)] for text in (line, other)]
+    return np.allclose(*values, rtol=0.1, atol=0.011)
 
 
 def test_links_between_pages_lead_somewhere() -> None:

@@ -214,6 +214,11 @@ def test_no_json(tmp_path: Path, content: bytes) -> None:
         read_result(path)
 
 
+def test_a_folder_stands_for_its_file(tmp_path: Path) -> None:
+    (tmp_path / "calibration.json").write_text(_result().to_json())
+    assert read_result(tmp_path) == read_result(str(tmp_path / "calibration.json")) == _result()
+
+
 def test_no_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         read_result(tmp_path / "calibration.json")

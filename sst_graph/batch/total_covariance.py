@@ -126,8 +126,7 @@ def sweep_effects(
         if np.sqrt(np.diag(effect) / np.diag(covariance + effect)).max() > MATTERS:
             worst = max(steps.values(), key=lambda step: float((step**2 / np.diag(covariance)).max()))
             reasons.append(
-                f"{drive.name}: the scans do not show whether its clouds are compensated for the sweep "
-                f"(share of the sweep in the points {sweep.fraction:+.2f} +- {sweep.sigma:.2f}), and "
+                f"{drive.name}: the scans do not show whether they are compensated ({sweep.evidence}), and "
                 f"it matters: {np.degrees(np.linalg.norm(worst[:3])):.2f} deg, "
                 f"{100.0 * np.linalg.norm(worst[3:6]):.1f} cm, {1e3 * abs(worst[6]):.1f} ms; {REMEDY}"
             )

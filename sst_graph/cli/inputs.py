@@ -16,7 +16,6 @@ from sst_graph.cli.reading import open_drive
 from sst_graph.config import read_config, with_overrides
 from sst_graph.errors import ConfigError
 from sst_graph.imports import ImportOptions, import_calibration
-from sst_graph.result import CalibrationResult, read_result
 from sst_graph.types import SemanticClass, Source
 
 T = TypeVar("T")
@@ -100,13 +99,3 @@ def chosen_classes(text: str | None) -> list[str] | None:
     if unknown or not names:
         raise ConfigError(f"--classes {text!r}: expected all, or some of {', '.join(alignable)}")
     return list(dict.fromkeys(names))
-
-
-def result_at(path: Path) -> CalibrationResult:
-    """The result in a ``calibration.json`` or in the folder that holds it."""
-    return read_result(result_file(path))
-
-
-def result_file(path: Path) -> Path:
-    """The ``calibration.json`` that a file or the folder that holds one stands for."""
-    return path / "calibration.json" if path.is_dir() else path

@@ -15,6 +15,8 @@ FloatArray = NDArray[np.float64]
 
 _TAKES_PART = 0.1
 """Least part of a weak direction's unit vector that is named."""
+_ALONG_AXIS = 0.95
+"""Least component of a rotation's unit vector along an axis that is named instead of it (18 deg)."""
 _PAIR_CORRELATION = 0.98
 """A translation and the time offset that are correlated as closely as this hardly separate, as at constant
 speed: they are separated by small differences only."""
@@ -48,7 +50,8 @@ MOTION = Advice(
     together="record turns to both sides, at different speeds",
     offset="record turns that begin and end, or a rough road: where turning changes, the time offset is seen",
     rotation="record turns: a straight drive leaves the rotation about its direction open",
-    translation="record tight turns and ramps, or use method joint: motion in a plane leaves the height open",
+    translation="record tight turns and ramps, or use method joint: motion without turns leaves the "
+    "translation open, and motion in a plane the height",
 )
 """For calibration by motion alone."""
 
@@ -204,14 +207,23 @@ def _words(
     if parts["rotation"] > parts["translation"]:
         angle = np.degrees(float(np.linalg.norm(rotation)))
         return (
-            f"the rotation is known to {angle:.2f} deg only (one sigma) about the LiDAR axis "
-            + np.array2string(rotation / max(float(np.linalg.norm(rotation)), 1e-12), precision=2),
+            f"the rotation is known to {angle:.2f} deg only (one sigma) about {_rotation_axis(rotation)}",
             advice.rotation,
         )
     return (
         f"the translation is known to {100 * translation_m:.1f} cm only (one sigma), the LiDAR {words}",
         advice.translation,
     )
+
+
+def _rotation_axis(rotation: FloatArray) -> str:
+    """The LiDAR's axis about which a rotation vector turns; its direction where it is none of them."""
+    direction = rotation / max(float(np.linalg.norm(rotation)), 1e-12)
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) > _ALONG_AXIS:
+        return f"the LiDAR's {'xyz'[axis]} axis"
+    x, y, z = np.round(direction * np.sign(direction[axis]), 2) + 0.0  # no -0.00
+    return f"the direction ({x:.2f}, {y:.2f}, {z:.2f}) of the LiDAR's axes"
 
 
 def _axis_words(c_translation: FloatArray) -> str:

@@ -202,6 +202,14 @@ class LeftOut:
         """What was found missing at least once, by name."""
         return {name: int(count) for name, count in vars(self).items() if count}
 
+    def in_part(self, scans: int, images: int) -> LeftOut:
+        """Without labels that no scan has, and masks that no image has: such a drive has none."""
+        return replace(
+            self,
+            scans_without_labels=self.scans_without_labels if self.scans_without_labels < scans else 0,
+            images_without_mask=self.images_without_mask if self.images_without_mask < images else 0,
+        )
+
     def __str__(self) -> str:
         return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in self.counts().items())
 
@@ -332,7 +340,8 @@ def prepare_drive(
         missing = "scan" if not scans else "image"
         raise DataError(source.name, f"no {missing} in {total} frames", "scans and images")
     if left_out.counts():
-        _LOG.warning("%s: left out: %s", source.name, left_out)
+        surprising = left_out.in_part(len(scans), len(images)).counts()
+        _LOG.log(logging.WARNING if surprising else logging.INFO, "%s: left out: %s", source.name, left_out)
     sweep = source.sweep_decision if isinstance(source, SweptSource) else None
     return Drive(
         source.name,

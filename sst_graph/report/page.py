@@ -156,10 +156,13 @@ def _pictures(inputs: ReportInputs, reader: DriveReader) -> str:
         pictures.append(overlay(one, _placements(result, one.frame.drive), points))
     hint = (
         "Drag in the picture or move the slider: left of the line the cloud as the start would place it, "
-        "right of it as the result does. Edges of vehicles, poles and kerbs must meet their picture. "
-        "Coloured by residual, only boundary points are shown: green ones lie within "
-        f"{CLOSE_PX:g} px of the contour of the labels (yellow)."
+        "right of it as the result does. Edges of vehicles, poles and kerbs must meet their picture."
     )
+    if fit is not None:
+        hint += (
+            " Coloured by residual, only boundary points are shown: green ones lie within "
+            f"{CLOSE_PX:g} px of the contour of the labels (yellow)."
+        )
     return section("pictures", "Before and after", paragraph(hint), *pictures) if pictures else ""
 
 

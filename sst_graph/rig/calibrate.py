@@ -236,7 +236,8 @@ class _Rig:
         """(7, 7) of a camera's own estimate; wide where that is not to be trusted and others know better."""
         camera, poses = self.cameras[name], self.known.poses
         linked = self.known.one_trigger or any(name in (p.camera, p.reference) for p in poses)
-        return np.diag(_UNKNOWN_SIGMAS**2) if linked and not camera.trusted else camera.result.covariance
+        others_know = linked and any(other.trusted for other in self.cameras.values())
+        return np.diag(_UNKNOWN_SIGMAS**2) if others_know and not camera.trusted else camera.result.covariance
 
     @cached_property
     def marginal(self) -> RigMarginal:

@@ -1,7 +1,4 @@
-"""The ROS 2 node: ``python -m sst_graph.ros_node --ros-args -p ...`` (docs/how-to/ros-node.md).
-
-Messages are taken and published as bytes, and decoded and encoded by rosbags.
-"""
+"""The ROS 2 node (docs/how-to/ros-node.md). It takes and publishes bytes; rosbags decodes and encodes."""
 
 from __future__ import annotations
 
@@ -28,8 +25,7 @@ def main() -> None:
 
     rclpy.init()
     node = rclpy.create_node("sst_graph")
-    defaults = dataclasses.asdict(NodeSettings())
-    values = {name: node.declare_parameter(name, value).value for name, value in defaults.items()}
+    values = {k: node.declare_parameter(k, v).value for k, v in dataclasses.asdict(NodeSettings()).items()}
     overrides = node.declare_parameter("tracker_settings", [""]).value
     config = with_overrides(TrackerConfig(), [one for one in overrides if one])
     core, make = CalibrationNode(NodeSettings(**values), config), NodeMessages()
@@ -76,4 +72,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ModuleNotFoundError as missing:
+        raise SystemExit(f"sst_graph.ros_node: {missing.name} is not installed: source ROS 2 first") from None

@@ -5,6 +5,7 @@ Needs rerun-sdk (the extra ``rerun``), imported when a recording begins.
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from pathlib import Path
 from types import TracebackType
@@ -43,6 +44,8 @@ _MOST_POINTS = 60_000
 """Points of a cloud that are shown; of more, every second, third, ..."""
 _MOST_POSES = 5_000
 """Latest poses of the trajectory."""
+_LONGEST_FLUSH_S = 60.0
+"""The viewer that takes nothing for so long has gone."""
 _JPEG_QUALITY = 85
 _DEPTHS_M = 3.0, 60.0
 """Depths at the ends of the colours."""
@@ -97,8 +100,13 @@ class Recording:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._stream.flush()
-        self._stream.disconnect()
+        try:
+            self._stream.flush(timeout_sec=_LONGEST_FLUSH_S)
+        except Exception as error:
+            why = " ".join(str(error).split())
+            raise ConfigError(f"the viewer rerun has gone: {why} (without a screen, save a file)") from error
+        finally:
+            self._stream.disconnect()
 
     # ------------------------------------------------------------------ what is logged
 
@@ -178,7 +186,8 @@ class Recording:
             sinks.append(rr.FileSink(str(save)))
         if live:
             try:
-                rr.spawn(connect=False)
+                # Without the recording, the global one is asked, and says that it is disabled.
+                rr.spawn(connect=False, recording=self._stream, executable_path=_executable())
             except Exception as error:
                 why = " ".join(str(error).split())
                 raise ConfigError(f"the viewer rerun cannot be opened: {why} (or save a file)") from error
@@ -249,6 +258,12 @@ class Recording:
         self._log("fit/residual_px", rr.Scalars([float(np.median(np.abs(matches.residuals_px)))]))
 
 
+def _executable() -> str | None:
+    """The viewer installed beside this Python, whose folder need not be on the PATH; None: the PATH's."""
+    beside = Path(sys.executable).with_name("rerun")
+    return str(beside) if beside.is_file() else None
+
+
 def _blueprint(tracked: bool) -> Any:
     """Space and picture above, curves and messages below."""
     from rerun import blueprint as rrb
@@ -268,7 +283,9 @@ def _blueprint(tracked: bool) -> Any:
     if tracked:
         below = [
             rrb.TimeSeriesView(
-                origin=f"estimate/{group}", name=f"{group.replace('_', ' ')} - start, 2 sigma [{unit}]"
+                origin=f"estimate/{group}",
+                name=f"{group.replace('_', ' ')} - start, 2 sigma [{unit}]",
+                plot_legend=rrb.PlotLegend(visible=False),  # nine entries would hide the curves
             )
             for group, unit in units
         ]

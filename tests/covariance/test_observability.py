@@ -80,7 +80,16 @@ def test_the_other_sign_of_the_time_offset() -> None:
     ("step", "words", "advice"),
     [
         ([0, 0, 0, 0, 0, 0, 0.02], "the time offset is known to 20.0 ms only", "motion"),
-        ([0, 0, np.radians(2), 0, 0, 0, 0], "the rotation is known to 2.00 deg only", "all sides"),
+        (
+            [0, 0, np.radians(2), 0, 0, 0, 0],
+            "known to 2.00 deg only (one sigma) about the LiDAR's z axis",
+            "all sides",
+        ),
+        (
+            [0.03, 0, -0.04, 0, 0, 0, 0],
+            "about the direction (-0.60, 0.00, 0.80) of the LiDAR's axes",
+            "all sides",
+        ),
         ([0, 0, 0, 0, 0.3, 0, 0], "known to 30.0 cm only (one sigma), the LiDAR shifted", "nearer"),
     ],
 )

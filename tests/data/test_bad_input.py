@@ -263,6 +263,15 @@ def test_missing_labels_masks_and_pictures_are_left_out_and_counted(
     ]
 
 
+def test_a_drive_without_any_label_is_no_surprise(drive: Path, caplog: pytest.LogCaptureFixture) -> None:
+    shutil.rmtree(drive / "labels")
+    shutil.rmtree(drive / "semantic_2")
+    with caplog.at_level("WARNING", "sst_graph"):
+        found = prepare_drive(open_source(drive), (SemanticClass.OBJECT,))
+    assert found.left_out.counts() == {"scans_without_labels": FRAMES, "images_without_mask": FRAMES}
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("value", [np.nan, -np.inf])
 def test_points_that_are_no_numbers_are_left_out_with_their_labels_and_times(
     drive: Path, value: float

@@ -16,6 +16,7 @@ from sst_graph.batch.method_estimate import Guess
 from sst_graph.config import with_overrides
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.errors import ConfigError, DataError
+from sst_graph.odometry.sweep.decision import SweepDecision
 from sst_graph.rig import KnownPose, KnownRig, RigMarginal, RigResult, calibrate_rig
 from sst_graph.rig.adjustment import adjusted
 from sst_graph.rig.calibrate import calibrate_rig_prepared, prepare_rig
@@ -191,6 +192,27 @@ def test_a_camera_without_masks_has_its_pose_from_the_other() -> None:
     unknown = calibrate_rig_prepared(both, guesses, CalibrationConfig(), KnownRig())
     assert unknown["right"].status == "unobservable" and unknown["left"].status == "ok"
     assert unknown.status == "unobservable"
+
+
+@pytest.mark.slow
+def test_cameras_that_are_all_doubtful_keep_their_own_covariances() -> None:
+    """The scans do not show their sweep, so neither camera is ok, and none knows better than the other."""
+    crawling = {
+        name: [replace(drive, sweep=SweepDecision("undecided", drive.sweep.timing, others=both_turns()))]
+        for name, (drive,) in drives().items()
+    }
+    guesses = {name: Guess(drive.nominal) for name, drive in rig().items()}
+    known = KnownRig((KnownPose("right", "left", _true_pose()),), one_trigger=True)
+    result = calibrate_rig_prepared(crawling, guesses, CalibrationConfig(), known)
+    for name in NAMES:
+        assert result[name].status == "not_converged" and "enough motion" in result[name].reasons[0]
+        assert max(result[name].sigmas().rotation_deg) < 1.0
+
+
+def both_turns():
+    """As measured, turning either way."""
+    timing = drives()["left"][0].sweep.timing
+    return tuple(replace(timing, fraction=fraction) for fraction in (-1.0, 1.0))
 
 
 def _without_masks():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import subprocess
+import sys
 from functools import cache
 from typing import Any
 
@@ -268,3 +270,5 @@ def test_the_wrapper_is_short_and_needs_rclpy_only_to_run() -> None:
         assert len(file.readlines()) < 80
     with pytest.raises(ModuleNotFoundError, match="rclpy"):
         wrapper.main()
+    done = subprocess.run([sys.executable, "-m", "sst_graph.ros_node"], capture_output=True, text=True)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "rclpy is not installed" in done.stderr

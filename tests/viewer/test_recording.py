@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import gtsam
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from rrd import RrdFile
 
+from sst_graph.errors import ConfigError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.simulator import SimulatedDrive
 from sst_graph.tracker.config import TrackerConfig
@@ -167,3 +169,20 @@ def test_the_tracker_is_logged_and_not_changed(
     assert sigmas[19] == pytest.approx([100.0 * np.sqrt(last.covariance[3, 3])])
     said = [text[0] for text in file.of("/tracker/log", "text").values()]
     assert said[0].startswith("starting") and any(text.startswith(last.status) for text in said)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere a viewer needs no display server")
+def test_a_viewer_without_a_screen_ends_in_one_line(
+    street: SimulatedDrive, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The real viewer is started, finds no screen and ends; nothing waits for it for ever."""
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    views = list(views_under(frames[:2], street.camera, *_truth(street), CAR))
+    with (
+        pytest.raises(ConfigError, match=r"rerun (has gone|cannot be opened)"),
+        Recording(street.camera, live=True, save=None, tracked=False) as recording,
+    ):
+        for view in views:
+            recording.frame(view)

@@ -6,18 +6,18 @@ import argparse
 import dataclasses
 import json
 
-from sst_graph.cli.inputs import result_at
 from sst_graph.cli.messages import complain, say
 from sst_graph.cli.reading import reading_words
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.inspect.report import error_lines
 from sst_graph.metrics import TruthSigma, calibration_errors
 from sst_graph.reference import read_reference
+from sst_graph.result import read_result
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the errors of ``args.result`` against ``args.truth``."""
-    result = result_at(args.result)
+    result = read_result(args.result)
     truth = read_reference(args.truth, result.camera_name)
     if result.read_as.get("image_shift"):
         complain(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import complain, mention, say
 from sst_graph.cli.outputs import check_apart
 from sst_graph.data.kitti.calib import read_calibration
@@ -13,7 +12,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.export import ExportOptions, export_text
 from sst_graph.files import output_file
 from sst_graph.imports import read_tree
-from sst_graph.result import CalibrationResult
+from sst_graph.result import CalibrationResult, read_result, result_file
 from sst_graph.rig import RigResult, read_rig
 from sst_graph.rig.result import RIG_NAME
 
@@ -55,7 +54,7 @@ def _text(args: argparse.Namespace) -> str:
 
 def _result(path: Path) -> CalibrationResult | RigResult:
     """The result of a camera, or of a rig."""
-    return read_rig(path) if _file(path).name == RIG_NAME else result_at(path)
+    return read_rig(path) if _file(path).name == RIG_NAME else read_result(path)
 
 
 def _file(path: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sst_graph.cli.inputs import result_at, result_file
 from sst_graph.cli.messages import mention
 from sst_graph.cli.outputs import PNG_FILE, check_apart
 from sst_graph.cli.pictures import ShownFrame, overlay, png, position_of
@@ -17,7 +16,7 @@ from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
 from sst_graph.odometry.sweep import with_sweep_of
 from sst_graph.reference import load_initial
-from sst_graph.result import CalibrationResult
+from sst_graph.result import CalibrationResult, read_result, result_file
 from sst_graph.types import Source
 from sst_graph.viz import Placement
 from sst_graph.viz.video import check_video_name
@@ -36,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
     check_apart(inputs, {"--out": args.out})
     with output_file(args.out, args.overwrite, PNG_FILE) as out:
-        result = result_at(args.result)
+        result = read_result(args.result)
         source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
         drive = RecentReader(source)
         position = len(drive) // 2 if args.frame is None else position_of(drive, args.frame)
@@ -54,7 +53,7 @@ def _write_video(args: argparse.Namespace) -> int:
     inputs = {"RESULT": result_file(args.result), "DATA": args.data, "--before": args.before}
     check_apart(inputs, {"--video": args.video})
     with output_file(args.video, args.overwrite, VIDEO_FILE) as out:
-        result = result_at(args.result)
+        result = read_result(args.result)
         source = with_sweep_of(open_drive_of(args, args.data, result, args.result), result.diagnostics)
         drives = [(source, _before(args.before, result, source))]
         with ProgressBar() as progress:

@@ -82,7 +82,7 @@ def _cell(runs: Sequence[PeerRun], config: PeersConfig) -> str:
     qad = _median([row.qad_deg for row in runs], 2)
     rotation_only = any(row.method in PEERS and PEERS[row.method].rotation_only for row in runs)
     atd = "–" if rotation_only else _median([None if r.atd_m is None else 100.0 * r.atd_m for r in runs], 1)
-    return f"{qad} / {atd} / {failed} of {len(runs)}"
+    return f"{qad} / {atd} / {failed}\u00a0of\u00a0{len(runs)}"  # a narrow cell is broken at a slash
 
 
 def _remaining_cells(method: str, runs: Sequence[PeerRun], config: PeersConfig) -> list[str]:

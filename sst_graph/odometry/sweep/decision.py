@@ -23,9 +23,7 @@ SweepKind = Literal["compensated", "clockwise", "counterclockwise", "undecided",
 given."""
 FRACTIONS: dict[str, float] = {"compensated": 0.0, "clockwise": -1.0, "counterclockwise": 1.0}
 
-REMEDY = (
-    "say --sweep compensated, --sweep clockwise or --sweep counterclockwise, or give the time of each point"
-)
+REMEDY = "say --sweep compensated, clockwise or counterclockwise, or give the time of each point"
 
 
 _SAMPLED_PAIRS = 6
@@ -97,21 +95,32 @@ class SweepDecision:
     @property
     def sentence(self) -> str:
         """The decision in words."""
-        share = f"share of the sweep in the points {self.fraction:+.2f} +- {self.sigma:.2f}"
         if self.kind == "given":
             return "as given"
         if self.kind == "standstill":
             return "assumed compensated: at standstill it does not matter"
         if self.kind == "undecided":
             return (
-                f"not determined by the scans ({share}; compensated 0, clockwise -1, counter-clockwise +1); "
-                f"assumed compensated, its effect is in the sigmas; if you know it, {REMEDY}"
+                f"not determined by the scans ({self.evidence}); assumed compensated, its effect is in the "
+                f"sigmas; if you know it, {REMEDY}"
             )
         if self.kind == "compensated":
-            return f"compensated ({share}, 0 expected)"
+            return f"compensated ({self.evidence}, 0 expected)"
         where = f"a turn begins at {np.degrees(self.timing.start_rad):.0f} deg" if self.start_known else ""
         expected = FRACTIONS[self.kind]
-        return f"as measured, {self.kind} ({share}, {expected:+.0f} expected){'; ' * bool(where)}{where}"
+        return (
+            f"as measured, {self.kind} ({self.evidence}, {expected:+.0f} expected){'; ' * bool(where)}{where}"
+        )
+
+    @property
+    def evidence(self) -> str:
+        """The estimated share in words."""
+        if not np.isfinite(self.sigma):
+            return "no stretch with enough motion"
+        share = f"share of the sweep in the points {self.fraction:+.2f} +- {self.sigma:.2f}"
+        if self.kind == "undecided":
+            return f"{share}; compensated 0, clockwise -1, counter-clockwise +1"
+        return share
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able, for the diagnostics of a result."""
