@@ -13,7 +13,6 @@ import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from wrong_drives import BASELINE_M, with_images_of
 
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
@@ -60,11 +59,11 @@ def _elevation_deg(scan: Scan) -> FloatArray:
 
 
 def repeated_pictures(drive: KeptDrive, every: int = 2) -> KeptDrive:
-    """Of every few images only the first is new: a driver that publishes the last buffer again."""
+    """Of every few images the last is the one before it again: a driver that publishes its last buffer."""
     images = [f.image for f in drive.frames]
 
     def held(k: int, image: CameraImage) -> CameraImage:
-        first = images[k - k % every]
+        first = images[k - 1] if k % every == every - 1 else image
         return image if first is None else replace(first, stamp_ns=image.stamp_ns)
 
     return with_numbered_images(drive, held)
@@ -75,7 +74,7 @@ def repeated_scans(drive: KeptDrive, every: int = 2) -> KeptDrive:
     scans = [f.scan for f in drive.frames]
 
     def held(k: int, scan: Scan) -> Scan:
-        first = scans[k - k % every]
+        first = scans[k - 1] if k % every == every - 1 else scan
         return scan if first is None else replace(first, stamp_ns=scan.stamp_ns)
 
     return with_numbered_scans(drive, held)
@@ -116,9 +115,12 @@ def jittered_images(drive: KeptDrive, milliseconds: float) -> KeptDrive:
 def late_masks(drive: KeptDrive) -> KeptDrive:
     """Each image under the mask of the one before it."""
     images = [f.image for f in drive.frames]
-    ones = [*images[:1], *images[:-1]]
-    others = [replace(f, image=i) for f, i in zip(drive.frames, ones, strict=True)]
-    return with_images_of(drive, others, pictures=False)
+
+    def masked(k: int, image: CameraImage) -> CameraImage:
+        former = images[max(k - 1, 0)] or image
+        return replace(image, mask=former.mask, instances=former.instances)
+
+    return with_numbered_images(drive, masked)
 
 
 def backwards(drive: KeptDrive) -> KeptDrive:
@@ -376,13 +378,6 @@ def sheared(drive: KeptDrive, pixels: float) -> KeptDrive:
     )
 
 
-def start_of_right_camera(drive: KeptDrive) -> KeptDrive:
-    """The start is that of the other camera of a stereo pair (P3 for P2)."""
-    assert drive.nominal is not None
-    beside = gtsam.Pose3(gtsam.Rot3(), np.array([-BASELINE_M, 0.0, 0.0]))
-    return replace(drive, nominal=beside * drive.nominal)
-
-
 SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "every second picture repeated": repeated_pictures,
     "every second scan repeated": repeated_scans,
@@ -416,5 +411,11 @@ SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "dashboard, labelled background": lambda d: with_dashboard(d, False),
     "watermark": with_watermark,
     "pictures sheared by 6 px": lambda d: sheared(d, 6.0),
-    "start of the other stereo camera": start_of_right_camera,
 }
+
+SUBTLE_NAMED: dict[str, str] = {
+    "every second picture repeated": "pictures are repeated",
+    "every second scan repeated": "scans are repeated",
+    "three scans in one cloud": "several scans laid over each other",
+}
+"""Words of the sentence that names a fault before anything is solved."""
