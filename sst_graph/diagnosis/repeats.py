@@ -48,7 +48,7 @@ def repeats(drive: Drive) -> Finding | None:
         if len(found) >= max(_LEAST, _LEAST_SHARE * total):
             return Finding(
                 f"{what}s are repeated (a sensor that is slower than its frames, or a frozen one)",
-                f"{len(found)} of {total} are equal to the last bit to the one before, where the other sensor moves",
+                f"{len(found)} of {total} equal the one before to the last bit where the other sensor moves",
                 f"look at {check}, and leave those frames out",
             )
     return _earlier_points(drive)
