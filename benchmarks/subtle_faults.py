@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.experiments.wrong_drives import with_elevation
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass
 
 FloatArray = NDArray[np.float64]
@@ -254,20 +255,6 @@ def scaled_ranges(drive: KeptDrive, factor: float) -> KeptDrive:
     return drive.with_scans(lambda s: replace(s, points=(factor * s.points).astype(np.float32)))
 
 
-def shifted_elevations(drive: KeptDrive, degrees: float) -> KeptDrive:
-    """All beams higher by an angle: elevations of another calibration of the LiDAR."""
-
-    def raised(scan: Scan) -> Scan:
-        p = scan.points.astype(np.float64)
-        across = np.maximum(np.hypot(p[:, 0], p[:, 1]), 1e-6)
-        elevation = np.arctan2(p[:, 2], across) + np.radians(degrees)
-        distance = np.linalg.norm(p, axis=1)
-        flat = (distance * np.cos(elevation) / across)[:, None] * p[:, :2]
-        return replace(scan, points=np.c_[flat, distance * np.sin(elevation)].astype(np.float32))
-
-    return drive.with_scans(raised)
-
-
 def tilting(drive: KeptDrive, degrees: float) -> KeptDrive:
     """The LiDAR's mount gives way evenly, by so much over the drive, about its y axis."""
 
@@ -401,7 +388,7 @@ SUBTLE_FAULTS: dict[str, SubtleFault] = {
     "own bonnet in the cloud": with_own_body,
     "ranges 1 % long": lambda d: scaled_ranges(d, 1.01),
     "ranges 3 % long": lambda d: scaled_ranges(d, 1.03),
-    "beams 0.3 deg high": lambda d: shifted_elevations(d, 0.3),
+    "beams 0.3 deg high": lambda d: with_elevation(d, np.radians(-0.3)),
     "LiDAR tilts by 1 deg over the drive": lambda d: tilting(d, 1.0),
     "LiDAR tilted by 3 deg in the middle": lambda d: knocked(d, 3.0),
     "middle 90 % blown up": cropped,
