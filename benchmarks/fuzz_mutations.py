@@ -11,11 +11,13 @@ import json
 import os
 import socket
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 Rng = np.random.Generator
@@ -230,7 +232,21 @@ def text(rng: Rng, data: bytes) -> bytes:
     else:
         lines[k] = " ".join(words[: int(rng.integers(len(words) + 1))])
     separator = pick(rng, ("\n", "\n", "\n", "\r\n", "\r", "\v", "\n\n"))
-    return separator.join(lines).encode("utf-8", "surrogatepass")
+    return encoded(rng, separator.join(lines))
+
+
+def encoded(rng: Rng, written: str) -> bytes:
+    """Text as UTF-8; now and then with a byte order mark, in UTF-16, or with digits of another script."""
+    if rng.random() < 0.9:
+        return written.encode("utf-8", "surrogatepass")
+    change = int(rng.integers(4))
+    if change == 0:
+        return b"\xef\xbb\xbf" + written.encode("utf-8", "surrogatepass")
+    if change == 1:
+        return written.encode(pick(rng, ("utf-16", "utf-16-be", "utf-32")), "surrogatepass")
+    if change == 2:
+        return written.translate({48 + k: 0x0660 + k for k in range(10)}).encode("utf-8", "surrogatepass")
+    return written.replace(" ", "\x00 ", 2).encode("utf-8", "surrogatepass")
 
 
 # --- JSON -------------------------------------------------------------------------------------------------
@@ -285,7 +301,7 @@ def json_text(rng: Rng, data: bytes) -> bytes:
     written = json.dumps(mutate_json(rng, json.loads(data)))
     if rng.random() < 0.1:
         written = twice_or_long(rng, written)
-    return written.encode("utf-8", "surrogatepass")
+    return encoded(rng, written)
 
 
 def twice_or_long(rng: Rng, written: str) -> str:
@@ -314,7 +330,7 @@ def toml_text(rng: Rng, data: bytes) -> bytes:
         lines[k] = (
             f"{name}={value}" if equals else pick(rng, ("[a", "[[b]]", "a." * 5000 + "a = 1", name, "= 1"))
         )
-    return "\n".join(lines).encode("utf-8", "surrogatepass")
+    return encoded(rng, "\n".join(lines))
 
 
 # --- arrays and images ------------------------------------------------------------------------------------
@@ -347,10 +363,51 @@ def image(rng: Rng, data: bytes) -> bytes:
     """A PNG or JPEG file: its header, its chunks, its compressed data, or bytes."""
     if rng.random() < 0.3:
         return bytewise(rng, data)
+    if rng.random() < 0.2:
+        return recoded(rng, data)
     return _png(rng, data) if data.startswith(b"\x89PNG") else _jpeg(rng, data)
 
 
 SIZES = (0, 1, 2, 5, 7, 9, 255, 65_535, 60_000, 32_767, 2**20, 2**31 - 1, 2**32 - 1)
+
+
+def recoded(rng: Rng, data: bytes) -> bytes:
+    """The same picture as people save it by mistake: other depths, channels and formats, a wrong checksum."""
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    grey = pixels if pixels.ndim == 2 else pixels[..., 0]
+    eight = grey.astype(np.uint8)
+    action = int(rng.integers(8))
+    if action == 0:
+        return bytes(data[:-4]) + b"\x00\x00\x00\x00"
+    if action == 1:  # the checksum of the header
+        return data[:29] + bytes(4) + data[33:]
+    if action == 2:
+        return _palette(eight)
+    made = {
+        3: grey.astype(np.uint16) * 257,
+        4: np.dstack([eight] * 4),
+        5: np.dstack([eight.astype(np.uint16) * 257] * 4),
+        6: np.dstack([eight] * 3),
+        7: eight,
+    }[action]
+    suffix = pick(rng, (".bmp", ".tiff", ".webp")) if action == 7 else ".png"
+    return bytes(cv2.imencode(suffix, made)[1])
+
+
+def _palette(eight: np.ndarray) -> bytes:
+    """A PNG file with a colour table, and rows of indices into it, of which some are beyond it."""
+    height, width = eight.shape
+    rows = b"".join(b"\x00" + row.tobytes() for row in eight)
+    parts = (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 3, 0, 0, 0)),
+        (b"PLTE", bytes(range(30))),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(part)) + kind + part + struct.pack(">I", zlib.crc32(kind + part))
+        for kind, part in parts
+    )
 
 
 def _png(rng: Rng, data: bytes) -> bytes:
@@ -413,6 +470,8 @@ def checkpoint(rng: Rng, data: bytes) -> bytes:
     """A tracker's npz file: its bytes; or its JSON or its arrays, and the checksum made again."""
     if rng.random() < 0.15:
         return bytewise(rng, data)
+    if rng.random() < 0.03:
+        return bomb(rng)
     with np.load(io.BytesIO(data)) as file:
         head, body = bytes(file["head"]), bytes(file["data"])
     action = int(rng.integers(8))
@@ -428,6 +487,15 @@ def checkpoint(rng: Rng, data: bytes) -> bytes:
     stream = io.BytesIO()
     save = np.savez_compressed if rng.random() < 0.03 else np.savez
     save(stream, **arrays)
+    return stream.getvalue()
+
+
+def bomb(rng: Rng) -> bytes:
+    """An npz file of half a megabyte that unpacks to half a gigabyte under the members' names."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("head", "data", "sha256"):
+            archive.writestr(f"{name}.npy", bytes(1 << int(rng.integers(20, 27))))
     return stream.getvalue()
 
 

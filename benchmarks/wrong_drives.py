@@ -165,6 +165,7 @@ def _in_millimetres(cTl: gtsam.Pose3) -> gtsam.Pose3:
     return gtsam.Pose3(cTl.rotation(), 1000.0 * cTl.translation())
 
 
+_BESIDE = gtsam.Pose3(gtsam.Rot3(), np.array([-BASELINE_M, 0.0, 0.0]))
 _CAMERA_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
 INPUT_FAULTS: dict[str, InputFault] = {
@@ -180,6 +181,7 @@ INPUT_FAULTS: dict[str, InputFault] = {
     "Tr inverted": lambda d, o: _nominal(d, lambda T: T.inverse()),
     "Tr in mm": lambda d, o: _nominal(d, _in_millimetres),
     "radians as degrees": lambda d, o: _nominal(d, _radians_as_degrees),
+    "Tr of the right camera": lambda d, o: _nominal(d, lambda T: _BESIDE * T),
     "x flipped": lambda d, o: with_points(d, np.diag([-1.0, 1.0, 1.0])),
     "y flipped": lambda d, o: with_points(d, np.diag([1.0, -1.0, 1.0])),
     "turned by 180 deg": lambda d, o: with_points(d, np.diag([-1.0, -1.0, 1.0])),
@@ -209,7 +211,7 @@ INPUT_FAULTS: dict[str, InputFault] = {
 
 def right_camera(street: SimulatedDrive) -> KeptDrive:
     """A street as the right-hand camera of a stereo pair sees it, with the left one's nominal pose."""
-    beside = gtsam.Pose3(gtsam.Rot3(), np.array([-BASELINE_M, 0.0, 0.0])) * street.truth.cTl
+    beside = _BESIDE * street.truth.cTl
     return KeptDrive.of(replace(street, truth=replace(street.truth, cTl=beside)), sweep="auto")
 
 
@@ -226,6 +228,7 @@ NAMED: dict[str, str] = {
     "Tr inverted": "the start (Tr) is inverted",
     "Tr in mm": "the translation of the start (Tr) is in millimetres",
     "radians as degrees": "radians that were taken as degrees",
+    "Tr of the right camera": "the pictures are those of another camera",
     "x flipped": "x axis is flipped",
     "y flipped": "mirrored",
     "turned by 180 deg": "the clouds are turned by 180 deg",

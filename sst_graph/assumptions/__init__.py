@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from sst_graph.assumptions.clocks import LINE_DELAY, SKEW
 from sst_graph.assumptions.distortion import K1, K2
 from sst_graph.assumptions.focal_length import FOCAL
+from sst_graph.assumptions.lidar_elevation import ELEVATION
 from sst_graph.assumptions.lidar_range import RANGE_BIAS, RANGE_SCALE
 from sst_graph.assumptions.model import Assumption, Effect, View, combined
 from sst_graph.assumptions.principal_point import CX, CY
@@ -18,7 +19,7 @@ from sst_graph.errors import ConfigError
 
 ASSUMPTIONS: dict[str, Assumption] = {
     assumption.name: assumption
-    for assumption in (FOCAL, CX, CY, K1, K2, SWEEP, SKEW, LINE_DELAY, RANGE_BIAS, RANGE_SCALE)
+    for assumption in (FOCAL, CX, CY, K1, K2, SWEEP, SKEW, LINE_DELAY, RANGE_BIAS, RANGE_SCALE, ELEVATION)
 }
 """All assumptions by name, in the order in which they are shown."""
 

@@ -16,16 +16,14 @@ from numpy.typing import NDArray
 from sst_graph.batch.method_estimate import DriveCovariance
 from sst_graph.batch.problem import CalibrationProblem, JointEstimate
 from sst_graph.covariance.considered import Considered, budget, motion_covariance, remainder
+from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.covariance.unknown_motion import unknown_motion_covariance
 from sst_graph.graph.frozen_problem import FrozenProblem
 from sst_graph.graph.matching import DriveMatches
 from sst_graph.graph.outer_loop import JointConfig, JointSolution
-from sst_graph.odometry.sweep import REMEDY, SweepTiming
+from sst_graph.odometry.sweep import SweepTiming
 
 FloatArray = NDArray[np.float64]
-
-MATTERS = 0.5
-"""An undecided sweep matters where it makes up more than this share of the sigma claimed for an unknown."""
 
 
 @dataclass(frozen=True)
@@ -107,8 +105,6 @@ def sweep_effects(
 ) -> SweepEffects:
     """The effect of every sweep that the scans leave undecided, one drive at a time.
 
-    The covariance is the mean square of the changes under the hypotheses, by their probability.
-
     Args:
         covariance: (7, 7) of the estimate, without it.
     """
@@ -121,15 +117,10 @@ def sweep_effects(
             timing.fraction: sweep_step(solution, {number: timing}, problem.config.joint)
             for timing in sweep.others
         }
-        effect = sum(sweep.shares[fraction] * np.outer(step, step) for fraction, step in steps.items())
-        added += effect
-        if np.sqrt(np.diag(effect) / np.diag(covariance + effect)).max() > MATTERS:
-            worst = max(steps.values(), key=lambda step: float((step**2 / np.diag(covariance)).max()))
-            reasons.append(
-                f"{drive.name}: the scans do not show whether they are compensated ({sweep.evidence}), and "
-                f"it matters: {np.degrees(np.linalg.norm(worst[:3])):.2f} deg, "
-                f"{100.0 * np.linalg.norm(worst[3:6]):.1f} cm, {1e3 * abs(worst[6]):.1f} ms; {REMEDY}"
-            )
+        effect = SweepEffect.of(sweep, steps, covariance)
+        added += effect.covariance
+        if effect.sentence:
+            reasons.append(f"{drive.name}: {effect.sentence}")
     return SweepEffects(tuple(reasons), added)
 
 

@@ -219,8 +219,8 @@ def _add_estimate(command: _Parser) -> None:
         "--estimate",
         metavar="NAMES",
         help="estimate what is otherwise assumed, with the calibration: some of focal, cx, cy, k1, "
-        "k2, sweep, skew, line_delay, range_bias, range_scale, separated by commas; k1=0.05 gives the "
-        "standard deviation of its prior about 0 (docs/understand/assumptions.md)",
+        "k2, sweep, skew, line_delay, range_bias, range_scale, elevation, separated by commas; k1=0.05 gives "
+        "the standard deviation of its prior about 0 (docs/understand/assumptions.md)",
     )
 
 

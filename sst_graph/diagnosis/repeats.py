@@ -1,16 +1,23 @@
-"""Sensors that deliver one frame again and again."""
+"""Sensors that deliver one frame again and again, and clouds that hold the points of earlier scans."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from sst_graph.diagnosis.finding import Finding
 from sst_graph.drive.preparation import Drive
 
-_LEAST = 3
-"""Equal frames in a row: a doubled one now and then is left to the robust matching."""
+_LEAST, _LEAST_SHARE = 3, 0.1
+"""Equal frames in a row, or frames equal to the one before them and their share of the drive: a doubled one
+now and then is left to the robust matching."""
+_SHARED = 0.2
+"""Of the points of a scan that the scan before has, too, to the last bit: 0 of a moving HDL-64E, up to 0.06
+of a standing one, whose ranges come in steps; a half of two scans in one cloud."""
+_LEAST_SAMPLE = 20
+"""Points by which two scans are compared."""
 _MOVED_PX, _MOVED_M = 1.0, 0.05
 """What the other sensor sees move from frame to frame: recorded without noise, equal frames of a standing
 vehicle are right."""
@@ -30,7 +37,45 @@ def repeats(drive: Drive) -> Finding | None:
     if count >= _LEAST and _lidar_moves(drive, first, count):
         frame = drive.statistics.images[first].index
         return _finding("picture", frame, count, "the LiDAR moves", "the camera's driver and its recording")
-    return None
+    of_scans, of_images = (
+        [k for k in _equal_to_former(digests) if moves(drive, k - 1, 2)]
+        for digests, moves in ((scans, _pictures_move), (images, _lidar_moves))
+    )
+    for what, found, total, check in (
+        ("scan", of_scans, len(scans), "the LiDAR's driver and its recording"),
+        ("picture", of_images, len(images), "the camera's driver and its recording"),
+    ):
+        if len(found) >= max(_LEAST, _LEAST_SHARE * total):
+            return Finding(
+                f"{what}s are repeated (a sensor that is slower than its frames, or a frozen one)",
+                f"{len(found)} of {total} equal the one before to the last bit where the other sensor moves",
+                f"look at {check}, and leave those frames out",
+            )
+    return _earlier_points(drive)
+
+
+def _earlier_points(drive: Drive) -> Finding | None:
+    """Clouds that hold the points of the scan before, as they were: several scans laid over each other."""
+    assert drive.statistics is not None
+    samples = [scan.sample for scan in drive.statistics.scans]
+    shares = [
+        len(np.intersect1d(a, b, assume_unique=True)) / len(b)
+        for k, (a, b) in enumerate(pairwise(samples))
+        if len(b) >= _LEAST_SAMPLE and _pictures_move(drive, k, 2)
+    ]
+    if len(shares) < _LEAST or float(np.median(shares)) < _SHARED:
+        return None
+    return Finding(
+        "the clouds are several scans laid over each other",
+        f"{100.0 * float(np.median(shares)):.0f} % of a scan's points stand in the scan before, too, to the "
+        "last bit, though the vehicle moves",
+        "give each turn of the scanner as a cloud of its own, with its own stamp",
+    )
+
+
+def _equal_to_former(digests: Sequence[int]) -> list[int]:
+    """Positions of frames that are equal to the one before."""
+    return [k for k in range(1, len(digests)) if digests[k] == digests[k - 1]]
 
 
 def _finding(what: str, frame: int, count: int, other: str, check: str) -> Finding:

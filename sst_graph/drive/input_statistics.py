@@ -59,6 +59,8 @@ class ScanStatistics:
         median_range: of all points.
         ground: None where too few points are labelled so, or the scan is not one of the chosen ones.
         vehicle_heights: (k,) from the ground to the top of its vehicles.
+        sample: (s,) sorted numbers of some points, chosen and numbered by their coordinates: a point that is
+            equal to the last bit in two scans is in both samples or in none.
     """
 
     index: int
@@ -68,6 +70,7 @@ class ScanStatistics:
     median_range: float
     ground: Ground | None = None
     vehicle_heights: FloatArray = field(default_factory=lambda: np.zeros(0))
+    sample: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,22 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
         heights = _heights(points[member], instances, ground)
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
-    return ScanStatistics(index, digest, sweep, labelled, median_range, ground, heights)
+    sample = _sample(scan.points)
+    return ScanStatistics(index, digest, sweep, labelled, median_range, ground, heights, sample)
+
+
+_FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+"""Odd numbers whose multiples spread over 64 bits."""
+_SAMPLED_BITS = 5
+"""One point in 2^5 is in a sample."""
+
+
+def _sample(points: NDArray[np.float32]) -> NDArray[np.uint64]:
+    """(s,) sorted hashes of the points (n, 3) whose hash begins with :data:`_SAMPLED_BITS` zeros."""
+    bits = np.ascontiguousarray(points, np.float32).view(np.uint32).astype(np.uint64)
+    mixed = (bits * _FACTORS).sum(axis=1, dtype=np.uint64)
+    mixed = (mixed ^ (mixed >> np.uint64(29))) * _FACTORS[0]
+    return np.unique(mixed[mixed >> np.uint64(64 - _SAMPLED_BITS) == 0])
 
 
 def image_statistics(index: int, image: CameraImage, closely: bool = True) -> ImageStatistics:

@@ -30,6 +30,7 @@ SIZES: dict[str, tuple[float, ...]] = {
     "line_delay": (2e-5, 1e-4, 4e-4),
     "range_bias": (0.03, 0.1, 0.3, 1.0, 2.0),
     "range_scale": (0.003, 0.01, 0.03, 0.1, 0.3),
+    "elevation": (0.001, 0.003, 0.01, 0.02, 0.04),
 }
 """Sizes by which each assumption is broken, in its unit, in either sense."""
 

@@ -68,6 +68,20 @@ def with_ranges(drive: KeptDrive, bias_m: float, scale: float) -> KeptDrive:
     return drive.with_scans(change)
 
 
+def with_elevation(drive: KeptDrive, size: float) -> KeptDrive:
+    """The true beams are higher than they are said to be [rad]."""
+
+    def change(scan: Scan) -> Scan:
+        p = scan.points.astype(np.float64)
+        azimuth, ranges = np.arctan2(p[:, 1], p[:, 0]), np.linalg.norm(p, axis=1)
+        said = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])) - size
+        across = ranges * np.cos(said)
+        points = np.stack([across * np.cos(azimuth), across * np.sin(azimuth), ranges * np.sin(said)], axis=1)
+        return replace(scan, points=points.astype(np.float32))
+
+    return drive.with_scans(change)
+
+
 def with_skew(drive: KeptDrive, size: float) -> KeptDrive:
     """The camera's clock loses ``size`` seconds a second against the LiDAR's, from the first image on."""
     first = next(frame.image.stamp_ns for frame in drive.frames if frame.image is not None)
@@ -131,5 +145,6 @@ WRONG: dict[str, Callable[[KeptDrive, float], KeptDrive]] = {
     "skew": with_skew,
     "range_bias": lambda drive, size: with_ranges(drive, size, 0.0),
     "range_scale": lambda drive, size: with_ranges(drive, 0.0, size),
+    "elevation": with_elevation,
 }
 """How to break an assumption by the size of its parameter."""

@@ -34,7 +34,7 @@ UNKNOWNS = 7
 KINDS = ("side", "side_frame", "match")
 """Kinds of errors of the matches, as the error model has them."""
 
-LIDAR_ASSUMPTIONS = ("sweep", "range_bias", "range_scale")
+LIDAR_ASSUMPTIONS = ("sweep", "range_bias", "range_scale", "elevation")
 """Assumptions about the LiDAR, which all cameras share; the others are about a camera or its clock."""
 
 _MOST_SCANS, _MOST_CLASSES, _MOST_POINTS = 1_000_000, 256, 1_000_000

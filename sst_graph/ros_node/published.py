@@ -72,6 +72,7 @@ class NodeMessages(MessageMaker):
 def diagnosis_of(update: TrackUpdate) -> Diagnosis:
     """The calibration's diagnosis: status, sigmas, offset."""
     words = [update.status, update.reason, update.suspected_change, *update.contradictions]
+    words.append(update.undecided_sweep)
     words += [weak.sentence for weak in update.weak_directions[:1]]
     sigmas = update.sigmas
     values: dict[str, object] = {

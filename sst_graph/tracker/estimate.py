@@ -11,10 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.assumptions.sweep import SWEEP
 from sst_graph.batch.assumption_tests import with_test_results
 from sst_graph.covariance.considered import Considered, considered_by_steps
+from sst_graph.covariance.undecided_sweep import SweepEffect
 from sst_graph.errors import EstimationError
 from sst_graph.graph.outer_loop import NARROW_KERNELS_PX
+from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.tracker.assumption_tests import AssumptionTests
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.history import History, HistoryEntry
@@ -78,6 +81,7 @@ class OnlineEstimate:
         information_log: what each scan contributed.
         past_epochs: those that have left the window (drift mode).
         starts: number of the start that the estimate comes from.
+        sweep: what was decided of the sweep of the scans; None: nothing, they are used as they come.
     """
 
     def __init__(self, matcher: WindowMatcher, config: TrackerConfig, guess: Guess) -> None:
@@ -91,6 +95,7 @@ class OnlineEstimate:
         self.information_log = InformationLog()
         self.past_epochs = History()
         self.starts = 0
+        self.sweep: SweepDecision | None = None
 
     def begin(self, initialization: Initialization) -> None:
         """Go on from a first estimate."""
@@ -156,8 +161,24 @@ class OnlineEstimate:
         }
 
     def reported_covariance(self) -> FloatArray:
-        """(7, 7) covariance of the present estimate, with the considered assumptions."""
+        """(7, 7) covariance of the present estimate, with the considered assumptions and an undecided
+        sweep."""
+        return self._without_sweep() + self.by_sweep().covariance
+
+    def _without_sweep(self) -> FloatArray:
         return self.covariance[:7, :7] + self.considered().covariance(7)
+
+    def by_sweep(self) -> SweepEffect:
+        """The effect of a sweep that the scans leave undecided.
+
+        The changes under its hypotheses are those by the share of the sweep that is left in the clouds: with
+        turns that begin outside the camera's view, as in the assumption's column.
+        """
+        step = self.uncertainty.steps.get(SWEEP.name)
+        if self.sweep is None or step is None:
+            return SweepEffect(np.zeros((7, 7)))
+        steps = {timing.fraction: -timing.fraction * step for timing in self.sweep.others}
+        return SweepEffect.of(self.sweep, steps, self._without_sweep())
 
     def considered(self) -> Considered:
         """The considered assumptions: those whose parameters are not estimated."""
@@ -174,7 +195,7 @@ class OnlineEstimate:
         if self.smoother is None:
             return []
         entries = self.past_epochs.smoothed(self.smoother)
-        extra = self.considered().covariance(7)
+        extra = self.considered().covariance(7) + self.by_sweep().covariance
         return [dataclasses.replace(entry, covariance=entry.covariance + extra) for entry in entries]
 
     # ------------------------------------------------------------------ a frame

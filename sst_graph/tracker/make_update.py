@@ -30,10 +30,12 @@ def make_update(
     confirmation, contradictions = changes.confirmation, contradiction_sentence(estimate.tests.findings)
     status: TrackStatus = "alarm" if tracker.initializer.alarmed else "starting"
     weak: tuple[WeakDirection, ...] = ()
+    sweep = ""
     if estimate.exists:
         limits = tracker.setup.config.calibration.observability
         weak = open_directions(covariance, estimate.uncertainty.by_static_objects, point.cTl, limits)
-        unconfirmed = changes.start_unconfirmed or confirmation.too_old
+        sweep = estimate.by_sweep().sentence
+        unconfirmed = changes.start_unconfirmed or confirmation.too_old or sweep
         status = "unobservable" if weak else "unconfirmed" if unconfirmed else "ok"
         status = "contradicted" if contradictions else status
     return TrackUpdate(
@@ -54,6 +56,7 @@ def make_update(
         weak_directions=weak,
         contradictions=contradictions,
         estimated=estimate.parameters,
+        undecided_sweep=sweep,
     )
 
 

@@ -14,6 +14,7 @@ from sst_graph.tracker.make_update import current_update
 from sst_graph.tracker.track_update import TrackUpdate
 
 if TYPE_CHECKING:
+    from sst_graph.tracker.monitor.change_detector import ChangeDetector
     from sst_graph.tracker.tracker import Tracker
 
 
@@ -29,9 +30,11 @@ def tracker_result(
     elif last.status == "contradicted":
         reasons = (*last.contradictions, *reasons)
     elif last.status == "unconfirmed":
-        reasons = _unconfirmed(last, tracker.monitor.changes.start_unconfirmed)
+        reasons = _unconfirmed(last, tracker.monitor.changes)
     elif last.status != "ok":
         reasons = (f"the tracker is {last.status}: no estimate of the calibration as it is now",)
+    if last.undecided_sweep:
+        reasons = (*reasons, last.undecided_sweep)
     entries = {} if estimate.smoother is None else estimate.smoother.entries
     used = [FrameId(drive, scan.index) for number, scan in window.scans if number in entries]
     model = None if estimate.smoother is None else estimate.smoother.model
@@ -67,9 +70,11 @@ def tracker_result(
     )
 
 
-def _unconfirmed(last: TrackUpdate, new_start: bool) -> tuple[str, ...]:
-    if new_start:
+def _unconfirmed(last: TrackUpdate, changes: ChangeDetector) -> tuple[str, ...]:
+    if changes.start_unconfirmed:
         return ("no frames that came after the start have been found to agree with those it was made of",)
+    if not changes.confirmation.too_old:
+        return ()
     of_offset = (
         f", nor one of the time offset for {last.time_offset_unconfirmed_s:.1f} s of driving"
         if last.time_offset_unconfirmed_s > 0.0

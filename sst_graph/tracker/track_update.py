@@ -31,7 +31,8 @@ class TrackUpdate(ByValue):
         covariance: (7, 7) cluster-robust; None while there is no estimate, and ``covariance_reason`` says so.
         status: ``starting`` until a first estimate exists; ``alarm`` from an alarm until there is an estimate
             again; ``contradicted`` where the data contradict what is assumed; ``unconfirmed`` where no frames
-            have lately confirmed it; else whether the limits of observability are met.
+            have lately confirmed it, or ``undecided_sweep`` says why; else whether the limits of
+            observability are met.
         accepted: all of the frame was used; else ``reason`` says why not.
         reason: why the frame was not accepted; empty where it was.
         refused: the sensors of it whose data were not used: they have changed nothing.
@@ -52,6 +53,8 @@ class TrackUpdate(ByValue):
         frame: index of the frame; None where a scan or an image was added alone.
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
+        undecided_sweep: that the scans do not show whether they are compensated for the sweep, where it
+            matters (:meth:`Tracker.use_sweep`); else empty.
     """
 
     stamp_ns: int
@@ -75,6 +78,7 @@ class TrackUpdate(ByValue):
     contradictions: tuple[str, ...] = ()
     frame: int | None = None
     estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    undecided_sweep: str = ""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -112,5 +116,6 @@ class TrackUpdate(ByValue):
             "estimated": {
                 name: {"value": value, "sigma": sigma} for name, (value, sigma) in self.estimated.items()
             },
+            "undecided_sweep": self.undecided_sweep,
             "weak": [weak.sentence for weak in self.weak_directions],
         }

@@ -12,6 +12,7 @@ import numpy as np
 from sst_graph.drive.stamp_intervals import Jump
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.factors.camera import PinholeCamera
+from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.result import UNNAMED_CAMERA, CalibrationResult
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.estimate import FrameMatches, OnlineEstimate
@@ -73,6 +74,13 @@ class Tracker:
         self.estimate = OnlineEstimate(self.matcher, config, guess)
         self.monitor = Monitor(self.matcher, config)
         self.last_update: TrackUpdate | None = None
+
+    def use_sweep(self, decision: SweepDecision | None) -> None:
+        """Tell what was decided of the sweep of the scans (``SweptSource.sweep_decision``).
+
+        Undecided, its effect is in the covariance, and where it matters no estimate is ``ok``.
+        """
+        self.estimate.sweep = decision
 
     def add(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image and scan; either may be missing, and either may be refused alone."""

@@ -59,6 +59,11 @@ def truly_seen(name: str, theta: float, a: Alignment, offsets_s: FloatArray) -> 
     if name == "range_scale":
         lPs = lPs * (1.0 + theta)
         twist = np.asarray(cTl.AdjointMap()) @ (L_TWIST * [1, 1, 1, 1 + theta, 1 + theta, 1 + theta])
+    if name == "elevation":
+        azimuth, across = np.arctan2(lPs[:, 1], lPs[:, 0]), np.hypot(lPs[:, 0], lPs[:, 1])
+        raised = np.arctan2(lPs[:, 2], across) + theta
+        ray = [np.cos(raised) * np.cos(azimuth), np.cos(raised) * np.sin(azimuth), np.sin(raised)]
+        lPs = ranges * np.column_stack(ray)
     if name == "skew":
         taus = taus + theta * SCENE.image_s
     if name == "sweep":

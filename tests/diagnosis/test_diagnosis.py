@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stored import simulated
 
+from benchmarks.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
 from benchmarks.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.calibrate import prepare_drives
@@ -95,6 +96,16 @@ def test_right_data_are_left_alone() -> None:
 def test_a_fault_is_named_before_anything_is_solved(fault: str) -> None:
     found = causes(INPUT_FAULTS[fault](drive(), other()))
     assert any(NAMED[fault] in sentence for sentence in found), found
+
+
+@pytest.mark.parametrize("fault", SUBTLE_NAMED)
+def test_frames_that_hold_earlier_ones_are_named(fault: str) -> None:
+    found = causes(SUBTLE_FAULTS[fault](drive()))
+    assert any(SUBTLE_NAMED[fault] in sentence for sentence in found), found
+
+
+def test_a_doubled_picture_now_and_then_is_left_to_the_robust_matching() -> None:
+    assert causes(repeated_pictures(drive(), every=5)) == []
 
 
 @cache

@@ -14,7 +14,7 @@ from sst_graph.batch.by_edges.method import LabelsSay, edges_method
 from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.batch.motion_factor import MAX_DISAGREEMENT_CHI2
-from sst_graph.batch.total_covariance import MATTERS
+from sst_graph.covariance.undecided_sweep import MATTERS
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
 from sst_graph.inspect.frame_information import KEY as FRAME_INFORMATION

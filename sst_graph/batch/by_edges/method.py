@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sst_graph.association.time_pairing import pair_by_time
 from sst_graph.batch.by_edges.covariance import NEAR_KERNELS_PX, edges_covariance
+from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.parts import thinned
 from sst_graph.batch.by_edges.reasons import EdgeContrast, drift_reasons, edge_contrast, edges_reasons
 from sst_graph.batch.config import CalibrationConfig
@@ -157,6 +158,8 @@ def edges_method(
     )
     reasons = edges_reasons(solution, contrast, motion, covariance, problem.centre)
     reasons += drift_reasons(drift)
+    if config.check_contradictions:
+        reasons += halves_reasons(problem.whole, solution.state, covariance)
     return MethodEstimate(
         solution.state.cTl,
         solution.state.time_offsets_s[0],

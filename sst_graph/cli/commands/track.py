@@ -19,8 +19,8 @@ from sst_graph.cli.progress import ProgressBar, counted
 from sst_graph.cli.reading import open_drive, options_of, warn_of_other_pairs
 from sst_graph.errors import ConfigError
 from sst_graph.files import output_file
-from sst_graph.odometry.sweep import REMEDY, SWEEP_KEY, SweptSource, with_sweep
-from sst_graph.result import CalibrationResult, Status
+from sst_graph.odometry.sweep import SWEEP_KEY, SweptSource, with_sweep
+from sst_graph.result import CalibrationResult
 from sst_graph.tracker.config import TrackerConfig
 from sst_graph.tracker.storage.checkpoint import Saver
 from sst_graph.tracker.storage.resume import Setup, check_setup, frames_to_come
@@ -30,8 +30,6 @@ from sst_graph.types import Frame, Source
 
 if TYPE_CHECKING:
     from sst_graph.viewer import TrackerView
-
-_OPEN_SWEEP = f"whether the clouds are compensated for the sweep cannot be decided from the scans: {REMEDY}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -54,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         if not sys.stdout.isatty():  # else each line shows how far it is
             frames = counted(frames, source, progress.stage("track"))
         with _viewed(args, tracker, None if recorded is None else recorded.partial) as view:
-            tracker, last = _track(args, source, tracker, frames, view)
+            tracker, last = _track(args, tracker, frames, view)
             if view is not None:
                 view.finish(last)
         if recorded is not None:
@@ -68,7 +66,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _track(
     args: argparse.Namespace,
-    source: SweptSource,
     tracker: Tracker,
     frames: Iterator[Frame],
     view: TrackerView | None,
@@ -93,14 +90,14 @@ def _track(
             if saver is not None and (is_last or number % args.checkpoint_every == 0):
                 saver.save(tracker)
             if is_last:
-                tracker, update = _optimized(args, source, tracker, saver)
+                tracker, update = _optimized(args, tracker, saver)
             _say_line(update)
         if update is not None:
             return tracker, update
         # A save consolidates the tracker: what is saved already is not saved again.
         if saver is not None and not args.checkpoint.exists():
             saver.save(tracker)
-        tracker, update = _optimized(args, source, tracker, saver)
+        tracker, update = _optimized(args, tracker, saver)
         if update.frame is not None:
             _say_line(update)
         return tracker, update
@@ -123,16 +120,13 @@ def _say_line(update: TrackUpdate) -> None:
 
 
 def _optimized(
-    args: argparse.Namespace, source: SweptSource, tracker: Tracker, saver: Saver | None
+    args: argparse.Namespace, tracker: Tracker, saver: Saver | None
 ) -> tuple[Tracker, TrackUpdate]:
     """The tracker that is saved, or the one given where none is, its whole window solved; and its update."""
     if saver is not None:
         saver.finish()
         tracker = Tracker.load(args.checkpoint)
-    last = tracker.optimize()
-    if last.status == "ok" and _is_open(source):
-        last = dataclasses.replace(last, status="unconfirmed", suspected_change=_OPEN_SWEEP)
-    return tracker, last
+    return tracker, tracker.optimize()
 
 
 def _check(args: argparse.Namespace) -> None:
@@ -170,6 +164,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         initial, time_offset_s = starting_point(args.init or "dataset", source, args.camera)
         tracker = Tracker(source.camera, config, initial, time_offset_s)
         swept = with_sweep(source, config.calibration.decide_sweep)
+        tracker.use_sweep(swept.sweep_decision)
         return tracker, swept, iter(swept)
     tracker = Tracker.load(args.checkpoint)
     made = tracker.setup
@@ -180,6 +175,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     asked = settings(made.config, args, flags)
     check_setup(tracker, Setup(source.camera, asked, initial, time_offset_s), args.checkpoint)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
+    tracker.use_sweep(swept.sweep_decision)
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 
 
@@ -197,18 +193,9 @@ def _with_last(frames: Iterator[Frame]) -> Iterator[tuple[Frame, bool]]:
 
 
 def _with_decision(result: CalibrationResult, source: SweptSource) -> CalibrationResult:
-    """The result with what was decided of the sweep; not to be trusted where that is open."""
+    """The result with what was decided of the sweep."""
     diagnostics = {**result.diagnostics, SWEEP_KEY: {source.name: source.sweep_decision.to_dict()}}
-    result = dataclasses.replace(result, diagnostics=diagnostics)
-    if not _is_open(source):
-        return result
-    status: Status = "not_converged" if result.status == "ok" else result.status
-    return dataclasses.replace(result, status=status, reasons=(*result.reasons, _OPEN_SWEEP))
-
-
-def _is_open(source: SweptSource) -> bool:
-    """Whether the scans leave it open, and it makes a difference."""
-    return source.sweep_decision.kind == "undecided" and bool(source.sweep_decision.others)
+    return dataclasses.replace(result, diagnostics=diagnostics)
 
 
 def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:

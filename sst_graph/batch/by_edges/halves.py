@@ -1,0 +1,92 @@
+"""Whether the two halves of a drive agree: each searched and solved by itself by edges, around the estimate.
+
+The stretches of labels (:mod:`sst_graph.batch.contradictions`) are compared by covariances of frozen matches,
+which say too little of soft ones; that of the whole estimate, by half-samples of its objects, is used here. A
+half of the scans is known with twice that variance at most, for what all objects have in common does not
+differ between halves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sst_graph.batch.by_edges.covariance import SAMPLES
+from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
+from sst_graph.batch.contradictions import FALSE_ALARM
+from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
+from sst_graph.edges.agreement import score
+from sst_graph.edges.search import SearchRegion, edge_starts, spread_evenly
+from sst_graph.errors import EstimationError
+from sst_graph.graph.matching import edges_of
+from sst_graph.graph.outer_loop import JointProblem, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.solution import difference
+
+FloatArray = NDArray[np.float64]
+
+_LEAST_SCANS = 8
+"""Fewest scans of a half."""
+_SEARCHED_SCANS = 12
+"""Scans of a half on which starts are compared."""
+_HALF_DEG = 5.0
+"""A half's own pose is searched within this of the estimate, about each of the camera's axes [deg]."""
+_SCORE_PX = 1.5
+"""Blur under which solutions are compared [px]."""
+KERNELS_PX = (10.0, 8.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.5, 1.2)
+"""Scales of the kernel of a half's solution [px]: from a start that is a degree off."""
+
+
+def halves_reasons(problem: JointProblem, state: State, covariance: FloatArray) -> tuple[str, ...]:
+    """A sentence for every drive whose halves contradict each other.
+
+    Args:
+        state: estimate of all drives together.
+        covariance: (7, 7) of it.
+    """
+    reasons = []
+    for number, drive in enumerate(problem.drives):
+        halves = [half.tolist() for half in np.array_split(np.arange(len(drive.scans)), 2)]
+        parts = [_half(problem, number, half, state, covariance) for half in halves]
+        first, second = parts
+        if first is None or second is None:
+            continue
+        found = Difference.of(first, second)
+        if found.p_value * len(problem.drives) < FALSE_ALARM:
+            at = drive.scans[halves[1][0]].index
+            reasons.append(
+                f"{drive.name}: frames {drive.scans[0].index} to {drive.scans[halves[0][-1]].index} and "
+                f"those from {at} on contradict each other: the later ones differ in "
+                f"{name_step(found, state.cTl).sentence}; check whether the mount was moved or a clock "
+                "was set, and calibrate the frames before and after apart"
+            )
+    return tuple(reasons)
+
+
+def _half(
+    problem: JointProblem, number: int, scans: list[int], state: State, covariance: FloatArray
+) -> PartEstimate | None:
+    """A half's own estimate, as a step from that of the whole; None where it has none."""
+    if len(scans) < _LEAST_SCANS:
+        return None
+    drive, tracks = problem.drives[number].part(scans), problem.tracks.part(number, scans)
+    few = spread_evenly(len(scans), _SEARCHED_SCANS)
+    edges = edges_of([drive.part(few)], tracks.part(0, few), problem.config.graph)
+    if not edges:
+        return None
+    region = SearchRegion(state.cTl, state.time_offsets_s[:1], (_HALF_DEG,) * 3)
+    starts = [state, *(replace(state, cTl=start.cTl) for start in edge_starts(edges[0], region))]
+    found: list[tuple[float, State]] = []
+    for start in starts:
+        try:
+            own = solve_joint(replace(problem, drives=[drive], tracks=tracks), start, KERNELS_PX).state
+        except EstimationError:
+            continue
+        # From another start a pose must agree clearly better, as between the optima of a whole drive.
+        found.append((score(edges, own, _SCORE_PX) * (1.0 if start is state else 1.0 / MIN_OVER_OTHER), own))
+    if not found:
+        return None
+    best = max(found, key=lambda one: one[0])[1]
+    return PartEstimate(difference(state, best), 2.0 * covariance, float(SAMPLES))
