@@ -31,7 +31,7 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.solving import moved_px, proximal
+from sst_graph.slam.solving import moved_px, proximal, widest_px
 from sst_graph.slam.term_warnings import TermWarning, last_warnings, wide_uncertainty
 
 FloatArray = NDArray[np.float64]
@@ -155,8 +155,9 @@ class IncrementalTerms:
         config = self._config
         P, matches = self._marginal(), self._matches()
         sigma_px = wide_uncertainty(matches, estimate, P[:7, :7], config, 0.0)
-        known = bool(sigma_px) and sigma_px[0].value < _KNOWN * self._kernel_px
-        calm = moved_px(matches, estimate) < CALM * self._kernel_px
+        widest = widest_px(matches, self._kernel_px)
+        known = bool(sigma_px) and sigma_px[0].value < _KNOWN * widest
+        calm = moved_px(matches, estimate) < CALM * widest
         if self._kernel_px > config.last_px:
             if calm and known:
                 self._kernel_px = config.narrower(self._kernel_px)
@@ -203,7 +204,8 @@ class IncrementalTerms:
         removed += self._slots_of(self._proximal)
         self._proximal = {}
         if self._held and matches_now:
-            for prior in _factors(proximal(matches_now, estimate, self._kernel_px, self._keys)):
+            widest = widest_px(matches_now, self._kernel_px)
+            for prior in _factors(proximal(matches_now, estimate, widest, self._keys)):
                 graph.add(prior)
                 owners.append(None)
         if graph.size() or removed:

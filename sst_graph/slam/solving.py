@@ -100,14 +100,15 @@ def solve_with_terms(
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
         if held:
-            whole.push_back(proximal(matches, values, kernel_px, keys))
+            whole.push_back(proximal(matches, values, widest_px(matches, kernel_px), keys))
         values = gtsam.LevenbergMarquardtOptimizer(whole, values, parameters).optimize()
         moved, rounds = moved_px(matches, values), rounds + 1
+        calm = moved < CALM * widest_px(matches, kernel_px)
         if kernel_px > config.last_px:
-            if moved < CALM * kernel_px:
+            if calm:
                 kernel_px = config.narrower(kernel_px)
         elif held:
-            held = moved >= CALM * kernel_px
+            held = not calm
         else:
             converged = moved < _STEP_PX
         matches = match_all(terms, values, kernel_px, 1.0)
@@ -156,6 +157,11 @@ def with_factors(
         if each.factor is not None:
             whole.add(each.factor)
     return whole
+
+
+def widest_px(matches: Sequence[TermMatches], kernel_px: float) -> float:
+    """Widest kernel of any of the matches [px]; ``kernel_px`` where there is none."""
+    return max((each.scale_px for each in matches if each.factor is not None), default=kernel_px)
 
 
 def moved_px(matches: Sequence[TermMatches], values: gtsam.Values) -> float:

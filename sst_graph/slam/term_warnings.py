@@ -74,7 +74,7 @@ def wide_uncertainty(
     found = [(each, each.term) for each in matches if each.factor is not None and each.term is not None]
     if not found:
         return []
-    limit = GATE * found[0][0].kernel_px if reach_px is None else reach_px
+    limit = GATE * max(each.scale_px for each, _ in found) if reach_px is None else reach_px
     if not np.isfinite(covariance).all():
         return [TermWarning(WarningKind.WIDE_UNCERTAINTY, float("inf"), limit, "px")]
     sigmas = [each.predicted_sigma_px(values, covariance) for each, _ in found]
