@@ -202,6 +202,7 @@ def nearest_edges(
     shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
     if peaks:
         variance = (ts**2 @ mass) / np.maximum(total, 1e-9) - centre**2
-        stiffness = np.clip(1.0 - variance / scale_px**2, _LEAST_STIFFNESS, 1.0)
-        centre, shares = centre / stiffness, shares * stiffness
+        stiffness = 1.0 - variance / scale_px**2
+        centre = centre / np.maximum(stiffness, _LEAST_STIFFNESS)
+        shares = shares * np.maximum(stiffness, 0.0)
     return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, shares)

@@ -40,9 +40,9 @@ SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
 """In a graph of your own the information is not corrected afterwards: each side of an object counts as one
 measurement."""
 SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
-EDGE_KERNEL_SHARE = 0.3
-"""Scale of the kernel where there is no mask, over that of the contours: pictures have edges beside the
-objects', and a few pixels away they are others'."""
+EDGE_KERNEL_SHARE, EDGE_KERNEL_PX = 0.3, 8.0
+"""Scale of the kernel where there is no mask, over that of the contours, and at most [px]: pictures have
+edges beside the objects', and a few pixels away they are others'."""
 _LABELLED_M = 0.3
 """Boundary points of objects without a class that lie this near to a labelled point are of its object [m]."""
 
@@ -139,7 +139,8 @@ class FrameMatching:
             ground, found in the scan alone, and meets the edges of the picture; where scan and image show
             labelled classes of these, only objects without such a label.
         kernel: robust kernel of the matches; its scale, times ``GATE``, is also the farthest match [px].
-            Edges of the picture have :data:`EDGE_KERNEL_SHARE` of that scale.
+            Edges of the picture have :data:`EDGE_KERNEL_SHARE` of that scale, and :data:`EDGE_KERNEL_PX` at
+            most.
         config: how boundary points meet contours.
     """
 
@@ -149,7 +150,8 @@ class FrameMatching:
 
     def matchers(self) -> list[tuple[frozenset[SemanticClass], RobustKernel, MatchConfig]]:
         """Classes that are matched alike, with their kernel and settings."""
-        narrow = RobustKernel(self.kernel.kind, EDGE_KERNEL_SHARE * self.kernel.scale)
+        scale = min(EDGE_KERNEL_SHARE * self.kernel.scale, EDGE_KERNEL_PX)
+        narrow = RobustKernel(self.kernel.kind, scale)
         labelled = frozenset(self.classes) - {SemanticClass.OBJECT}
         edges = frozenset(self.classes) - labelled
         both = [

@@ -36,7 +36,13 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings, wide_uncertainty
+from sst_graph.slam.term_warnings import (
+    TermWarning,
+    WarningKind,
+    far_from_start,
+    last_warnings,
+    wide_uncertainty,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -95,7 +101,8 @@ def solve_with_terms(
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
-    warnings = wide_uncertainty(matches, values, marginal(graph, values, keys)[:7, :7], config)
+    start, alone = values, marginal(graph, values, keys)[:7, :7]
+    warnings = wide_uncertainty(matches, values, alone, config)
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
@@ -126,6 +133,7 @@ def solve_with_terms(
     if not converged:
         warnings.append(TermWarning(WarningKind.NOT_CONVERGED, moved, _STEP_PX, "px"))
     warnings += last_warnings(matches, values, C, config)
+    warnings += far_from_start(keys, start, values, alone)
     warnings += covariance_warnings(
         marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config
     )
