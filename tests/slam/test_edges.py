@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 from alignment_streets import BOTH, OBJECTS, D, E, Street, isam2_params, street_without_labels
 
-from sst_graph import AlignmentKeys, solve_with_terms
+from sst_graph import AlignmentKeys, AlignmentTerm, TermConfig, follow_objects, open_source, solve_with_terms
+from sst_graph.drive.preparation import PrepareConfig, prepare_drive
+from sst_graph.objects.tracks import scan_poses
 from sst_graph.slam.align import EDGE_KERNEL_PX, EDGE_KERNEL_SHARE
 from sst_graph.slam.alignment_keys import POSITIONS
 from sst_graph.slam.covariance import TermSums, calibration_covariance, rows_of
@@ -18,6 +21,7 @@ from sst_graph.slam.solving import RematchSolution
 from sst_graph.slam.term_warnings import WarningKind, far_from_start
 from sst_graph.types import SemanticClass
 
+STOP = Path(__file__).resolve().parents[3] / "shared" / "data" / "kitti_2011_09_26_stop"
 OBJECT, VEHICLE = SemanticClass.OBJECT, SemanticClass.VEHICLE
 NEAR = (0.05, 0.1, 0.05)
 """Prior sigmas of a calibration that is nearly known [rad, m, s]."""
@@ -126,6 +130,35 @@ def test_what_edges_have_in_common_is_considered(by_edges: RematchSolution) -> N
     matches = only.term(1, keys).matched(values, 5.0)
     own = TermSums.of(rows_of(matches, ObjectSides(), values), 1.0)
     assert own.claimed.any() and not own.by_edges.any()
+
+
+@pytest.mark.slow
+@pytest.mark.drives
+@pytest.mark.skipif(not STOP.is_dir(), reason="no ../shared")
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_real_drive_without_labels(seed: int) -> None:
+    """1 deg, 5 cm and 10 ms off: within 0.2 deg, 2 cm, 12 ms."""
+    source = open_source(STOP, image_shift=1)
+    drive = prepare_drive(source, OBJECTS, PrepareConfig(use_visual_odometry=False), with_lower_edges=False)
+    assert source.truth is not None and source.truth.time_offset_s is not None
+    truth = source.truth.cTl, source.truth.time_offset_s
+    street = Street(drive.camera, drive.scans, drive.images, drive.lidar_motions, *truth)
+    followed = follow_objects(drive.scans, scan_poses(drive), OBJECTS)
+    rng = np.random.default_rng(seed)
+    axes = [axis / np.linalg.norm(axis) for axis in rng.standard_normal((2, 3))]
+    off = np.concatenate([np.radians(1.0) * axes[0], 0.05 * axes[1]])
+    begin = truth[0].retract(off), truth[1] + 0.01 * float(rng.choice([-1.0, 1.0]))
+    keys, config = AlignmentKeys(street.trajectory(), E, D), TermConfig(classes=OBJECTS)
+    terms = []
+    for k, image in enumerate(drive.images):
+        near = slice(max(k - 1, 0), k + 4)
+        scans, moving = followed.features[near], followed.l_velocities[near]
+        terms.append(AlignmentTerm(scans, image, drive.camera, keys, config, moving))
+    solution = solve_with_terms(*street.whole(begin, (0.01, 0.03, 0.01)), terms)
+    rotation_deg, translation_m, time_offset_s = street.errors(solution.values)
+    assert solution.converged
+    assert rotation_deg < 0.2 and translation_m < 0.02 and time_offset_s < 0.012
+    assert street.nees(solution.values, solution.covariance) < 14.0
 
 
 def test_an_estimate_far_from_the_start_is_reported(by_edges: RematchSolution) -> None:
