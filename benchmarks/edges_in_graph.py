@@ -1,11 +1,11 @@
 """Alignment terms in a user's graph, by edges, by labels or by both: errors, sigmas, NEES on a real drive.
 
-    OMP_NUM_THREADS=1 python benchmarks/edges_in_graph.py DRIVE                    by edges, LM, starts 0 to 2
-    OMP_NUM_THREADS=1 python benchmarks/edges_in_graph.py DRIVE --classes vehicle object --solver isam2 --off 0.5
+    OMP_NUM_THREADS=1 python benchmarks/edges_in_graph.py DRIVE             by edges, LM, starts 0 to 2
+    OMP_NUM_THREADS=1 python benchmarks/edges_in_graph.py DRIVE --classes vehicle object --solver isam2
 
-The drive is read with ``--image-shift 1``, its reference taken for exact. A start is ``--off`` times 1 deg, 5 cm
-and 10 ms off in a random direction, the priors as many times 0.01 rad, 3 cm and 10 ms. Errors and sigmas are in
-the LiDAR's axes: roll, pitch, yaw [deg]; forward, left, up [cm]; time offset [ms].
+The drive is read with ``--image-shift 1``, its reference taken for exact. A start is ``--off`` times 1 deg,
+5 cm and 10 ms off in a random direction, the priors as many times 0.01 rad, 3 cm and 10 ms. Errors and sigmas
+are in the LiDAR's axes: roll, pitch, yaw [deg]; forward, left, up [cm]; time offset [ms].
 """
 
 from __future__ import annotations
