@@ -46,8 +46,10 @@ SECTIONS: dict[str, list[str]] = {
     "Frame by frame": ["sst_graph.Tracker", "sst_graph.TrackerConfig", "sst_graph.TrackUpdate"],
     "In a graph of your own": [
         "sst_graph.AlignmentTerm",
+        "sst_graph.TermConfig",
         "sst_graph.AlignmentKeys",
         "sst_graph.Trajectory",
+        "sst_graph.follow_objects",
         "sst_graph.solve_with_terms",
         "sst_graph.IncrementalTerms",
         "sst_graph.calibration_covariance",

@@ -17,9 +17,10 @@ if TYPE_CHECKING:
     from sst_graph.rig import KnownPose, KnownRig, RigResult, calibrate_rig, read_rig
     from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
     from sst_graph.slam.alignment_keys import AlignmentKeys, Trajectory
-    from sst_graph.slam.alignment_term import AlignmentTerm
+    from sst_graph.slam.alignment_term import AlignmentTerm, TermConfig
     from sst_graph.slam.covariance import calibration_covariance
     from sst_graph.slam.incremental_terms import IncrementalTerms
+    from sst_graph.slam.moving_objects import follow_objects
     from sst_graph.slam.solving import solve_with_terms
     from sst_graph.tracker import Tracker, TrackerConfig, TrackUpdate
     from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
@@ -43,6 +44,7 @@ __all__ = [
     "ScanMotion",
     "SemanticClass",
     "Source",
+    "TermConfig",
     "TrackUpdate",
     "Tracker",
     "TrackerConfig",
@@ -51,6 +53,7 @@ __all__ = [
     "calibrate",
     "calibrate_rig",
     "calibration_covariance",
+    "follow_objects",
     "inspect_result",
     "open_source",
     "read_result",
@@ -77,6 +80,7 @@ _HOMES = {
     "ScanMotion": "sst_graph.slam.align",
     "SemanticClass": "sst_graph.types",
     "Source": "sst_graph.types",
+    "TermConfig": "sst_graph.slam.alignment_term",
     "TrackUpdate": "sst_graph.tracker",
     "Tracker": "sst_graph.tracker",
     "TrackerConfig": "sst_graph.tracker",
@@ -85,6 +89,7 @@ _HOMES = {
     "calibrate": "sst_graph.batch",
     "calibrate_rig": "sst_graph.rig",
     "calibration_covariance": "sst_graph.slam.covariance",
+    "follow_objects": "sst_graph.slam.moving_objects",
     "inspect_result": "sst_graph.inspect.inspection",
     "open_source": "sst_graph.data",
     "read_result": "sst_graph.result",

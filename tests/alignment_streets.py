@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import gtsam
@@ -14,11 +14,12 @@ from stored import simulated, stored
 from sst_graph import AlignmentKeys, AlignmentTerm, IncrementalTerms, Trajectory
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.factors import PinholeCamera, time_offset_prior
-from sst_graph.simulator import SimulationConfig
+from sst_graph.simulator import SimulatedDrive, SimulationConfig
 from sst_graph.simulator.config import Motion
-from sst_graph.slam.align import features_of
+from sst_graph.slam.align import VEHICLES, features_of
+from sst_graph.slam.alignment_term import TermConfig
 from sst_graph.slam.incremental_terms import IncrementalUpdate, Solver
-from sst_graph.types import RelativeMotion, SemanticClass
+from sst_graph.types import Frame, RelativeMotion, SemanticClass
 
 E, D = gtsam.symbol("E", 0), gtsam.symbol("D", 0)
 WIDE = (1.0, 1.0, 1.0)
@@ -39,6 +40,7 @@ class Street:
     motions: tuple[RelativeMotion, ...]
     cTl: gtsam.Pose3
     time_offset_s: float
+    config: TermConfig = field(default_factory=TermConfig)
 
     @property
     def stamps_ns(self) -> list[int]:
@@ -58,7 +60,8 @@ class Street:
 
     def term(self, k: int, keys: AlignmentKeys) -> AlignmentTerm:
         """Image k with the scans around it."""
-        return AlignmentTerm(self.scans[max(k - 1, 0) : k + 4], self.images[k], self.camera, keys)
+        scans = self.scans[max(k - 1, 0) : k + 4]
+        return AlignmentTerm(scans, self.images[k], self.camera, keys, self.config)
 
     def new_at(
         self, k: int, start: tuple[gtsam.Pose3, float], sigmas: Sequence[float] = WIDE
@@ -96,13 +99,15 @@ class Street:
     def trajectory(self) -> Trajectory:
         return Trajectory([X(k) for k in range(len(self.scans))], self.stamps_ns)
 
-    def frame_by_frame(self, solver: Solver, start: tuple[gtsam.Pose3, float]) -> IncrementalUpdate:
+    def frame_by_frame(
+        self, solver: Solver, start: tuple[gtsam.Pose3, float], sigmas: Sequence[float] = WIDE
+    ) -> IncrementalUpdate:
         """Every frame as it comes, then rounds until nothing changes."""
         trajectory = Trajectory()
         keys = AlignmentKeys(trajectory, E, D)
         terms = IncrementalTerms(solver, keys)
         for k, stamp_ns in enumerate(self.stamps_ns):
-            graph, values = self.new_at(k, start)
+            graph, values = self.new_at(k, start, sigmas)
             trajectory.append(X(k), stamp_ns)
             new = [self.term(k, keys)] if k < len(self.images) else []
             terms.update(graph, values, new, {X(k): 1e-9 * (stamp_ns - self.stamps_ns[0])})
@@ -153,11 +158,17 @@ def _new_street(seed: int, frames: int, motion: Motion) -> Street:
             time_offset_s=0.05,
         )
     )
+    return _street(drive, drive, VEHICLES, seed)
+
+
+def _street(
+    drive: SimulatedDrive, frames: Iterable[Frame], classes: tuple[SemanticClass, ...], seed: int
+) -> Street:
+    """What a user has of a drive, from its frames."""
     scans, images = [], []
-    for k in range(frames):
-        frame = drive[k]
+    for frame in frames:
         assert frame.scan is not None and frame.image is not None
-        scan, image = features_of(frame.scan, frame.image, [SemanticClass.VEHICLE])
+        scan, image = features_of(frame.scan, frame.image, classes)
         scans.append(scan)
         images.append(image)
     rng, stamps = np.random.default_rng(seed), [scan.stamp_ns for scan in scans]
@@ -169,6 +180,33 @@ def _new_street(seed: int, frames: int, motion: Motion) -> Street:
             RelativeMotion(a, b, step.retract(sigmas * rng.standard_normal(6)), np.diag(sigmas**2))
         )
     assert drive.truth.time_offset_s is not None
-    return Street(
-        drive.camera, tuple(scans), tuple(images), tuple(motions), drive.truth.cTl, drive.truth.time_offset_s
+    truth = drive.truth.cTl, drive.truth.time_offset_s
+    config = TermConfig(classes=classes)
+    return Street(drive.camera, tuple(scans), tuple(images), tuple(motions), *truth, config)
+
+
+OBJECTS, BOTH = (SemanticClass.OBJECT,), (SemanticClass.VEHICLE, SemanticClass.OBJECT)
+
+
+@cache
+def street_without_labels(classes: tuple[SemanticClass, ...] = OBJECTS, labelled: int = 0) -> Street:
+    """A drive of which the first frames alone have labels."""
+    return stored(("a street without labels", classes, labelled), lambda: _without_labels(classes, labelled))
+
+
+def _without_labels(classes: tuple[SemanticClass, ...], labelled: int) -> Street:
+    config = SimulationConfig(
+        seed=504, frames=12, motion="no_stop", azimuth_limit_deg=50.0, time_offset_s=0.05, moving_fraction=0.0
     )
+    drive = simulated(config)
+    frames = [drive[k] if k < labelled else without_labels(drive[k]) for k in range(config.frames)]
+    return _street(drive, frames, classes, config.seed)
+
+
+def without_labels(frame: Frame) -> Frame:
+    """The frame as nobody has labelled it."""
+    assert frame.scan is not None and frame.image is not None
+    nothing = np.full_like(frame.scan.classes, SemanticClass.IGNORE)
+    scan = replace(frame.scan, classes=nothing, instances=None)
+    mask = np.full_like(frame.image.mask, SemanticClass.IGNORE)
+    return replace(frame, scan=scan, image=replace(frame.image, mask=mask, instances=None))

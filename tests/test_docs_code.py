@@ -136,6 +136,33 @@ def _agree(line: str, other: str) -> bool:
     return np.allclose(*values, rtol=0.1, atol=0.011)
 
 
+@pytest.mark.slow
+def test_a_graph_of_your_own_without_labels(tmp_path: Path) -> None:
+    """The data's own calibration, which the page begins at, is 0.7 deg and 5 cm off."""
+    street = SimulationConfig(
+        seed=504, frames=12, motion="no_stop", azimuth_limit_deg=50.0, time_offset_s=0.03
+    )
+    (tmp_path / "drive").symlink_to(written(street))
+    code = (
+        code_of("graph/edges.md")
+        .replace("drive.nominal", "nominal")
+        .replace(
+            "frames = list(drive)",
+            "off = np.array([0.008, -0.006, 0.007, 0.03, -0.03, 0.027])\n"
+            "nominal = drive.truth.cTl.retract(off)\nframes = list(drive)",
+        )
+    )
+    found: dict[str, Any] = {}
+    exec(compile(code, "edges.md", "exec"), found)
+    solution, truth = found["solution"], found["drive"].truth
+    assert {c for each in solution.matches for c in each.found.classes} == {found["SemanticClass"].OBJECT}
+    apart = truth.cTl.localCoordinates(solution.values.atPose3(found["E"](0)))
+    late = solution.values.atVector(found["D"](0))[0] - truth.time_offset_s
+    assert solution.converged
+    assert (np.abs([*apart, late]) < 4.0 * np.sqrt(np.diag(solution.covariance))).all()
+    assert np.degrees(np.linalg.norm(apart[:3])) < 0.35 and abs(late) < 0.01
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in (*DOCS.rglob("*.md"), DOCS.parent / "README.md"):
         for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text(encoding="utf-8")):

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_graph.assumptions.model import Effect, Scene
-from sst_graph.config import Settings, setting
+from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
@@ -52,7 +52,13 @@ LOWER_EDGE_SIGMA_PX = 1.2
 
 @dataclass(frozen=True)
 class MatchConfig(Settings):
-    """How boundary points are matched to contours."""
+    """How boundary points are matched to contours.
+
+    Attributes:
+        edge_peaks: where no mask has the class, points are matched to the peak of the picture's edge, not to
+            the centre of mass under the kernel: one step goes as far as many, and the information is that of
+            a match which follows the pose (:func:`~sst_graph.features.picture_gradients.nearest_edges`).
+    """
 
     mask_sigma_px: float = setting(
         1.0,
@@ -67,6 +73,7 @@ class MatchConfig(Settings):
         doc="Error that all matches on one side of an object in one image share. Raise it where "
         "outlines are drawn carelessly.",
     )
+    edge_peaks: bool = internal(False)
 
 
 GATE = 3.0
@@ -335,7 +342,7 @@ def match_edges(
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
         tips = paired.projected(paired.points.outward, cTl, time_offset_s)
         ways = tips - (uvs if shift is None else ideal[index])
-        feet, shares = _contours_or_gradients(paired, uvs, ways, kernel)
+        feet, shares = _contours_or_gradients(paired, uvs, ways, kernel, config.edge_peaks)
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         feet, shares = nearest_contours(maps, paired.spans, uvs), None
@@ -384,12 +391,13 @@ def match_edges(
 
 
 def _contours_or_gradients(
-    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel
+    paired: PairedEdges, uvs: FloatArray, ways: FloatArray, kernel: RobustKernel, peaks: bool
 ) -> tuple[ContourFeet, FloatArray]:
     """Contours of masks for the groups that have one, edges of the picture for the others.
 
     Args:
         ways: (n, 2) outward in the image, of any length [px].
+        peaks: as :func:`~sst_graph.features.picture_gradients.nearest_edges` has it.
 
     Returns:
         The contours, and (n,) the share of its full weight that each has.
@@ -418,7 +426,8 @@ def _contours_or_gradients(
             outward = ways[index] / np.maximum(np.linalg.norm(ways[index], axis=1), 1e-9)[:, None]
             # The window is where the residual is 0.
             bias = biases[index]
-            edges = nearest_edges(pictures, spans, own + bias[:, None] * outward, outward, kernel.scale)
+            moved = own + bias[:, None] * outward
+            edges = nearest_edges(pictures, spans, moved, outward, kernel.scale, peaks)
             found, shares[index] = edges, np.maximum(edges.shares, 1e-3)
             distances[index] = edges.distances - bias
         normals[index], feet[index], valid[index] = found.normals, found.feet, found.valid

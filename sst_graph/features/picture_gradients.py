@@ -39,6 +39,8 @@ STEP_PX = 0.5
 """Between the places across an edge at which strengths are read [px]."""
 _LEAST_MASS = 0.5
 """Least sum of strengths above the usual, times pixels, that makes an edge."""
+_LEAST_STIFFNESS = 0.3
+"""An edge's peak is taken for no farther than the centre of mass over this share."""
 
 
 @storable("strengths", "usual")
@@ -166,15 +168,22 @@ def nearest_edges(
     uvs: FloatArray,
     outward: FloatArray,
     scale_px: float,
+    peaks: bool = False,
 ) -> GradientFeet:
     """Edges across the outward directions near pixels uvs (n, 2): their centres of mass under a Gaussian.
 
     To match these again and again, and to minimise squared distances in between, climbs the sum of the
     strengths under that Gaussian (mean shift; Comaniciu and Meer, PAMI 2002).
 
+    The centre m follows the pixel x: dm/dx = V / scale^2, V the variance of the strengths under the Gaussian.
+    So the distance x - m grows with the stiffness 1 - V / scale^2 of x alone. The peak, where it is 0, is the
+    step of Newton's method, (m - x) / stiffness away, and the information is that of the distance to the
+    peak times the stiffness.
+
     Args:
         outward: (n, 2) unit vectors.
         scale_px: sigma of the Gaussian [px].
+        peaks: the peaks instead of the centres, shares times the stiffness.
     """
     n = len(uvs)
     if n == 0:
@@ -191,4 +200,9 @@ def nearest_edges(
     centre = (ts @ mass) / np.maximum(total, 1e-9)
     valid &= total * step > _LEAST_MASS
     shares = np.minimum(total * step / (_MOST * 2.0), 1.0)
+    if peaks:
+        variance = (ts**2 @ mass) / np.maximum(total, 1e-9) - centre**2
+        stiffness = 1.0 - variance / scale_px**2
+        centre = centre / np.maximum(stiffness, _LEAST_STIFFNESS)
+        shares = shares * np.maximum(stiffness, 0.0)
     return GradientFeet(-centre, outward, safe + centre[:, None] * outward, valid, shares)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sst_graph.association.edge_matching import (
     MatchConfig,
@@ -27,6 +28,7 @@ from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import CameraTwist
 from sst_graph.factors.robust import RobustKernel
+from sst_graph.features.lidar_edges import Boundaries
 from sst_graph.objects.occupancy import ObjectName
 from sst_graph.objects.velocity import velocities_of_points
 from sst_graph.types import CameraImage, Scan, SemanticClass
@@ -38,6 +40,11 @@ SLAM_MATCHES = MatchConfig(side_sigma_px=1.5)
 """In a graph of your own the information is not corrected afterwards: each side of an object counts as one
 measurement."""
 SLAM_KERNEL = RobustKernel("geman_mcclure", 5.0)
+EDGE_KERNEL_SHARE, EDGE_KERNEL_PX = 0.3, 8.0
+"""Scale of the kernel where there is no mask, over that of the contours, and at most [px]: pictures have
+edges beside the objects', and a few pixels away they are others'."""
+_LABELLED_M = 0.3
+"""Boundary points of objects without a class that lie this near to a labelled point are of its object [m]."""
 
 
 @dataclass(frozen=True)
@@ -89,13 +96,13 @@ class ScanMotion:
         l_acceleration: (6,) its rate of change [rad/s^2, m/s^2], zero by default.
         l_velocities: (3,) over ground of objects that move, in the scan's LiDAR frame, by class and number
             within the scan (the data's instance, where all points of the class carry one) [m/s]; all others
-            stand. Not with ``lTs``.
+            stand.
         lTs: where the scan was taken at another time: pose of the scan's LiDAR frame in the LiDAR's frame
-            at ``from_ns``, ``wTl_a.between(wTl_s)``; the scan deskewed to its stamp, no moving vehicles.
+            at ``from_ns``, ``wTl_a.between(wTl_s)``; the scan deskewed to its stamp.
         from_ns: with ``lTs``, the LiDAR-clock stamp of the pose before the image [ns].
 
     Raises:
-        DataError: one of ``lTs`` and ``from_ns``, or both with velocities; arrays of a wrong shape.
+        DataError: one of ``lTs`` and ``from_ns``; arrays of a wrong shape.
     """
 
     l_twist: FloatArray
@@ -107,9 +114,6 @@ class ScanMotion:
     def __post_init__(self) -> None:
         if (self.lTs is None) != (self.from_ns is None):
             raise DataError("ScanMotion", "one of lTs and from_ns", "both, or none")
-        if self.lTs is not None and self.l_velocities:
-            found = "l_velocities with lTs"
-            raise DataError("ScanMotion", found, "objects that stand in a scan of another time")
         acceleration = np.zeros(6) if self.l_acceleration is None else self.l_acceleration
         velocities = {
             (c, n): _finite(f"l_velocities[{c.name}, {n}]", velocity, 3)
@@ -131,14 +135,30 @@ class FrameMatching:
     """What is matched, and how.
 
     Attributes:
-        classes: to match.
+        classes: to match. Labelled ones meet the contours of their masks. ``OBJECT`` is what stands on the
+            ground, found in the scan alone, and meets the edges of the picture; where scan and image show
+            labelled classes of these, only objects without such a label.
         kernel: robust kernel of the matches; its scale, times ``GATE``, is also the farthest match [px].
+            Edges of the picture have :data:`EDGE_KERNEL_SHARE` of that scale, and :data:`EDGE_KERNEL_PX` at
+            most.
         config: how boundary points meet contours.
     """
 
     classes: Sequence[SemanticClass] = VEHICLES
     kernel: RobustKernel = SLAM_KERNEL
     config: MatchConfig = SLAM_MATCHES
+
+    def matchers(self) -> list[tuple[frozenset[SemanticClass], RobustKernel, MatchConfig]]:
+        """Classes that are matched alike, with their kernel and settings."""
+        scale = min(EDGE_KERNEL_SHARE * self.kernel.scale, EDGE_KERNEL_PX)
+        narrow = RobustKernel(self.kernel.kind, scale)
+        labelled = frozenset(self.classes) - {SemanticClass.OBJECT}
+        edges = frozenset(self.classes) - labelled
+        both = [
+            (labelled, self.kernel, self.config),
+            (edges, narrow, replace(self.config, edge_peaks=True)),
+        ]
+        return [each for each in both if each[0]]
 
 
 SLAM_MATCHING = FrameMatching()
@@ -151,7 +171,7 @@ def align_frame(
     motion: ScanMotion,
     matching: FrameMatching = SLAM_MATCHING,
 ) -> FrameAlignments:
-    """Boundary points of a scan matched to the contours of an image, at the current estimate.
+    """Boundary points of a scan matched to an image, at the current estimate.
 
     Args:
         scan, image: as the data have them, or their ``scan_features``, ``image_features``, which spare work.
@@ -163,19 +183,22 @@ def align_frame(
         The matches, possibly none: a frame without any gives no factor.
     """
     points, contours = features_of(scan, image, matching.classes)
-    boundaries = {c: some for c, some in points.boundaries.items() if c in matching.classes}
     from_ns = points.stamp_ns if motion.from_ns is None else motion.from_ns
-    pair = ScanWithImage(
-        boundaries,
-        contours.contours,
-        calibration.camera,
-        (contours.stamp_ns - from_ns) * 1e-9,
-        motion.of_camera(calibration.cTl),
-        velocities_of_points(motion.l_velocities, boundaries),
-    )
     place = calibration.cTl if motion.lTs is None else calibration.cTl * motion.lTs
     offset_s, biases_px = calibration.time_offset_s, calibration.biases_px
-    found = match_silhouettes(pair, place, offset_s, biases_px, matching.kernel, matching.config)
+    found: dict[SemanticClass, SilhouetteMatches] = {}
+    for classes, kernel, config in matching.matchers():
+        boundaries = {c: some for c, some in points.boundaries.items() if c in classes}
+        velocities = velocities_of_points(motion.l_velocities, boundaries)
+        pair = ScanWithImage(
+            _carried(boundaries, velocities, 1e-9 * (from_ns - points.stamp_ns)),
+            contours.contours,
+            calibration.camera,
+            (contours.stamp_ns - from_ns) * 1e-9,
+            motion.of_camera(calibration.cTl),
+            velocities,
+        )
+        found |= match_silhouettes(pair, place, offset_s, biases_px, kernel, config)
     return _frame_alignments(found)
 
 
@@ -183,11 +206,49 @@ def features_of(
     scan: Scan | ScanFeatures, image: CameraImage | ImageFeatures, classes: Sequence[SemanticClass]
 ) -> tuple[ScanFeatures, ImageFeatures]:
     """What :func:`align_frame` needs of a scan and an image."""
-    points = scan
-    if isinstance(points, Scan):
-        points = scan_features(0, points, classes, PrepareConfig(), with_lower_edges=False)
+    points = scan_features_of(scan, classes)
     contours = image_features(0, image, classes) if isinstance(image, CameraImage) else image
-    return points, contours
+    if points.by_geometry is None:
+        return points, contours
+    # A scan with labels, in which objects without a class were looked for too.
+    labelled = [c for c in classes if c in points.boundaries and c in contours.contours]
+    objects = _unlabelled(points.by_geometry.boundaries, points, labelled)
+    return replace(points, boundaries=points.boundaries | objects, by_geometry=None), contours
+
+
+def scan_features_of(scan: Scan | ScanFeatures, classes: Sequence[SemanticClass]) -> ScanFeatures:
+    """What :func:`features_of` needs of a scan, whatever its image shows."""
+    if isinstance(scan, ScanFeatures):
+        return scan
+    return scan_features(0, scan, classes, PrepareConfig(), depth=False, with_lower_edges=False)
+
+
+def _unlabelled(
+    found: Mapping[SemanticClass, Boundaries], scan: ScanFeatures, labelled: Sequence[SemanticClass]
+) -> dict[SemanticClass, Boundaries]:
+    """Boundary points of objects found by geometry that are not of labelled ones."""
+    own = [scan.boundaries[c].lPs for c in labelled]
+    own.append(scan.lPs[np.isin(scan.classes, [int(c) for c in labelled])])
+    tree = cKDTree(np.concatenate(own))
+    kept = {}
+    for c, points in found.items():
+        distances, _ = tree.query(points.lPs, distance_upper_bound=_LABELLED_M)
+        kept[c] = points.take(np.flatnonzero(np.isinf(distances)))
+    return {c: points for c, points in kept.items() if len(points)}
+
+
+def _carried(
+    boundaries: Mapping[SemanticClass, Boundaries],
+    velocities: Mapping[SemanticClass, FloatArray],
+    late_s: float,
+) -> dict[SemanticClass, Boundaries]:
+    """Boundary points that move over ground, where they are so much later [s]."""
+    carried = dict(boundaries)
+    if late_s:
+        for c, velocity in velocities.items():
+            points, shift = carried[c], late_s * velocity
+            carried[c] = replace(points, lPs=points.lPs + shift, outward=points.outward + shift)
+    return carried
 
 
 def _frame_alignments(found: Mapping[SemanticClass, SilhouetteMatches]) -> FrameAlignments:

@@ -16,8 +16,12 @@ from sst_graph.types import SemanticClass
 FloatArray = NDArray[np.float64]
 
 _CLASSES = tuple(SemanticClass)
-COLUMNS = 7 + len(_CLASSES)
-"""What all terms share, in order: extrinsic (6), time offset, the mask bias of each class."""
+POSITIONS = slice(7 + len(_CLASSES), 7 + len(_CLASSES) + 2)
+"""Columns of what all edges of objects without a class may have in common: upper edges lie higher, those at
+the sides farther to the right, each by one sigma of the beams' spacing."""
+COLUMNS = POSITIONS.stop
+"""What all terms share, in order: extrinsic (6), time offset, the mask bias of each class,
+:data:`POSITIONS`."""
 
 
 def bias_column(semantic_class: SemanticClass) -> int:

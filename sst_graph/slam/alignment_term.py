@@ -12,13 +12,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, cast
+from typing import cast
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sst_graph.association.edge_matching import MatchConfig
+from sst_graph.batch.by_edges.positions import position_columns
 from sst_graph.config import Settings, setting
 from sst_graph.drive.preparation import ImageFeatures, ScanFeatures
 from sst_graph.errors import DataError
@@ -38,7 +39,7 @@ from sst_graph.slam.align import (
     align_frame,
     features_of,
 )
-from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
+from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
 from sst_graph.slam.object_sides import ObjectSides
 from sst_graph.types import CameraImage, Scan, SemanticClass
 
@@ -50,7 +51,7 @@ class TermConfig(Settings):
     """How a term matches.
 
     Attributes:
-        classes: to match.
+        classes: to match, as of :class:`~sst_graph.slam.align.FrameMatching`: ``OBJECT`` needs no labels.
         match: how boundary points meet contours; its ``side_sigma_px`` bounds the information of a side.
         min_matches: fewer matches than this make no factor.
     """
@@ -158,6 +159,11 @@ class TermMatches:
     def __len__(self) -> int:
         return len(self.found)
 
+    @property
+    def scale_px(self) -> float:
+        """Widest kernel of any of the matches [px]."""
+        return max((each.kernel.scale for each in self.found.alignments), default=self.kernel_px)
+
     def __str__(self) -> str:
         outside = f", by {1e3 * abs(self.outside_s):.0f} ms" if self.outside_s else ""
         return f"{self.state.value}{outside}: {len(self)} matches, kernel {self.kernel_px:.1f} px"
@@ -204,8 +210,7 @@ class AlignmentTerm:
             scan's stamp.
         config: how to match.
         l_velocities: for each scan (3,) over ground of objects that move, in the scan's LiDAR frame [m/s], by
-            class and number within the scan. Where the image falls into another interval than the one that
-            begins with the scan, these objects are left out.
+            class and number within the scan.
     """
 
     scans: Scan | ScanFeatures | Sequence[Scan | ScanFeatures]
@@ -274,7 +279,7 @@ class AlignmentTerm:
 
         Args:
             values: with extrinsic, offset, biases and the poses around the image.
-            kernel_px: scale of the robust kernel [px]; ``GATE`` times it is the search range.
+            kernel_px: scale of the robust kernel of contours [px]; ``GATE`` times it is the search range.
             information: what the image counts, over what its matches would by themselves.
         """
         place = self.place(values)
@@ -294,9 +299,10 @@ class AlignmentTerm:
             return TermRows.none()
         scan_ns, wTl = self.features[place.scan].stamp_ns, self._wTl(values, place.between.X_s)
         found, parts = matches.found, []
-        for c, alignment, numbers, (r, J) in zip(
+        for c, alignment, of_object, numbers, (r, J) in zip(
             found.classes,
             found.alignments,
+            found.sides,
             sides.of(scan_ns, found, wTl),
             self.residuals_of(matches, values),
             strict=True,
@@ -305,6 +311,9 @@ class AlignmentTerm:
             weights = alignment.weights * alignment.kernel.weight(r / alignment.sigmas_px)
             columns = np.zeros((len(r), COLUMNS))
             columns[:, :7], columns[:, bias_column(c)] = J, 1.0
+            if c == SemanticClass.OBJECT:
+                beams = position_columns(of_object, alignment.sigmas_px, self.config.match)
+                columns[:, POSITIONS] = beams[:, :2]
             parts.append(TermRows(columns, r, weights, alignment.sigmas_px, numbers))
         return TermRows.joined(parts)
 
@@ -358,15 +367,11 @@ class AlignmentTerm:
         biases_px = {c: keys.bias(values, c) for c in keys.biases_px}
         calibration = CameraCalibration(self.camera, keys.extrinsic(values), keys.offset(values), biases_px)
         l_twist, l_acceleration = self._in_lidar(twist + late_s * acceleration), self._in_lidar(acceleration)
-        motion = (
-            ScanMotion(l_twist, l_acceleration, moving)
-            if lTs is None
-            else ScanMotion(l_twist, l_acceleration, lTs=lTs, from_ns=place.stamp_a_ns)
-        )
+        from_ns = None if lTs is None else place.stamp_a_ns
+        motion = ScanMotion(l_twist, l_acceleration, moving, lTs, from_ns)
         kernel = RobustKernel("geman_mcclure", kernel_px)
         matching = FrameMatching(self.config.classes, kernel, self.config.match)
-        of_scan = scan if lTs is None else _without(scan, moving)
-        return align_frame(of_scan, self.image, calibration, motion, matching)
+        return align_frame(scan, self.image, calibration, motion, matching)
 
     def _in_lidar(self, b_twist: FloatArray) -> FloatArray:
         if self.keys.bTl is None:
@@ -381,14 +386,3 @@ class AlignmentTerm:
         aTs = values.atPose3(between.X_a).between(values.atPose3(between.X_s))
         bTl = self.keys.bTl
         return aTs if bTl is None else bTl.inverse() * aTs * bTl
-
-
-def _without(scan: ScanFeatures, moving: Mapping[ObjectName, Any]) -> ScanFeatures:
-    """A scan without the objects that move."""
-    if not moving:
-        return scan
-    kept = {}
-    for c, points in scan.boundaries.items():
-        numbers = [n for of, n in moving if of == c]
-        kept[c] = points.take(np.flatnonzero(~np.isin(points.objects, numbers)))
-    return replace(scan, boundaries=kept)

@@ -16,6 +16,10 @@ The mask bias of a class for which it is no variable shifts the estimate. It is 
 if it were a variable (a score test); the larger of that and :data:`MASK_BIAS_PX` is considered in C
 (Schmidt).
 
+Edges of objects without a class (``OBJECT``) err together in more ways, which no residual shows. Where they
+lie between the beams is considered as common to all upper edges, and to all at the sides, as in
+``calibrate`` (:mod:`sst_graph.batch.by_edges.covariance`); its floor counts with their share of the estimate.
+
 Along a direction that the data hardly determine, as forward against later at one speed, a common error of a
 pixel is many times what independent matches leave: there the two covariances differ most.
 """
@@ -29,13 +33,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from sst_graph.batch.by_edges.covariance import FLOOR
 from sst_graph.covariance.error_model import ErrorModel, SideResiduals, fit_error_model
 from sst_graph.covariance.observability import limits_of_unknowns, weak_directions
 from sst_graph.covariance.sums import ScoreSums
 from sst_graph.errors import EstimationError
 from sst_graph.graph.linear import covariance_root
 from sst_graph.result import WeakDirection
-from sst_graph.slam.alignment_keys import COLUMNS, AlignmentKeys, bias_column
+from sst_graph.slam.alignment_keys import COLUMNS, POSITIONS, AlignmentKeys, bias_column
 from sst_graph.slam.alignment_term import TermMatches, TermRows
 from sst_graph.slam.config import RematchConfig
 from sst_graph.slam.object_sides import ObjectSides
@@ -145,11 +150,13 @@ class TermSums:
 
     Attributes:
         claimed: (n, n) information in the graph, sum of q w J J' / sigma^2 with q the factor's scale.
+        by_edges: (n, n) part of it by edges of objects without a class.
         scores: of the errors of sides [px] and, over sigma / sqrt(w), of single matches.
         gradient: (n,) sum of q w J r / sigma^2.
     """
 
     claimed: FloatArray = field(default_factory=lambda: np.zeros((COLUMNS, COLUMNS)))
+    by_edges: FloatArray = field(default_factory=lambda: np.zeros((COLUMNS, COLUMNS)))
     scores: ScoreSums = field(default_factory=lambda: ScoreSums.none(COLUMNS))
     gradient: FloatArray = field(default_factory=lambda: np.zeros(COLUMNS))
 
@@ -160,11 +167,16 @@ class TermSums:
         J = rows.J * roots[:, None]
         scores = ScoreSums.of_frame(J, roots, rows.sides)
         gradient = np.asarray(information * (J.T @ (roots * rows.r)))
-        return cls(information * scores.independent, scores.scaled(information), gradient)
+        edges = J[rows.J[:, bias_column(SemanticClass.OBJECT)] > 0.0]
+        by_edges = information * (edges.T @ edges)
+        return cls(information * scores.independent, by_edges, scores.scaled(information), gradient)
 
     def __add__(self, other: TermSums) -> TermSums:
         return TermSums(
-            self.claimed + other.claimed, self.scores + other.scores, self.gradient + other.gradient
+            self.claimed + other.claimed,
+            self.by_edges + other.by_edges,
+            self.scores + other.scores,
+            self.gradient + other.gradient,
         )
 
 
@@ -208,7 +220,7 @@ class Robust:
     """A cluster-robust covariance.
 
     Attributes:
-        covariance: (7, 7), mask biases that are no variables considered.
+        covariance: (7, 7), mask biases that are no variables and what edges have in common considered.
         clustered: (7, 7) without them: errors that matches share, and their own.
         independent: (7, 7) part of it by errors that no two matches share.
         mask_biases_px: estimate and sigma of each class's that is no variable.
@@ -238,6 +250,7 @@ def robust_covariance(P: FloatArray, sums: TermSums, errors: ErrorModel, keys: A
     for c, (bias, _) in biases.items():
         step = max(abs(bias), MASK_BIAS_PX) * P @ sums.claimed[:, bias_column(c)]
         considered += np.outer(step, step)
+    considered += _by_common_edges(P, sums.by_edges)
     C = clustered + considered
     return Robust(_symmetric(C), _symmetric(clustered), _symmetric(independent), biases)
 
@@ -250,6 +263,13 @@ def _by_the_rest(P: FloatArray, claimed: FloatArray) -> FloatArray:
     root, _ = covariance_root(P)
     shares, axes = np.linalg.eigh(root.T @ claimed @ root)
     return np.asarray((root @ axes * np.clip(1.0 - shares, 0.0, 1.0)) @ (root @ axes).T)
+
+
+def _by_common_edges(P: FloatArray, by_edges: FloatArray) -> FloatArray:
+    """What all edges of objects without a class have in common: positions between the beams, and the floor
+    of ``calibrate``, where they alone decide."""
+    share, steps = P @ by_edges[:, :7], P @ by_edges[:, POSITIONS]
+    return np.asarray(steps @ steps.T + (share * FLOOR**2) @ share.T)
 
 
 def _held_biases(

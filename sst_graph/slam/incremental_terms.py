@@ -31,21 +31,22 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.solving import moved_px, proximal
-from sst_graph.slam.term_warnings import TermWarning, last_warnings, wide_uncertainty
+from sst_graph.slam.solving import moved_px, proximal, widest_px
+from sst_graph.slam.term_warnings import TermWarning, far_from_start, last_warnings, wide_uncertainty
 
 FloatArray = NDArray[np.float64]
 
 Solver = gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
 
 
-_REMATCH_PX = 0.3
-"""A term is matched again when the estimate has moved its points by more (RMS) [px]."""
+_REMATCH_PX, _REMATCH_SHARE = 0.3, 0.075
+"""A term is matched again when the estimate has moved its points by more (RMS) [px], or, under a narrow
+kernel, by more than this share of it: less than what counts as calm."""
 _ROUNDS = 2
 """Most rounds of matching an update: bounds its time; the next update goes on."""
-_KNOWN = 0.5
-"""The kernel is narrowed only when extrinsic and offset are known to less than this share of it in the image
-(one sigma): a single image must not decide."""
+_KNOWN, _KNOWN_PX = 0.5, 1.0
+"""The kernel is narrowed only when extrinsic and offset are known to less than this share of it in the image,
+or to less than a pixel (one sigma): a single image must not decide."""
 _RESCALE = 0.2
 """The factors are made again when the scale of their information is off by more than this share."""
 
@@ -88,6 +89,7 @@ class IncrementalTerms:
         self._held, self._information = True, 1.0
         self._sides = ObjectSides()
         self._gone = TermSums()
+        self._start: tuple[gtsam.Values, FloatArray] | None = None
 
     def update(
         self,
@@ -129,7 +131,7 @@ class IncrementalTerms:
             before, estimate = estimate, self._solver.calculateEstimate()
             if alone is not None:
                 first_warnings = wide_uncertainty(self._matches(), before, alone, self._config)
-                alone = None
+                self._start, alone = (before, alone), None
             covariance, found, converged = self._anneal(estimate)
             if converged:
                 break
@@ -140,6 +142,9 @@ class IncrementalTerms:
             if found is not None:
                 P, cTl = self._marginal()[:7, :7], self._keys.extrinsic(estimate)
                 warnings = warnings + covariance_warnings(P, found, cTl, self._config)
+            if self._start is not None:
+                start, known = self._start
+                warnings = warnings + far_from_start(self._keys, start, estimate, known)
         return IncrementalUpdate(
             estimate,
             covariance,
@@ -155,8 +160,9 @@ class IncrementalTerms:
         config = self._config
         P, matches = self._marginal(), self._matches()
         sigma_px = wide_uncertainty(matches, estimate, P[:7, :7], config, 0.0)
-        known = bool(sigma_px) and sigma_px[0].value < _KNOWN * self._kernel_px
-        calm = moved_px(matches, estimate) < CALM * self._kernel_px
+        widest = widest_px(matches, self._kernel_px)
+        known = bool(sigma_px) and sigma_px[0].value < max(_KNOWN * widest, _KNOWN_PX)
+        calm = moved_px(matches, estimate) < CALM * widest
         if self._kernel_px > config.last_px:
             if calm and known:
                 self._kernel_px = config.narrower(self._kernel_px)
@@ -203,7 +209,8 @@ class IncrementalTerms:
         removed += self._slots_of(self._proximal)
         self._proximal = {}
         if self._held and matches_now:
-            for prior in _factors(proximal(matches_now, estimate, self._kernel_px, self._keys)):
+            widest = widest_px(matches_now, self._kernel_px)
+            for prior in _factors(proximal(matches_now, estimate, widest, self._keys)):
                 graph.add(prior)
                 owners.append(None)
         if graph.size() or removed:
@@ -224,7 +231,7 @@ class IncrementalTerms:
             matches.kernel_px != self._kernel_px
             or matches.information != self._information
             or matches.left_interval_s(estimate) > 0.0
-            or matches.moved_px(estimate) > _REMATCH_PX
+            or matches.moved_px(estimate) > min(_REMATCH_PX, _REMATCH_SHARE * matches.scale_px)
         )
 
     def _retire(self, estimate: gtsam.Values) -> None:

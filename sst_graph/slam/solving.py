@@ -36,7 +36,13 @@ from sst_graph.slam.covariance import (
     total,
 )
 from sst_graph.slam.object_sides import ObjectSides
-from sst_graph.slam.term_warnings import TermWarning, WarningKind, last_warnings, wide_uncertainty
+from sst_graph.slam.term_warnings import (
+    TermWarning,
+    WarningKind,
+    far_from_start,
+    last_warnings,
+    wide_uncertainty,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -95,19 +101,21 @@ def solve_with_terms(
     parameters = gtsam.LevenbergMarquardtParams()
     parameters.setMaxIterations(_INNER_ITERATIONS)
     matches = match_all(terms, values, kernel_px, 1.0)
-    warnings = wide_uncertainty(matches, values, marginal(graph, values, keys)[:7, :7], config)
+    start, alone = values, marginal(graph, values, keys)[:7, :7]
+    warnings = wide_uncertainty(matches, values, alone, config)
     converged, rounds = False, 0
     while not converged and rounds < config.most_rounds:
         whole = with_factors(graph, matches)
         if held:
-            whole.push_back(proximal(matches, values, kernel_px, keys))
+            whole.push_back(proximal(matches, values, widest_px(matches, kernel_px), keys))
         values = gtsam.LevenbergMarquardtOptimizer(whole, values, parameters).optimize()
         moved, rounds = moved_px(matches, values), rounds + 1
+        calm = moved < CALM * widest_px(matches, kernel_px)
         if kernel_px > config.last_px:
-            if moved < CALM * kernel_px:
+            if calm:
                 kernel_px = config.narrower(kernel_px)
         elif held:
-            held = moved >= CALM * kernel_px
+            held = not calm
         else:
             converged = moved < _STEP_PX
         matches = match_all(terms, values, kernel_px, 1.0)
@@ -125,6 +133,7 @@ def solve_with_terms(
     if not converged:
         warnings.append(TermWarning(WarningKind.NOT_CONVERGED, moved, _STEP_PX, "px"))
     warnings += last_warnings(matches, values, C, config)
+    warnings += far_from_start(keys, start, values, alone)
     warnings += covariance_warnings(
         marginal(whole, values, keys)[:7, :7], robust, keys.extrinsic(values), config
     )
@@ -156,6 +165,11 @@ def with_factors(
         if each.factor is not None:
             whole.add(each.factor)
     return whole
+
+
+def widest_px(matches: Sequence[TermMatches], kernel_px: float) -> float:
+    """Widest kernel of any of the matches [px]; ``kernel_px`` where there is none."""
+    return max((each.scale_px for each in matches if each.factor is not None), default=kernel_px)
 
 
 def moved_px(matches: Sequence[TermMatches], values: gtsam.Values) -> float:

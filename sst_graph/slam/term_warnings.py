@@ -11,16 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.association.edge_matching import GATE
+from sst_graph.graph.linear import covariance_root
+from sst_graph.slam.alignment_keys import AlignmentKeys
 from sst_graph.slam.alignment_term import TermMatches
 from sst_graph.slam.config import RematchConfig
 
 FloatArray = NDArray[np.float64]
 
 
+MOST_SIGMAS = 4.3
+"""An estimate farther from the start contradicts what was known there: chi-squared of 7 exceeds its square
+once in a hundred [sigma]."""
+
+
 class WarningKind(Enum):
     """What may be wrong with a solution."""
 
     WIDE_UNCERTAINTY = "the calibration is less certain than the matches reach"
+    FAR_FROM_START = "the estimate lies farther from the start than the rest of the graph allows"
     LEFT_INTERVAL = "stamp + offset has left the interval between its two poses"
     NO_MATCHES = "terms without a factor"
     NOT_CONVERGED = "matching again still moves the matched points"
@@ -74,12 +82,33 @@ def wide_uncertainty(
     found = [(each, each.term) for each in matches if each.factor is not None and each.term is not None]
     if not found:
         return []
-    limit = GATE * found[0][0].kernel_px if reach_px is None else reach_px
+    limit = GATE * max(each.scale_px for each, _ in found) if reach_px is None else reach_px
     if not np.isfinite(covariance).all():
         return [TermWarning(WarningKind.WIDE_UNCERTAINTY, float("inf"), limit, "px")]
     sigmas = [each.predicted_sigma_px(values, covariance) for each, _ in found]
     sigma_px = float(np.sqrt(np.mean(np.square(sigmas))))
     return [TermWarning(WarningKind.WIDE_UNCERTAINTY, sigma_px, limit, "px")] if sigma_px > limit else []
+
+
+def far_from_start(
+    keys: AlignmentKeys, start: gtsam.Values, values: gtsam.Values, covariance: FloatArray
+) -> list[TermWarning]:
+    """A warning where matches have led to another calibration than was known at the start.
+
+    Args:
+        covariance: (7, 7) of extrinsic and offset at the start, by all but the matches.
+    """
+    if not np.isfinite(covariance).all():
+        return []
+    step = np.append(
+        gtsam.Pose3.Logmap(keys.extrinsic(start).between(keys.extrinsic(values))),
+        keys.offset(values) - keys.offset(start),
+    )
+    _, whiten = covariance_root(covariance)
+    sigmas = float(np.linalg.norm(whiten @ step))
+    if sigmas <= MOST_SIGMAS:
+        return []
+    return [TermWarning(WarningKind.FAR_FROM_START, sigmas, MOST_SIGMAS, "sigma")]
 
 
 def last_warnings(

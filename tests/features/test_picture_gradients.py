@@ -37,6 +37,28 @@ def test_the_centre_of_an_edge(degrees: float, away: float) -> None:
     np.testing.assert_allclose(found.feet[0], [80.0, 60.0], atol=0.25)
 
 
+@pytest.mark.parametrize("scale_px", [1.2, 3.0, 6.0])
+def test_the_peak_is_met_at_once(scale_px: float) -> None:
+    """The centre of mass lies between pixel and peak, by the share that the peak's own width leaves."""
+    gradients = PictureGradients.of(step_picture(0.0))
+    outward, away = np.array([[1.0, 0.0]]), 0.8 * scale_px
+    pixels = np.array([[80.0 + away, 60.0]])
+    centre, peak = (
+        nearest_edges([gradients], [(0, 1)], pixels, outward, scale_px, peaks) for peaks in (False, True)
+    )
+    assert abs(peak.feet[0, 0] - 80.0) < 0.12 * scale_px < 0.3 * away
+    assert peak.distances[0] >= centre.distances[0]
+    # the information of the step is that of the strengths' sum under the Gaussian: its second derivative
+    stiffness = centre.distances[0] / peak.distances[0]
+    assert peak.shares[0] == pytest.approx(stiffness * centre.shares[0], rel=1e-6)
+    step = 0.05 * scale_px
+    near = [
+        nearest_edges([gradients], [(0, 1)], pixels + np.array([d, 0.0]), outward, scale_px).distances[0]
+        for d in (-step, step)
+    ]
+    assert (near[1] - near[0]) / (2.0 * step) == pytest.approx(stiffness, abs=0.1)
+
+
 def test_no_edge_along_its_own_direction_or_on_plain_ground() -> None:
     gradients = PictureGradients.of(step_picture(0.0))
     pixels, outward = np.array([[80.0, 60.0], [30.0, 60.0]]), np.array([[0.0, 1.0], [1.0, 0.0]])
