@@ -5,17 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import os
-import signal
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
-from tqdm import tqdm
-
+from sst_graph.cli.commands.batch.ending import children_ended
+from sst_graph.cli.commands.batch.progress import ProgressOnStderr
 from sst_graph.cli.inputs import calibration_settings
 from sst_graph.cli.messages import complain, mention
 from sst_graph.cli.options import SOURCE_DEFAULTS
@@ -26,7 +20,6 @@ from sst_graph.fleet import (
     Limits,
     Outcome,
     Place,
-    Progress,
     WalkConfig,
     find_drives,
     open_batch,
@@ -34,12 +27,9 @@ from sst_graph.fleet import (
     with_vehicles,
     write_summary,
 )
-from sst_graph.fleet.isolated import end_all
 from sst_graph.fleet.summary.page import counts_line
 from sst_graph.reference import load_initial
 
-_LINE_EVERY_S = 30.0
-"""Between lines of progress where no person watches."""
 _MOST_SAID = 10
 
 
@@ -53,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     out = Place.of(args.out)
     out = Place(os.path.abspath(out.url)) if out.is_local else out
     _check_apart(drives, out)
-    with open_batch(out, config.options), _children_ended(), _Told() as told:
+    with open_batch(out, config.options), children_ended(), ProgressOnStderr() as told:
         records = run_batch(drives, out, config, told)
         told.close()
         outcome = write_summary(drives, records, out, config)
@@ -131,96 +121,6 @@ def _check_apart(drives: list[Drive], out: Place) -> None:
             raise ConfigError(
                 f"--out {out}: found the drive {drive.place} in it or around it, expected two places"
             )
-
-
-@contextmanager
-def _children_ended() -> Iterator[None]:
-    """What ends this process ends those of its drives first; so does an error."""
-    former = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-
-    def end(number: int, frame: FrameType | None) -> None:
-        for one in former:
-            signal.signal(one, signal.SIG_IGN)
-        complain("ending the drives that run; the same command goes on from here")
-        end_all()
-        before = former[signal.Signals(number)]
-        if callable(before):
-            before(number, frame)
-        raise KeyboardInterrupt
-
-    in_main = _is_main_thread()
-    for number, before in former.items():
-        if in_main and before is not signal.SIG_IGN:
-            signal.signal(number, end)
-    try:
-        yield
-    except BaseException:
-        end_all()
-        raise
-    finally:
-        for number, before in former.items():
-            if in_main and before is not None:
-                signal.signal(number, before)
-
-
-def _is_main_thread() -> bool:
-    import threading
-
-    return threading.current_thread() is threading.main_thread()
-
-
-class _Told:
-    """Progress on stderr: a bar where a person watches, else a line now and then."""
-
-    def __init__(self) -> None:
-        self._bar: tqdm | None = None
-        self._said = time.monotonic()
-
-    def __enter__(self) -> _Told:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def __call__(self, progress: Progress) -> None:
-        """Show where the batch stands; name a drive that failed."""
-        if sys.stderr.isatty():
-            self._draw(progress)
-        elif time.monotonic() - self._said > _LINE_EVERY_S:
-            self._said = time.monotonic()
-            complain(progress_line(progress))
-        if progress.last is not None and not progress.last.has_result:
-            if self._bar is not None:
-                self._bar.clear()
-            complain(f"{progress.last.drive}: {progress.last.status}: {progress.last.reason}")
-
-    def _draw(self, progress: Progress) -> None:
-        if self._bar is None:
-            self._bar = tqdm(
-                total=progress.total, initial=progress.earlier, desc="drives", file=sys.stderr, leave=False
-            )
-        self._bar.set_postfix_str(f"{progress.without_result} without result", refresh=False)
-        self._bar.update(progress.done - self._bar.n)
-
-    def close(self) -> None:
-        """Take the bar away."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-
-def progress_line(progress: Progress) -> str:
-    """Where a batch stands, in words."""
-    left = "" if progress.left_s is None else f", {_duration(progress.left_s)} left"
-    failed = f", {progress.without_result} without result" if progress.without_result else ""
-    return f"{progress.done} of {progress.total} drives{failed}, {progress.per_hour:.0f} an hour{left}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90.0:
-        return f"{seconds:.0f} s"
-    minutes = seconds / 60.0
-    return f"{minutes:.0f} min" if minutes < 90.0 else f"{minutes / 60.0:.1f} h"
 
 
 def _say(outcome: Outcome, out: Place) -> None:
