@@ -1,6 +1,6 @@
 """How many small faults in ``factors/`` the tests of ``tests/factors`` find.
 
-    python benchmarks/mutation.py [--sample 600] [--seed 0] [--only hand_eye] [--out tried.jsonl]
+    python checks/mutation.py [--sample 600] [--seed 0] [--only hand_eye] [--out tried.jsonl]
 
 A mutant is the source of one module with one place changed by an operator of mutmut: a number, an operator,
 a comparison, a keyword, an argument, an assignment, an arm of a conditional. Each runs the tests in a forked

@@ -1,6 +1,6 @@
 """What labels by networks cost against exact ones: small networks fitted to some streets, tried on others.
 
-    python benchmarks/network_labels.py --out out/networks [--train 14 --streets 6] [--networks DIR]
+    python -m studies.networks.network_labels --out out/networks [--train 14 --streets 6] [--networks DIR]
 
 Prints a table: intersection over union of the vehicles of both sides, and the errors of calibrations with
 exact labels, with labels of the networks on one side, and on both.
@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.small_networks import Fit, write_image_network, write_scan_network
 from sst_graph.batch import CalibrationConfig, calibrate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.metrics import CalibrationErrors, calibration_errors
@@ -28,6 +27,7 @@ from sst_graph.segmentation import (
 )
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import SemanticClass, Source
+from studies.networks.small_networks import Fit, write_image_network, write_scan_network
 
 HALF_SIZE = {
     "width": 621,

@@ -1,7 +1,7 @@
 """Calibration by edges on streets of two simulators and on real drives: errors, sigmas, NEES. Prints a table.
 
-    OMP_NUM_THREADS=1 python benchmarks/edges_streets.py                 six streets of each simulator
-    OMP_NUM_THREADS=1 python benchmarks/edges_streets.py own-504 third-900 ../shared/data/DRIVE
+    OMP_NUM_THREADS=1 python -m studies.edges_streets                 six streets of each simulator
+    OMP_NUM_THREADS=1 python -m studies.edges_streets own-504 third-900 ../shared/data/DRIVE
 
 Starts are within 4.4 deg and 10 cm by axis. Errors are in the LiDAR's axes: roll, pitch, yaw; forward, left,
 up. Real drives are read with ``--image-shift 1``; their reference is taken for exact.
@@ -16,12 +16,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-# The directory of a script is on its path.
-from third_street import ThirdConfig, ThirdStreet
-
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Source
+from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
 FloatArray = NDArray[np.float64]
 STREETS = [*(f"own-{seed}" for seed in range(504, 510)), *(f"third-{seed}" for seed in range(900, 906))]

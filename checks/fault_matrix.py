@@ -1,7 +1,7 @@
 """Every command under every fault: kills, signals, a full disk, broken streams, a second writer.
 
-    python benchmarks/fault_matrix.py --moments 50 --out faults.md
-    python benchmarks/fault_matrix.py --moments 5 --rows kill,resume --commands simulate,track
+    python checks/fault_matrix.py --moments 50 --out faults.md
+    python checks/fault_matrix.py --moments 5 --rows kill,resume --commands simulate,track
 
 Prints one Markdown table; exit code 1 if a row has a failure. A run fails if an output is neither what it was
 nor what a run to its end makes of it (byte for byte), if something is left behind that the next run does not

@@ -1,13 +1,13 @@
 """A simulated fleet through ``sst-graph batch``, sequentially and on two workers that are killed at random.
 
-    python benchmarks/fleet.py --vehicles 10 --drives 20 --out out/fleet
+    python studies/fleet.py --vehicles 10 --drives 20 --out out/fleet
 
 makes the drives (kept in OUT/drives, so a second run starts at once), calibrates them one after the other by
 ``sst-graph calibrate``, then by ``sst-graph batch`` while processes of drives are killed at random and the
 batch itself is killed once and resumed, and compares: every result there, each byte-equal to the sequential
 one, the changed vehicles found, no other accused. Prints one Markdown table.
 
-    python benchmarks/fleet.py --empty 100000 --out out/empty
+    python studies/fleet.py --empty 100000 --out out/empty
 
 runs drives of no work through the scheduler's own code: what it adds to each, its memory, the summary.
 """

@@ -1,7 +1,7 @@
 """The joint method on streets of other simulators (second_street.py, third_street.py). Prints a table.
 
-    OMP_NUM_THREADS=1 python benchmarks/second_simulator.py --streets 6
-    OMP_NUM_THREADS=1 python benchmarks/second_simulator.py --streets 6 --simulator third
+    OMP_NUM_THREADS=1 python studies/simulators/second_simulator.py --streets 6
+    OMP_NUM_THREADS=1 python studies/simulators/second_simulator.py --streets 6 --simulator third
 
 Starts are uniform within 12 deg by axis and 10 cm; ``--init none`` gives none.
 """

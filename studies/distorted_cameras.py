@@ -4,7 +4,7 @@ Each street is driven through once a lens. Its images are rectified, and calibra
 pinhole with the rectified camera's intrinsics takes of the same street. The table has the median errors of
 both, and their ratio.
 
-    python benchmarks/distorted_cameras.py --streets 4
+    python studies/distorted_cameras.py --streets 4
 
 A rectified fisheye has fewer raw pixels than its pinhole: towards the rim the pinhole is up to three times as
 fine as the lens. With ``--pinhole pixels`` the pinhole has as many pixels as the lens spends on that field.

@@ -1,6 +1,6 @@
 """Drift mode against a known random walk: is it followed, and do the history's sigmas cover it? Prints JSON.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracker_drift.py --streets 5
+    OMP_NUM_THREADS=1 python -m studies.tracker_drift --streets 5
 
 Each street: a simulated drive (half-size pictures) is played forth and back while the camera yaws by a random
 walk of the rate that the tracker assumes, and its clock walks too. The masks are warped and the stamps moved.
@@ -16,14 +16,14 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from tracker_run import PERIOD_NS, endless
-from tracker_steps import Step
 
+from benchmarks.tracker_run import PERIOD_NS, endless
 from sst_graph import Tracker, TrackerConfig
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
 from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.window.epochs import EPOCH_S
 from sst_graph.types import Frame
+from studies.tracker_steps import Step
 
 DRIFT = DriftConfig(enabled=True, rotation_deg=0.05, translation_m=0.0005, time_offset_s=0.001)
 

@@ -1,8 +1,8 @@
 """A seeded fuzzer of all that is read: drives, calibrations, marginals, settings, checkpoints, commands.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.fuzz --seed 1 --count 20000
+    OMP_NUM_THREADS=1 python -m checks.fuzz --seed 1 --count 20000
 
-Valid tiny files of every kind are mutated (benchmarks/fuzz_mutations.py) and read in a worker process whose
+Valid tiny files of every kind are mutated (checks/fuzz_mutations.py) and read in a worker process whose
 memory is limited. Right ends are a value, an error of the package (one printable line), and for a command
 exit 0, 2 (one line on stderr) or 3. Wrong are any other exception, more than 5 s (of the processor), more
 than 1 GB, a process that dies, and lines of libraries. ``--kind calibrate`` runs whole calibrations
@@ -36,8 +36,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks import fuzz_layouts
-from benchmarks import fuzz_mutations as m
+from checks import fuzz_layouts
+from checks import fuzz_mutations as m
 from sst_graph import CalibrationConfig, Tracker, TrackerConfig, calibrate, open_source
 from sst_graph.cli import main as command
 from sst_graph.cli.options import EXPORTS

@@ -1,7 +1,7 @@
 """Steps of mount and clock in mid-drive: which sizes are found, and what is found on clean drives.
 
-    OMP_NUM_THREADS=1 python benchmarks/contradictions.py --streets 6
-    OMP_NUM_THREADS=1 python benchmarks/contradictions.py --streets 50 --clean
+    OMP_NUM_THREADS=1 python studies/contradictions.py --streets 6
+    OMP_NUM_THREADS=1 python studies/contradictions.py --streets 50 --clean
 
 Small simulated streets of 30 frames at half the usual size. The joint solution starts at the truth, without a
 global search, and the stamps' rhythm is not looked at: what is found is found by the drive's stretches alone.

@@ -1,7 +1,7 @@
 """Steps of the calibration on streets of all kinds: how soon noticed, and what is learnt. Prints Markdown.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracker_steps.py
-    OMP_NUM_THREADS=1 python benchmarks/tracker_steps.py --seed 760 --streets 4
+    OMP_NUM_THREADS=1 python studies/tracker_steps.py
+    OMP_NUM_THREADS=1 python studies/tracker_steps.py --seed 760 --streets 4
 
 Each street: a simulated drive (time offset 100 ms, label noise 1) is tracked from a guess 2 deg and 9 cm off,
 and goes on from a checkpoint several times: as it was, with the camera knocked, and with its clock jumping.

@@ -2,7 +2,7 @@
 
 Each street is driven through once, 4 s by default. The camera of 10 Hz takes the images at the scans' stamps.
 
-    python -m benchmarks.camera_rate --streets 8
+    python -m studies.camera_rate --streets 8
 """
 
 from __future__ import annotations

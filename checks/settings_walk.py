@@ -1,7 +1,7 @@
 """Every setting of ``calibrate`` and ``track`` at its lowest and its highest value, on a tiny street.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.settings_walk [--only noise.] [--seconds 60] [--memory-gb 4]
-    OMP_NUM_THREADS=1 python -m benchmarks.settings_walk --part 3/4
+    OMP_NUM_THREADS=1 python -m checks.settings_walk [--only noise.] [--seconds 60] [--memory-gb 4]
+    OMP_NUM_THREADS=1 python -m checks.settings_walk --part 3/4
 
 Each case must end in a result or in a typed error (:class:`sst_graph.errors.SstGraphError`) within the time
 and the memory; the others are printed, and the exit code is 1 if there are any. Cases run in a process of

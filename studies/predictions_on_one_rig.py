@@ -4,7 +4,7 @@ A simulated drive of 42 frames (standing, accelerating, turning) is cut: its fir
 and predict the sigmas that 14 and 28 frames more will give, with the record's average view and the motion
 that these frames then have; the first 28 and all 42 frames are calibrated too. Prints claimed over predicted.
 
-    python benchmarks/predictions_on_one_rig.py 21 22
+    python studies/predictions_on_one_rig.py 21 22
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Drives made wrong on purpose, each in one way that happens to people: units, axes, sizes, stamps, labels.
 
-``INPUT_FAULTS`` maps the name of each to a function of the drive; benchmarks/wrong_input.py tries them.
+``INPUT_FAULTS`` maps the name of each to a function of the drive; studies/wrong_input.py tries them.
 """
 
 from __future__ import annotations

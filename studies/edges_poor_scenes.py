@@ -1,6 +1,6 @@
 """Calibration by edges where a scene tells little: between walls, through a forest. Prints a table.
 
-    OMP_NUM_THREADS=1 python benchmarks/edges_poor_scenes.py [--seeds 2] [--frames 15]
+    OMP_NUM_THREADS=1 python studies/edges_poor_scenes.py [--seeds 2] [--frames 15]
 
 No result that is off by more than a degree may be ``ok``. Starts are 4 deg and 7 cm off.
 """

@@ -1,7 +1,7 @@
 """Drives made wrong on purpose, calibrated as a user would: status, named cause, error. Prints a table.
 
-    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --seeds 201 202
-    OMP_NUM_THREADS=1 python benchmarks/wrong_input.py --drive DATA --faults "Tr inverted" clean
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --seeds 201 202
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --drive DATA --faults "Tr inverted" clean
 
 Streets have 30 frames (--frames) of 621x188 px, and start from the pose that the data bring. --quick leaves
 the solution out where something is certain before it: the status is then never ok.

@@ -4,7 +4,7 @@ Two synthetic drives of six frames (80 silhouette matches each, sigma 3 px, Gema
 a mask bias free), the second's calibration set apart from the first's by so many sigmas. Prints medians over
 six pairs.
 
-    python benchmarks/marginal_disagreement.py
+    python studies/marginal_disagreement.py
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Labels and edges in one estimate: labels in a part of the frames, and edges in labelled frames too.
 
-    OMP_NUM_THREADS=1 python benchmarks/labels_and_edges.py part first own-504 third-900 ../shared/data/DRIVE
-    OMP_NUM_THREADS=1 python benchmarks/labels_and_edges.py part every4 ...
-    OMP_NUM_THREADS=1 python benchmarks/labels_and_edges.py same own-504 third-900 ../shared/data/DRIVE
+    OMP_NUM_THREADS=1 python -m studies.labels_and_edges part first own-504 third-900 ../shared/data/DRIVE
+    OMP_NUM_THREADS=1 python -m studies.labels_and_edges part every4 ...
+    OMP_NUM_THREADS=1 python -m studies.labels_and_edges same own-504 third-900 ../shared/data/DRIVE
 
 Real drives are read with ``--image-shift 0`` for ``part``, so that a scan's own image is the one of its
 instant, and with 1 for ``same``.
@@ -17,15 +17,13 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-# The directory of a script is on its path.
-from edges_streets import FloatArray, row, source_of, start_step
-
 from sst_graph import CalibrationConfig, calibrate, open_source
 from sst_graph.batch.by_edges.fusion import Fused
 from sst_graph.batch.method_estimate import MethodEstimate
 from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.result import CalibrationResult
 from sst_graph.types import Frame, GroundTruth, SemanticClass, Source
+from studies.edges_streets import FloatArray, row, source_of, start_step
 
 KEPT = {
     "first": lambda k, n: k < n // 2,

@@ -1,6 +1,6 @@
 """What a release must stand: sdist and wheel are built, installed into empty environments, and used.
 
-    python benchmarks/release_smoke.py [--python PATH ...]      (make release-check)
+    python checks/release_smoke.py [--python PATH ...]      (make release-check)
 
 For every Python and for the newest and the oldest versions of the dependencies that pyproject.toml
 allows: ``sst-graph --version``, the import of every module, ``simulate`` and ``calibrate`` (which must end

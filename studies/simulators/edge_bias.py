@@ -1,7 +1,7 @@
 """Where boundary points lie beside exact contours, at the true extrinsic, by side and range. Prints a table.
 
-    OMP_NUM_THREADS=1 python benchmarks/edge_bias.py --simulator third --streets 40
-    OMP_NUM_THREADS=1 python benchmarks/edge_bias.py --simulator third --streets 40 --option rays=1
+    OMP_NUM_THREADS=1 python studies/simulators/edge_bias.py --simulator third --streets 40
+    OMP_NUM_THREADS=1 python studies/simulators/edge_bias.py --simulator third --streets 40 --option rays=1
 
 One standing frame a street, vehicles only. Distances are robust means (Geman-McClure, 3 px) in pixels,
 positive outside of the contour, and their deviations by object. What sides have in common is taken up by the

@@ -18,7 +18,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from benchmarks import fuzz_mutations as m
+from checks import fuzz_mutations as m
 from sst_graph import open_source
 from sst_graph.errors import SstGraphError
 

@@ -1,7 +1,7 @@
 """Sweeps decided from the scans, on simulated streets. Prints tables.
 
-    OMP_NUM_THREADS=1 python benchmarks/sweep.py decide --streets 40      what the scans tell
-    OMP_NUM_THREADS=1 python benchmarks/sweep.py calibrate --streets 6    what it costs the calibration
+    OMP_NUM_THREADS=1 python studies/sweep.py decide --streets 40      what the scans tell
+    OMP_NUM_THREADS=1 python studies/sweep.py calibrate --streets 6    what it costs the calibration
 
 Every street has a rate of 5 to 20 Hz, a speed of 1 to 20 m/s, a sense of rotation, a start of the turn and a
 profile of the motion of its own, drawn from its seed. "compensated": measured point after point like a raw
