@@ -47,13 +47,13 @@ SAMPLE ?= 600
 
 mutate: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[mutation]'
-	$(BIN)/python benchmarks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
+	$(BIN)/python checks/mutation.py --sample $(SAMPLE) --out out/mutants.jsonl
 
 # Builds sdist and wheel and uses them in empty environments, with the newest and the oldest dependencies
 # that pyproject.toml allows, on every Python 3.11 to 3.13 that is found. Takes some minutes.
 release-check: $(INSTALLED)
 	$(PIP) install -c constraints.txt --no-build-isolation -e '.[release]'
-	$(BIN)/python benchmarks/release_smoke.py
+	$(BIN)/python checks/release_smoke.py
 
 image: $(INSTALLED)
 	docker build --build-arg VERSION=$$($(BIN)/python -m setuptools_scm) -t sst-graph .

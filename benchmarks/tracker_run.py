@@ -1,12 +1,12 @@
 """A long run of the tracker: cost of a frame, its growth, memory, alarms. Prints one JSON document.
 
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 5000 --markdown
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --checkpoint-every 10
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 300 --street heavy
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --frames 440 --step knock --step-at 340
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --frames 5000
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --frames 5000 --markdown
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --frames 300 --checkpoint-every 10
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --frames 300 --street heavy
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --frames 440 --step knock --step-at 340
 
-    OMP_NUM_THREADS=1 python benchmarks/tracker_run.py --drive DATA --image-shift 1 --checkpoint-every 10
+    OMP_NUM_THREADS=1 python -m benchmarks.tracker_run --drive DATA --image-shift 1 --checkpoint-every 10
 
 Streets: ``plain`` has about 5,000 labelled points a scan, ``heavy`` twice as many. A simulated drive (no
 time offset) is played forth and back under rising stamps: a drive reversed in time is a drive. Times are
@@ -29,7 +29,6 @@ import cv2
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from tracker_steps import Step
 
 from sst_graph import Tracker, TrackerConfig, open_source
 from sst_graph.simulator import SimulationConfig, simulate
@@ -37,6 +36,7 @@ from sst_graph.tracker.config import DriftConfig
 from sst_graph.tracker.storage.checkpoint import Saver
 from sst_graph.tracker.track_update import TrackUpdate
 from sst_graph.types import Frame
+from studies.tracker_steps import Step
 
 PERIOD_NS = 100_000_000
 WARM_UP = 100

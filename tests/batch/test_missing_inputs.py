@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fuzz import STREET
+from checks.fuzz import STREET
 from sst_graph.cli import main
 from sst_graph.simulator import simulate, write_drive
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.fault_matrix import (
+from checks.fault_matrix import (
     COMMANDS,
     Bench,
     Row,

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import sst_graph
-from benchmarks.settings_walk import Worker, cases
+from checks.settings_walk import Worker, cases
 from sst_graph.batch import CalibrationConfig
 from sst_graph.config import Range, Settings, from_dict, read_config, to_dict, walk_settings, with_overrides
 from sst_graph.errors import ConfigError, SstGraphError
@@ -245,7 +245,7 @@ def test_what_no_method_can_work_with_is_refused_with_its_bounds(setting: str, m
 
 @pytest.mark.slow
 def test_the_bounds_of_some_settings_end_in_a_result_or_a_typed_error() -> None:
-    """A sample of what ``benchmarks/settings_walk.py`` goes through."""
+    """A sample of what ``checks/settings_walk.py`` goes through."""
     quick = [case for case in cases() if not case.settings[-1].startswith("search.")]
     chosen = np.random.default_rng(8).choice(len(quick), 8, replace=False)
     worker = Worker(seconds=60.0, memory_gb=4.0)

@@ -13,8 +13,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stored import simulated
 
-from benchmarks.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
-from benchmarks.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.batch.calibrate import prepare_drives
 from sst_graph.data.kept_drive import KeptDrive
@@ -31,6 +29,8 @@ from sst_graph.odometry.sweep import SweepDecision
 from sst_graph.simulator import SimulationConfig
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import SemanticClass
+from studies.subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED, repeated_pictures
+from studies.wrong_drives import INPUT_FAULTS, NAMED, shifted_masks
 
 CLASSES = (SemanticClass.VEHICLE,)
 BY_THEMSELVES = (

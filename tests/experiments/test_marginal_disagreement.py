@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "marginal_disagreement.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "studies" / "marginal_disagreement.py"
 
 
 @pytest.fixture(scope="module")

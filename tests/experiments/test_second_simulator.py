@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from benchmarks.second_street import SecondStreet, StreetConfig
-from benchmarks.third_street import ThirdConfig, ThirdStreet
 from sst_graph import calibrate
 from sst_graph.types import SemanticClass
+from studies.simulators.second_street import SecondStreet, StreetConfig
+from studies.simulators.third_street import ThirdConfig, ThirdStreet
 
 
 def test_points_and_masks_agree() -> None:

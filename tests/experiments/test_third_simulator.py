@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from benchmarks.third_street import Hits, Solid, ThirdConfig, ThirdStreet, cast
 from sst_graph.types import SemanticClass
+from studies.simulators.third_street import Hits, Solid, ThirdConfig, ThirdStreet, cast
 
 EXACT = ThirdConfig(
     seed=3,

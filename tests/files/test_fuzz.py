@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import fuzz, fuzz_mutations
+from checks import fuzz, fuzz_mutations
 
 SEED, COUNT = 20, 1000
 IMPORTED = "from sst_graph.errors import SstGraphError"

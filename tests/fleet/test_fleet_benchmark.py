@@ -1,4 +1,4 @@
-"""A small version of benchmarks/fleet.py: a knocked vehicle, three bad drives, processes killed at random."""
+"""A small version of studies/fleet.py: a knocked vehicle, three bad drives, processes killed at random."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks import fleet
+from studies import fleet
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="finds processes by /proc")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from fleet.vehicle_drives import RIG, SIGMAS, WEEK, vehicle
 
-from benchmarks.marginal_disagreement import drive
 from sst_graph.errors import ConfigError
 from sst_graph.export import EXTRINSIC, TIME_OFFSET, fuse_marginals, marginal_of_graph
 from sst_graph.factors import extrinsic_drift, rekeyed, time_offset_drift
 from sst_graph.fleet.vehicles.walk import DriveEstimate, Smoothed, WalkConfig, passes, smoothed, walked
 from sst_graph.marginal import CalibrationMarginal
+from studies.marginal_disagreement import drive
 
 DAY_S = 86400.0
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from stored import written
 
-from benchmarks.small_networks import Fit, write_image_network, write_scan_network
 from sst_graph.cli import main
 from sst_graph.data import open_source
 from sst_graph.data.kept_drive import KeptDrive
@@ -20,6 +19,7 @@ from sst_graph.result import read_result
 from sst_graph.segmentation import open_image_segmenter, open_scan_segmenter
 from sst_graph.simulator import SimulationConfig, simulate
 from sst_graph.types import Frame, SemanticClass
+from studies.networks.small_networks import Fit, write_image_network, write_scan_network
 
 HALF_SIZE = {
     "width": 621,

@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from sst_graph.data import open_source
 from sst_graph.errors import ConfigError
 from sst_graph.experiments.paper.config import PaperTableConfig
@@ -63,15 +61,6 @@ def table_drives(config: PaperTableConfig) -> Sequence[TableDrive]:
     if len(set(names)) < len(names):
         raise ConfigError(f"data: found drives named {', '.join(names)}, expected names that differ")
     return drives
-
-
-def true_offset_ms(drive: TableDrive, config: PaperTableConfig, images_late: int) -> float | None:
-    """The time offset by the stamps [ms], or None where it is not known."""
-    if drive.street is not None:
-        return 1e3 * images_late * config.period_s
-    truth = drive.open(config, images_late).truth
-    known = None if truth is None else truth.time_offset_s
-    return None if known is None else 1e3 * float(np.float64(known))
 
 
 def _on_disk(path: str, config: PaperTableConfig) -> TableDrive:

@@ -19,7 +19,7 @@ _MAX_TURN_AGE_S = 1.0
 """An estimate is unconfirmed where the camera's orientation was not confirmed for longer [s]."""
 _MAX_OFFSET_AGE_S = 3.0
 """An estimate is unconfirmed where the time offset was not confirmed for longer, in motion [s]; chosen on
-streets 820 to 829 of ``benchmarks/tracker_steps.py``."""
+streets 820 to 829 of ``studies/tracker_steps.py``."""
 
 
 @dataclass

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from stored import simulated
 
-from benchmarks.edges_poor_scenes import SCENES, START, drive_through
 from sst_graph import CalibrationConfig, calibrate
 from sst_graph.association.edge_matching import TOP, MatchConfig, match_sigmas, sides_of
 from sst_graph.batch.by_edges.covariance import (
@@ -33,6 +32,7 @@ from sst_graph.graph.state import State
 from sst_graph.objects.tracks import object_tracks
 from sst_graph.simulator import SimulationConfig
 from sst_graph.types import SemanticClass
+from studies.edges_poor_scenes import SCENES, START, drive_through
 
 STREET = SimulationConfig(seed=504, frames=3, motion="no_stop", azimuth_limit_deg=50.0, width=621, height=188)
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from stored import simulated
 
-from benchmarks.subtle_faults import knocked
 from sst_graph import CalibrationConfig
 from sst_graph.batch.by_edges.halves import halves_reasons
 from sst_graph.batch.by_edges.parts import thinned
@@ -21,6 +20,7 @@ from sst_graph.data.kept_drive import KeptDrive
 from sst_graph.graph.outer_loop import JointProblem
 from sst_graph.graph.state import State
 from sst_graph.simulator import SimulationConfig
+from studies.subtle_faults import knocked
 
 STREET = SimulationConfig(
     seed=504,

@@ -1,0 +1,590 @@
+"""Every command under every fault: kills, signals, a full disk, broken streams, a second writer.
+
+    python checks/fault_matrix.py --moments 50 --out faults.md
+    python checks/fault_matrix.py --moments 5 --rows kill,resume --commands simulate,track
+
+Prints one Markdown table; exit code 1 if a row has a failure. A run fails if an output is neither what it was
+nor what a run to its end makes of it (byte for byte), if something is left behind that the next run does not
+remove, if there is a traceback, or if the exit code is another than docs/reference/faults.md says. Moments
+are uniform over the time that the command takes.
+
+A signal that comes before the interpreter has run the program's first line is the interpreter's: it ends the
+process as Python does (``early`` counts them; they fail only if something is left behind).
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sst_graph.errors import SstGraphError
+from sst_graph.files.staging import SUFFIX
+from sst_graph.simulator import SimulationConfig, simulate, write_drive
+from sst_graph.tracker import Tracker
+
+PROGRAM = [sys.executable, "-c", "import sys; from sst_graph.cli import main; sys.exit(main())"]
+"""What the installed script does."""
+
+STREET = SimulationConfig(
+    seed=4,
+    frames=12,
+    width=276,
+    height=84,
+    azimuth_limit_deg=50.0,
+    azimuth_step_deg=0.5,
+    vehicle_density=0.3,
+    time_offset_s=0.0,
+    rotation_error_deg=0.3,
+    translation_error_m=0.02,
+    motion="no_stop",
+    speed_mps=6.0,
+)
+SMALL = ["--frames", "3", "--set", "width=160", "--set", "height=64", "--set", "azimuth_step_deg=2"]
+TRACK = ["--set", "start_scans=4", "--set", "calibration.search.enabled=false", "--checkpoint-every", "2"]
+ENDED = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
+READER_GONE = 141
+TIMEOUT_S = 300.0
+
+State = dict[str, bytes]
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command as it is run here.
+
+    Attributes:
+        name: of the command.
+        arguments: for the folder with the inputs and the one to write into.
+        output: what it writes there, None where it only prints.
+        codes: exit codes of a run to its end.
+        prints: its result is what it prints.
+        older: arguments that make another output of the same kind, for overwriting.
+    """
+
+    name: str
+    arguments: Callable[[Path, Path], list[str]]
+    output: str | None
+    codes: tuple[int, ...] = (0,)
+    prints: bool = False
+    older: tuple[str, ...] = ()
+
+
+def _calibrate(data: Path, desk: Path) -> list[str]:
+    return ["calibrate", str(data / "street"), "--out", str(desk / "out"), "--frames", "0:3"]
+
+
+def _track(data: Path, desk: Path) -> list[str]:
+    files = ["--out", str(desk / "out.json"), "--checkpoint", str(desk / "checkpoint.npz")]
+    return ["track", str(data / "street"), *TRACK, *files]
+
+
+COMMANDS = {
+    command.name: command
+    for command in (
+        Command(
+            "simulate", lambda _, desk: ["simulate", str(desk / "out"), *SMALL], "out", older=("--seed", "9")
+        ),
+        Command("calibrate", _calibrate, "out", (0, 3), older=("--image-shift", "1")),
+        Command("track", _track, "out.json", (0, 3)),
+        Command(
+            "overlay",
+            lambda data, desk: [
+                *("overlay", str(data / "result"), str(data / "street")),
+                *("--out", str(desk / "out.png")),
+            ],
+            "out.png",
+            older=("--frame", "1"),
+        ),
+        Command(
+            "export",
+            lambda data, desk: [
+                *("export", str(data / "result"), "--force", "--to", "kalibr"),
+                *("--out", str(desk / "out.yaml")),
+            ],
+            "out.yaml",
+            older=("--to", "urdf"),
+        ),
+        Command(
+            "evaluate",
+            lambda data, _: [
+                *("evaluate", str(data / "result")),
+                *("--truth", str(data / "street/sequences/00/groundtruth.json")),
+            ],
+            None,
+            prints=True,
+        ),
+        Command(
+            "inspect",
+            lambda data, desk: ["inspect", str(data / "result"), "--plots", str(desk / "out")],
+            "out",
+            prints=True,
+        ),
+    )
+}
+
+
+@dataclass
+class Row:
+    """What a command did under a fault."""
+
+    command: str
+    fault: str
+    runs: int = 0
+    early: int = 0
+    finished: int = 0
+    failures: list[str] = field(default_factory=list)
+
+    def check(self, holds: bool, what: str) -> None:
+        """Count a failure unless it holds."""
+        if not holds:
+            self.failures.append(what)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a run ended."""
+
+    code: int
+    out: str
+    err: str
+    seconds: float
+
+
+def state(folder: Path) -> State:
+    """All files below a folder with their content, staging folders by name alone."""
+    found: State = {}
+    for path, folders, files in os.walk(folder):
+        for name in [one for one in (*folders, *files) if one.endswith(SUFFIX)]:
+            found[os.path.relpath(os.path.join(path, name), folder)] = b""
+        folders[:] = [one for one in folders if not one.endswith(SUFFIX)]
+        for name in (one for one in files if not one.endswith(SUFFIX)):
+            one = Path(path, name)
+            found[str(one.relative_to(folder))] = one.read_bytes()
+    return found
+
+
+def without_stages(found: State) -> State:
+    """A state without what is not finished."""
+    return {name: data for name, data in found.items() if not name.endswith(SUFFIX)}
+
+
+class Bench:
+    """The inputs of all commands, made once, and what each command makes of them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.data = folder, folder / "data"
+        self._whole: dict[tuple[str, ...], tuple[State, float]] = {}
+        self._number = 0
+        if not self.data.exists():
+            self.data.mkdir(parents=True)
+            write_drive(simulate(STREET), self.data / "street")
+            arguments = _calibrate(self.data, self.data)
+            self.run([*arguments[:-4], "--out", str(self.data / "result")])
+
+    def desk(self) -> Path:
+        """An empty folder to write into."""
+        self._number += 1
+        desk = self.folder / f"desk{self._number}"
+        shutil.rmtree(desk, ignore_errors=True)
+        desk.mkdir()
+        return desk
+
+    def arguments(self, command: Command, desk: Path, *more: str) -> list[str]:
+        return [*command.arguments(self.data, desk), *more]
+
+    def whole(self, command: Command, *more: str) -> tuple[State, float]:
+        """What stands in the desk after a run to its end, and how long the second such run took [s]."""
+        key = (command.name, *more)
+        if key not in self._whole:
+            for _ in range(2):
+                desk = self.desk()
+                ended = self.run(self.arguments(command, desk, *more))
+                if ended.code not in command.codes:
+                    raise RuntimeError(f"{command.name}: {ended}")
+            self._whole[key] = without_checkpoint(state(desk)), ended.seconds
+        return self._whole[key]
+
+    def start(
+        self, arguments: Sequence[str], limit: int | None = None, **streams: int | None
+    ) -> subprocess.Popen[str]:
+        """Start a command; ``limit``: bytes that any file may grow to."""
+
+        def prepare() -> None:
+            for number in ENDED:
+                signal.signal(number, signal.SIG_DFL)
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+
+        pipes: dict[str, int | None] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, **streams}
+        root = str(Path(__file__).resolve().parents[1])
+        return subprocess.Popen(
+            [*PROGRAM, *arguments],
+            text=True,
+            preexec_fn=prepare,
+            env={**os.environ, "PYTHONPATH": root},
+            cwd=self.folder,
+            **pipes,  # type: ignore[call-overload]
+        )
+
+    def run(
+        self,
+        arguments: Sequence[str],
+        send: tuple[int, float] | None = None,
+        limit: int | None = None,
+        **streams: int | None,
+    ) -> Ended:
+        """Run a command; ``send``: a signal and when [s]."""
+        begin = time.monotonic()
+        process = self.start(arguments, limit, **streams)
+        if send is not None:
+            number, moment = send
+            time.sleep(max(0.0, begin + moment - time.monotonic()))
+            process.send_signal(number)
+        out, err = process.communicate(timeout=TIMEOUT_S)
+        return Ended(process.returncode, out or "", err or "", time.monotonic() - begin)
+
+
+def without_checkpoint(found: State) -> State:
+    """A state without checkpoints: each of a run's is a valid one, and they are checked by resuming."""
+    return {name: data for name, data in found.items() if not name.startswith("checkpoint")}
+
+
+def kill(bench: Bench, command: Command, moments: Sequence[float]) -> Row:
+    """kill -9 at parts (0 to 1) of a run that makes a new output; then a run to its end."""
+    row = Row(command.name, "kill -9, new output")
+    whole, seconds = bench.whole(command)
+    desk = bench.desk()
+    for moment in moments:
+        ended = bench.run(bench.arguments(command, desk), (signal.SIGKILL, moment * seconds))
+        row.runs += 1
+        row.finished += ended.code in command.codes
+        found = without_stages(without_checkpoint(state(desk)))
+        row.check(found in ({}, whole), f"at {moment:.3f}: half an output: {sorted(found)}")
+        _check_checkpoint(row, desk)
+        if found:
+            shutil.rmtree(desk)
+            desk.mkdir()
+        elif (desk / "checkpoint.npz").exists():
+            (desk / "checkpoint.npz").unlink()
+    _check_next_run(bench, command, desk, row, whole)
+    return row
+
+
+def kill_overwriting(bench: Bench, command: Command, moments: Sequence[float]) -> Row:
+    """kill -9 while an earlier output is replaced, with somebody's notes in it."""
+    row = Row(command.name, "kill -9, --overwrite")
+    whole, seconds = bench.whole(command)
+    older, _ = bench.whole(command, *command.older)
+    notes: State = {}
+    desk = bench.desk()
+
+    def lay_out() -> None:
+        shutil.rmtree(desk)
+        desk.mkdir()
+        for name, data in older.items():
+            (desk / name).parent.mkdir(parents=True, exist_ok=True)
+            (desk / name).write_bytes(data)
+        if command.output is not None and (desk / command.output).is_dir():
+            notes[f"{command.output}/notes.txt"] = b"dear"
+            (desk / command.output / "notes.txt").write_bytes(b"dear")
+
+    lay_out()
+    for moment in moments:
+        arguments = bench.arguments(command, desk, "--overwrite")
+        ended = bench.run(arguments, (signal.SIGKILL, moment * seconds))
+        row.runs += 1
+        row.finished += ended.code in command.codes
+        found = without_stages(state(desk))
+        row.check(found in ({**older, **notes}, {**whole, **notes}), f"at {moment:.3f}: {sorted(found)}")
+        if found != {**older, **notes}:
+            lay_out()
+    _check_next_run(bench, command, desk, row, {**whole, **notes})
+    return row
+
+
+def ended_by(bench: Bench, command: Command, number: int, moments: Sequence[float]) -> Row:
+    """A signal that asks to end, at parts (0 to 1) of a run."""
+    row = Row(command.name, signal.Signals(number).name)
+    whole, seconds = bench.whole(command)
+    desk = bench.desk()
+    for moment in moments:
+        ended = bench.run(bench.arguments(command, desk), (number, moment * seconds))
+        row.runs += 1
+        found = state(desk)
+        row.check(without_checkpoint(found) in ({}, whole), f"at {moment:.3f}: left {sorted(found)}")
+        _check_checkpoint(row, desk)
+        if ended.code in command.codes:
+            row.finished += 1
+            row.check(without_checkpoint(found) == whole, f"at {moment:.3f}: {ended.code} without an output")
+        elif ended.code != ENDED[signal.Signals(number)] and _before_the_program(ended, number):
+            row.early += 1
+            row.check(not found, f"at {moment:.3f}: left {sorted(found)}")
+        else:
+            row.check(ended.code == ENDED[signal.Signals(number)], f"at {moment:.3f}: exit code {ended.code}")
+            row.check("Traceback" not in ended.err, f"at {moment:.3f}: {ended.err[-300:]}")
+        shutil.rmtree(desk)
+        desk.mkdir()
+    return row
+
+
+def full_disk(bench: Bench, command: Command, limits: Sequence[int]) -> Row:
+    """No file may grow beyond a limit, and, where a small file system can be mounted, that is full."""
+    row = Row(command.name, "disk full")
+    whole, _ = bench.whole(command)
+    for limit in limits:
+        desk = bench.desk()
+        _check_full(row, command, desk, bench.run(bench.arguments(command, desk), limit=limit), whole)
+    desk = bench.desk()
+    with mounted(desk, "size=16k") as done:
+        if done:
+            _check_full(row, command, desk, bench.run(bench.arguments(command, desk)), whole)
+    return row
+
+
+def read_only(bench: Bench, command: Command) -> Row:
+    """A place where nothing can be made: /proc, and, where one can be mounted, a read-only file system."""
+    row = Row(command.name, "read-only")
+    desk = bench.desk()
+    _check_refused(row, Path("/proc"), bench.run(bench.arguments(command, Path("/proc"))))
+    with mounted(desk, "ro") as done:
+        if done:
+            _check_refused(row, desk, bench.run(bench.arguments(command, desk)))
+    return row
+
+
+def streams(bench: Bench, command: Command) -> Row:
+    """stdout and stderr closed, full, or a pipe without a reader."""
+    row = Row(command.name, "streams")
+    whole, _ = bench.whole(command)
+    for name, code in (("full", 2), ("closed", 2), ("reader gone", READER_GONE)):
+        desk = bench.desk()
+        with broken_stream(name) as stream:
+            ended = bench.run(bench.arguments(command, desk), stdout=stream)
+        row.runs += 1
+        fails = command.prints or command.name == "track"
+        codes = (code,) if fails else command.codes
+        row.check(ended.code in codes, f"stdout {name}: exit code {ended.code}, expected {codes}")
+        row.check("Traceback" not in ended.err and "Exception ignored" not in ended.err, ended.err[-300:])
+        found = without_checkpoint(state(desk))
+        row.check(
+            found == whole or (command.name == "track" and not found), f"stdout {name}: {sorted(found)}"
+        )
+        desk = bench.desk()
+        with broken_stream(name) as stream:
+            ended = bench.run(bench.arguments(command, desk), stderr=stream)
+        row.runs += 1
+        row.check(ended.code in command.codes, f"stderr {name}: exit code {ended.code}")
+        row.check(without_checkpoint(state(desk)) == whole, f"stderr {name}: {sorted(state(desk))}")
+    return row
+
+
+def two_writers(bench: Bench, command: Command, times: int) -> Row:
+    """Two runs of one command that write one output, a little apart."""
+    row = Row(command.name, "two writers")
+    whole, seconds = bench.whole(command)
+    for apart in np.linspace(0.0, 0.8, times) * seconds:
+        desk = bench.desk()
+        first = bench.start(bench.arguments(command, desk))
+        time.sleep(apart)
+        second = bench.start(bench.arguments(command, desk))
+        ends = [(one, *one.communicate(timeout=TIMEOUT_S)) for one in (first, second)]
+        row.runs += 1
+        codes = sorted(one.returncode in command.codes for one, _, _ in ends)
+        row.check(codes == [False, True], f"{apart:.2f} s apart: {[one.returncode for one, _, _ in ends]}")
+        for one, _, err in ends:
+            refused = one.returncode == 2 and err.count("\n") == 1
+            row.check(one.returncode in command.codes or refused, f"{apart:.2f} s apart: {err[-300:]}")
+        found = without_checkpoint(state(desk))
+        row.check(found == whole, f"{apart:.2f} s apart: {sorted(found)}")
+    return row
+
+
+def resume(bench: Bench, command: Command, moments: Sequence[float]) -> Row:
+    """A tracker that is killed and resumed, again and again, says what an unbroken one says."""
+    row = Row(command.name, "kill -9 and --resume")
+    desk = bench.desk()
+    unbroken = bench.run(bench.arguments(command, desk))
+    lines = unbroken.out.splitlines()
+    whole, seconds = without_checkpoint(state(desk)), unbroken.seconds
+    for moment in moments:
+        desk = bench.desk()
+        killed = bench.run(bench.arguments(command, desk), (signal.SIGKILL, moment * seconds))
+        row.runs += 1
+        row.finished += killed.code in command.codes
+        said = [line for line in killed.out.splitlines(keepends=True) if line.endswith("\n")]
+        row.check([line.rstrip("\n") for line in said] == lines[: len(said)], f"at {moment:.3f}: other lines")
+        resumed = bench.run(bench.arguments(command, desk, "--resume", "--overwrite"))
+        again = resumed.out.splitlines()
+        row.check(resumed.code in command.codes, f"at {moment:.3f}: {resumed.err[-300:]}")
+        row.check(again == lines[len(lines) - len(again) :], f"at {moment:.3f}: resumed to other lines")
+        row.check(len(said) + len(again) >= len(lines), f"at {moment:.3f}: lines are missing")
+        row.check(without_checkpoint(state(desk)) == whole, f"at {moment:.3f}: another result")
+    return row
+
+
+@contextmanager
+def mounted(folder: Path, options: str) -> Iterator[bool]:
+    """A small file system mounted on a folder; False where that is not allowed."""
+    command = ["mount", "-t", "tmpfs", "-o", options, "none", str(folder)]
+    try:
+        done = subprocess.run(command, capture_output=True, check=False).returncode == 0
+    except OSError:
+        done = False
+    try:
+        yield done
+    finally:
+        if done:
+            subprocess.run(["umount", str(folder)], check=True)
+
+
+@contextmanager
+def broken_stream(kind: str) -> Iterator[int]:
+    """A stream that cannot be written: a full one, a pipe that nobody reads, one not open for writing."""
+    if kind == "reader gone":
+        reader, writer = os.pipe()
+        os.close(reader)
+    else:
+        writer = os.open(
+            "/dev/full" if kind == "full" else os.devnull, os.O_RDWR if kind == "full" else os.O_RDONLY
+        )
+    try:
+        yield writer
+    finally:
+        os.close(writer)
+
+
+def _check_checkpoint(row: Row, desk: Path) -> None:
+    path = desk / "checkpoint.npz"
+    if path.exists():
+        try:
+            Tracker.load(path)
+        except SstGraphError as error:
+            row.failures.append(str(error))
+
+
+def _check_next_run(bench: Bench, command: Command, desk: Path, row: Row, whole: State) -> None:
+    """A run to its end makes the output and removes what the killed ones left."""
+    standing = [] if command.output is None or not (desk / command.output).exists() else ["--overwrite"]
+    ended = bench.run(bench.arguments(command, desk, *standing))
+    row.check(ended.code in command.codes, f"the next run: {ended.code} {ended.err[-300:]}")
+    found = without_checkpoint(state(desk))
+    row.check(found == whole, f"the next run leaves {sorted(set(found) ^ set(whole))} or other content")
+
+
+def _check_full(row: Row, command: Command, desk: Path, ended: Ended, whole: State) -> None:
+    row.runs += 1
+    found = without_checkpoint(state(desk))
+    if ended.code in command.codes:
+        row.finished += 1
+        row.check(found == whole, f"finished with {sorted(found)}")
+        return
+    row.check(ended.code == 2, f"exit code {ended.code}: {ended.err[-300:]}")
+    row.check(not found, f"left {sorted(found)}")
+    lines = ended.err.strip().splitlines()
+    row.check(bool(lines) and str(desk) in lines[-1], f"the message names no place: {ended.err[-300:]}")
+    row.check("Traceback" not in ended.err, ended.err[-300:])
+
+
+def _check_refused(row: Row, place: Path, ended: Ended) -> None:
+    row.runs += 1
+    row.check(
+        ended.code == 2 and ended.out == "", f"exit code {ended.code}, {len(ended.out)} characters said"
+    )
+    row.check(ended.err.count("\n") == 1 and str(place) in ended.err, f"not one line: {ended.err[-300:]}")
+
+
+def _before_the_program(ended: Ended, number: int) -> bool:
+    """Whether the interpreter was still on its way to the program's first line."""
+    if ended.err == "":
+        return ended.code == -number
+    own = [line for line in ended.err.splitlines() if "sst_graph/" in line and "__editable__" not in line]
+    imports_only = all("sst_graph/__init__.py" in line or "sst_graph/cli/" in line for line in own)
+    return "KeyboardInterrupt" in ended.err and imports_only
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The rows in Markdown."""
+    lines = [
+        "| command | fault | runs | finished before it | early | failures |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        numbers = f"{row.runs} | {row.finished} | {row.early} | {len(row.failures)}"
+        lines.append(f"| {row.command} | {row.fault} | {numbers} |")
+    return "\n".join(lines) + "\n"
+
+
+def all_rows(bench: Bench, moments: int, chosen: Sequence[str], commands: Sequence[str]) -> Iterator[Row]:
+    """The whole matrix, row by row."""
+    random = np.random.default_rng(20)
+    limits = (0, 200, 3_000, 30_000)
+
+    def times() -> list[float]:
+        return [float(moment) for moment in random.uniform(0.0, 1.05, moments)]
+
+    for name in commands:
+        command = COMMANDS[name]
+        if command.output is not None:
+            rows: dict[str, list[Callable[[], Row]]] = {
+                "kill": [lambda c=command: kill(bench, c, times())],  # type: ignore[misc]
+                "full": [lambda c=command: full_disk(bench, c, limits)],  # type: ignore[misc]
+                "readonly": [lambda c=command: read_only(bench, c)],  # type: ignore[misc]
+                "writers": [lambda c=command: two_writers(bench, c, 4)],  # type: ignore[misc]
+            }
+            if command.older:
+                rows["kill"].append(lambda c=command: kill_overwriting(bench, c, times()))  # type: ignore[misc]
+            if name == "track":
+                rows["resume"] = [lambda c=command: resume(bench, c, times())]  # type: ignore[misc]
+        else:
+            rows = {}
+        rows["signals"] = [
+            lambda c=command, n=number: ended_by(bench, c, n, times())  # type: ignore[misc]
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+        ]
+        rows["streams"] = [lambda c=command: streams(bench, c)]  # type: ignore[misc]
+        for kind, makers in rows.items():
+            if kind in chosen:
+                yield from (make() for make in makers)
+
+
+KINDS = ("kill", "resume", "signals", "full", "readonly", "streams", "writers")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--moments", type=int, default=50, help="kills and signals of each kind (default 50)")
+    parser.add_argument("--rows", default=",".join(KINDS), help="faults (default: all)")
+    parser.add_argument("--commands", default=",".join(COMMANDS), help="commands (default: all)")
+    parser.add_argument("--out", type=Path, help="file for the table, written again after every row")
+    args = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder))
+        for row in all_rows(bench, args.moments, args.rows.split(","), args.commands.split(",")):
+            rows.append(row)
+            print(
+                f"{row.command}, {row.fault}: {row.runs} runs, {len(row.failures)} failures", file=sys.stderr
+            )
+            for failure in row.failures[:5]:
+                print("   ", failure, file=sys.stderr, flush=True)
+            if args.out is not None:
+                args.out.write_text(table(rows))
+    print(table(rows), end="")
+    return int(any(row.failures for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

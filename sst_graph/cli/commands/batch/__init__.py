@@ -1,0 +1,149 @@
+"""``sst-graph batch``: many drives, each in a process of its own, and one summary of all."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+from pathlib import Path
+from typing import Any
+
+from sst_graph.cli.commands.batch.ending import children_ended
+from sst_graph.cli.commands.batch.progress import ProgressOnStderr
+from sst_graph.cli.inputs import calibration_settings
+from sst_graph.cli.messages import complain, mention
+from sst_graph.cli.options import SOURCE_DEFAULTS
+from sst_graph.errors import ConfigError
+from sst_graph.fleet import (
+    BatchConfig,
+    Drive,
+    Limits,
+    Outcome,
+    Place,
+    WalkConfig,
+    find_drives,
+    open_batch,
+    run_batch,
+    with_vehicles,
+    write_summary,
+)
+from sst_graph.fleet.summary.page import counts_line
+from sst_graph.reference import load_initial
+
+_MOST_SAID = 10
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate all drives that are not done yet, and write the summary of all."""
+    config = _config(args)
+    _check_passed_on(args)
+    drives = find_drives(args.drives, _at_least("--name-parts", args.name_parts, 1))
+    if args.vehicle_from is not None:
+        drives = with_vehicles(drives, args.vehicle_from)
+    out = Place.of(args.out)
+    out = Place(os.path.abspath(out.url)) if out.is_local else out
+    _check_apart(drives, out)
+    with open_batch(out, config.options), children_ended(), ProgressOnStderr() as told:
+        records = run_batch(drives, out, config, told)
+        told.close()
+        outcome = write_summary(drives, records, out, config)
+    _say(outcome, out)
+    return 0 if outcome.all_fine else 3
+
+
+def _config(args: argparse.Namespace) -> BatchConfig:
+    workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if args.workers is not None:
+        workers = _at_least("--workers", args.workers, 1)
+    memory = _above_zero("--memory-limit", args.memory_limit)
+    return BatchConfig(
+        options=_passed_on(args),
+        workers=workers,
+        dask=args.dask,
+        limits=Limits(
+            _above_zero("--time-limit", args.time_limit), None if memory is None else round(memory * 2**30)
+        ),
+        retries=_at_least("--retries", args.retries, 0),
+        walk=_walk(args),
+    )
+
+
+def _walk(args: argparse.Namespace) -> WalkConfig:
+    given: dict[str, float] = {}
+    if args.drift is not None:
+        try:
+            degrees, centimetres, milliseconds = map(float, args.drift.split(","))
+        except ValueError:
+            raise ConfigError(f"--drift {args.drift}: expected three numbers DEG,CM,MS") from None
+        given = {
+            "rotation_deg": degrees,
+            "translation_m": 0.01 * centimetres,
+            "time_offset_s": 1e-3 * milliseconds,
+        }
+    if args.false_alarm_rate is not None:
+        given["false_alarm_rate"] = args.false_alarm_rate
+    return WalkConfig(**given)
+
+
+def _passed_on(args: argparse.Namespace) -> tuple[str, ...]:
+    """The options of ``calibrate`` that were given, as on its command line."""
+    words: list[str] = []
+    for action in args.passed_on:
+        value: Any = getattr(args, action.dest)
+        if value is None or value == action.default:
+            continue
+        name = action.option_strings[-1]
+        if value is True:
+            words.append(name)
+        else:
+            for one in value if isinstance(value, list) else [value]:
+                words.append(f"{name}={one}")
+    return tuple(words)
+
+
+def _check_passed_on(args: argparse.Namespace) -> None:
+    """Refuse at once what every drive would refuse."""
+    calibration_settings(args)
+    if args.init not in ("dataset", "none"):
+        load_initial(Path(args.init), args.camera or str(SOURCE_DEFAULTS["camera"]))
+
+
+def _check_apart(drives: list[Drive], out: Place) -> None:
+    """No drive stands in the batch's folder, nor the folder in a drive."""
+    if not out.is_local:
+        return
+    real = Path(os.path.realpath(out.url))
+    for drive in drives:
+        if not drive.place.is_local:
+            continue
+        data = Path(os.path.realpath(drive.place.url))
+        if data == real or real in data.parents or data in real.parents:
+            raise ConfigError(
+                f"--out {out}: found the drive {drive.place} in it or around it, expected two places"
+            )
+
+
+def _say(outcome: Outcome, out: Place) -> None:
+    mention(f"{'drives':<15} {len(outcome.rows)}: {counts_line(outcome.rows)}")
+    wrong = [row for row in outcome.rows if not row["report"]]
+    for row in wrong[:_MOST_SAID]:
+        mention(f"{row['status']!s:<15} {row['drive']}: {row['reason']}")
+    if len(wrong) > _MOST_SAID:
+        mention(f"{'':<15} and {len(wrong) - _MOST_SAID} more without result")
+    for vehicle in [one for one in outcome.vehicles if one.status != "ok"][:_MOST_SAID]:
+        mention(f"{'vehicle':<15} {vehicle.name}: {vehicle.reason}")
+    if "summary.parquet" not in outcome.names:
+        complain("note: no Parquet without pyarrow: pip install 'sst-graph[fleet]'")
+    mention(f"{'wrote':<15} {out}: {', '.join(outcome.names)}")
+
+
+def _at_least(option: str, value: int, least: int) -> int:
+    if value < least:
+        raise ConfigError(f"{option} {value}: expected at least {least}")
+    return value
+
+
+def _above_zero(option: str, value: float | None) -> float | None:
+    if value is not None and not (math.isfinite(value) and value > 0.0):
+        raise ConfigError(f"{option} {value:g}: expected a number above 0")
+    return value

@@ -1,0 +1,68 @@
+"""Where a batch stands, on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+from tqdm import tqdm
+
+from sst_graph.cli.messages import complain
+from sst_graph.fleet import Progress
+
+_LINE_EVERY_S = 30.0
+"""Between lines of progress where no person watches."""
+
+
+class ProgressOnStderr:
+    """Progress on stderr: a bar where a person watches, else a line now and then."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+        self._said = time.monotonic()
+
+    def __enter__(self) -> ProgressOnStderr:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def __call__(self, progress: Progress) -> None:
+        """Show where the batch stands; name a drive that failed."""
+        if sys.stderr.isatty():
+            self._draw(progress)
+        elif time.monotonic() - self._said > _LINE_EVERY_S:
+            self._said = time.monotonic()
+            complain(progress_line(progress))
+        if progress.last is not None and not progress.last.has_result:
+            if self._bar is not None:
+                self._bar.clear()
+            complain(f"{progress.last.drive}: {progress.last.status}: {progress.last.reason}")
+
+    def _draw(self, progress: Progress) -> None:
+        if self._bar is None:
+            self._bar = tqdm(
+                total=progress.total, initial=progress.earlier, desc="drives", file=sys.stderr, leave=False
+            )
+        self._bar.set_postfix_str(f"{progress.without_result} without result", refresh=False)
+        self._bar.update(progress.done - self._bar.n)
+
+    def close(self) -> None:
+        """Take the bar away."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+def progress_line(progress: Progress) -> str:
+    """Where a batch stands, in words."""
+    left = "" if progress.left_s is None else f", {_duration(progress.left_s)} left"
+    failed = f", {progress.without_result} without result" if progress.without_result else ""
+    return f"{progress.done} of {progress.total} drives{failed}, {progress.per_hour:.0f} an hour{left}"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 90.0 else f"{minutes / 60.0:.1f} h"

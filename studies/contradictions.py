@@ -1,0 +1,172 @@
+"""Steps of mount and clock in mid-drive: which sizes are found, and what is found on clean drives.
+
+    OMP_NUM_THREADS=1 python studies/contradictions.py --streets 6
+    OMP_NUM_THREADS=1 python studies/contradictions.py --streets 50 --clean
+
+Small simulated streets of 30 frames at half the usual size. The joint solution starts at the truth, without a
+global search, and the stamps' rhythm is not looked at: what is found is found by the drive's stretches alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from sst_graph import CalibrationConfig
+from sst_graph.batch.calibrate import prepare_drives
+from sst_graph.batch.contradictions import Contradictions, find_contradictions
+from sst_graph.batch.method_estimate import Guess
+from sst_graph.batch.part_solver import PartSolver
+from sst_graph.batch.problem import CalibrationProblem
+from sst_graph.errors import EstimationError
+from sst_graph.graph.outer_loop import NARROW_KERNELS_PX, solve_joint
+from sst_graph.graph.state import State
+from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
+from sst_graph.types import Frame, Source
+
+FRAMES = 30
+MOTIONS = ("mixed", "stop_and_go", "no_stop", "turning", "standing", "mixed", "constant", "stop_and_go")
+SPEEDS_MPS = (8.5, 6.0, 6.0, 5.0, 5.0, 3.0, 8.0, 4.0)
+DENSITIES = (0.25, 0.13, 0.2, 0.3)
+MOVING = (0.1, 0.2, 0.0, 0.3)
+OFFSETS_S = (0.05, 0.0, 0.1, -0.07)
+KNOCKS_DEG = (0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0)
+CLOCKS_MS = (10.0, 20.0, 50.0, 100.0, 200.0)
+
+
+def street(seed: int) -> SimulationConfig:
+    """The street of a seed."""
+    kind = seed % 8
+    return SimulationConfig(
+        seed=seed,
+        frames=FRAMES,
+        width=621,
+        height=188,
+        azimuth_limit_deg=50.0,
+        azimuth_step_deg=0.3,
+        motion=MOTIONS[kind],
+        speed_mps=SPEEDS_MPS[kind],
+        vehicle_density=DENSITIES[(seed // 8) % 4],
+        moving_fraction=MOVING[(seed // 2) % 4],
+        time_offset_s=OFFSETS_S[(seed // 3) % 4],
+    )
+
+
+@dataclass(frozen=True)
+class Edited:
+    """A drive whose frames were changed, as a source."""
+
+    source: SimulatedDrive
+    frames: Sequence[Frame]
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.source, name)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, position: int) -> Frame:
+        return self.frames[position]
+
+
+def knocked(frames: Sequence[Frame], first: int, axis: np.ndarray, degrees: float) -> list[Frame]:
+    """From a frame on the LiDAR is turned about an axis of its own."""
+    R = gtsam.Rot3.Expmap(np.radians(degrees) * axis / np.linalg.norm(axis)).matrix()
+    found = []
+    for frame in frames:
+        if frame.index >= first and frame.scan is not None:
+            points = (frame.scan.points.astype(np.float64) @ R.T).astype(np.float32)
+            frame = replace(frame, scan=replace(frame.scan, points=points))
+        found.append(frame)
+    return found
+
+
+def clock_set(frames: Sequence[Frame], first: int, milliseconds: float) -> list[Frame]:
+    """From a frame on images are stamped later."""
+    found = []
+    for frame in frames:
+        if frame.index >= first and frame.image is not None:
+            stamp = frame.image.stamp_ns + round(1e6 * milliseconds)
+            frame = replace(frame, image=replace(frame.image, stamp_ns=stamp))
+        found.append(frame)
+    return found
+
+
+def contradictions_of(source: Source, start: State) -> Contradictions:
+    """What the default settings find in a drive, its joint solution sought from ``start``."""
+    config = CalibrationConfig()
+    noise = replace(config.noise, lower_edges=tuple(config.classes))
+    drives = prepare_drives([source], config)
+    guess = Guess(start.cTl, start.time_offsets_s[0])
+    problem = CalibrationProblem.of(drives, guess, replace(config, noise=noise))
+    solution = solve_joint(problem.joint(), start, NARROW_KERNELS_PX)
+    return find_contradictions(PartSolver(problem, solution.state))
+
+
+def found_in(seed: int, edits: Sequence[Callable[[list[Frame]], list[Frame]]]) -> list[Contradictions | None]:
+    """What is found in a street's frames after each edit; None where no joint solution exists."""
+    drive = simulate(street(seed))
+    frames = list(drive)
+    start = State(drive.truth.cTl, (drive.truth.time_offset_s or 0.0,))
+    found: list[Contradictions | None] = []
+    for edit in edits:
+        try:
+            found.append(contradictions_of(Edited(drive, edit(frames)), start))
+        except EstimationError:
+            found.append(None)
+    return found
+
+
+def place_of(seed: int) -> tuple[int, np.ndarray]:
+    """First frame after the step, in the middle half of the drive, and the axis of a knock."""
+    rng = np.random.default_rng([seed, 7])
+    return int(rng.integers(FRAMES // 4, 3 * FRAMES // 4 + 1)), rng.normal(size=3)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--streets", type=int, default=6)
+    parser.add_argument("--seed", type=int, default=100)
+    parser.add_argument("--clean", action="store_true", help="unchanged drives only: false alarms")
+    args = parser.parse_args()
+    seeds = range(args.seed, args.seed + args.streets)
+    if args.clean:
+        alarms = 0
+        for seed in seeds:
+            found = found_in(seed, [list])[0]
+            sentences = () if found is None else found.sentences
+            alarms += bool(sentences)
+            print(f"seed {seed}, {street(seed).motion}: {' '.join(sentences) or 'nothing'}", flush=True)
+        print(f"{alarms} of {len(seeds)} clean drives raise an alarm")
+        return
+    sizes = [("knock", f"{degrees:g} deg") for degrees in KNOCKS_DEG]
+    sizes += [("clock", f"{ms:g} ms") for ms in CLOCKS_MS]
+    hits, near = np.zeros(len(sizes), int), np.zeros(len(sizes), int)
+    for seed in seeds:
+        first, axis = place_of(seed)
+        edits = [lambda f, d=d, k=first, a=axis: knocked(f, k, a, d) for d in KNOCKS_DEG]
+        edits += [lambda f, ms=ms, k=first: clock_set(f, k, ms) for ms in CLOCKS_MS]
+        for number, found in enumerate(found_in(seed, edits)):
+            steps = [] if found is None else found.diagnostics["within"]
+            hits[number] += bool(steps)
+            near[number] += any(
+                min(abs(step["frames"][0] - first), abs(step["frames"][1] + 1 - first)) <= 3 for step in steps
+            )
+            print(
+                f"seed {seed}, {street(seed).motion}, {' '.join(sizes[number])} at {first}: "
+                f"{' '.join(found.sentences) if found else 'no solution'}",
+                flush=True,
+            )
+    print("| step | size | found | place within 3 frames |\n|---|---|---|---|")
+    for (kind, size), hit, place in zip(sizes, hits, near, strict=True):
+        print(f"| {kind} | {size} | {hit} of {len(seeds)} | {place} |")
+
+
+if __name__ == "__main__":
+    main()

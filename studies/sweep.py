@@ -1,0 +1,146 @@
+"""Sweeps decided from the scans, on simulated streets. Prints tables.
+
+    OMP_NUM_THREADS=1 python studies/sweep.py decide --streets 40      what the scans tell
+    OMP_NUM_THREADS=1 python studies/sweep.py calibrate --streets 6    what it costs the calibration
+
+Every street has a rate of 5 to 20 Hz, a speed of 1 to 20 m/s, a sense of rotation, a start of the turn and a
+profile of the motion of its own, drawn from its seed. "compensated": measured point after point like a raw
+one, then moved to the stamp by the true motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import time
+from typing import Any
+
+import cv2
+import gtsam
+import numpy as np
+
+from sst_graph import CalibrationConfig, calibrate
+from sst_graph.odometry.sweep import FRACTIONS, SweepDecision, decide_sweep
+from sst_graph.simulator import SimulationConfig, simulate
+
+
+def street(seed: int, output: str, frames: int) -> SimulationConfig:
+    """A street with a raw or compensated sweep of its own."""
+    rng = np.random.default_rng([seed, 20])
+    speed = float(np.exp(rng.uniform(np.log(1.0), np.log(20.0))))
+    options: dict[str, Any] = {
+        "frame_rate_hz": float(rng.choice([5.0, 10.0, 20.0])),
+        "speed_mps": speed,
+        "motion": str(
+            rng.choice(["constant", "no_stop", "turning"] if speed < 9.0 else ["constant", "no_stop"])
+        ),
+        "sweep_sense": str(rng.choice(["clockwise", "counterclockwise"])),
+        "sweep_start_deg": float(rng.uniform(-180.0, 180.0)),
+        "sweep_stamp": str(rng.choice(["forward", "start", "end"])),
+        "azimuth_limit_deg": float(rng.choice([50.0, 60.0, 180.0])),
+    }
+    return SimulationConfig(
+        seed=seed, frames=frames, rolling=True, sweep_output=output, azimuth_step_deg=0.35, **options
+    )
+
+
+def decided(config: SimulationConfig) -> SweepDecision:
+    """What the scans of a street tell; each is made once."""
+    drive = simulate(config)
+    return decide_sweep(functools.cache(drive.scan), len(drive))
+
+
+def decide(args: argparse.Namespace) -> None:
+    """Of every street, raw and compensated: right, undecided or wrong, by view."""
+    counts: dict[tuple[str, str], list[int]] = {}
+    print("| street | truth | speed, rate, motion, view | decision | sigmas |\n|---|---|---|---|---|")
+    for seed in range(args.seed, args.seed + args.streets):
+        for output in args.outputs.split(","):
+            config = street(seed, output, args.frames)
+            truth = "compensated" if output == "compensated" else config.sweep_sense
+            began = time.perf_counter()
+            found = decided(config)
+            seconds = time.perf_counter() - began
+            kind = 0 if found.kind == truth else 2 if found.kind in FRACTIONS else 1
+            seen = "full" if config.azimuth_limit_deg == 180.0 else "cropped"
+            counts.setdefault((seen, output), [0, 0, 0])[kind] += 1
+            how = f"{config.speed_mps:.1f} m/s, {config.frame_rate_hz:.0f} Hz, {config.motion}, "
+            worse = ", ".join(f"{name} {sigmas:.1f}" for name, sigmas in found.worse_by.items())
+            start = f", start {config.sweep_start_deg:.0f} deg"
+            view = f"{how}{config.azimuth_limit_deg:.0f} deg{start}"
+            print(
+                f"| {seed} | {truth} | {view} | {found.sentence} | {worse} | <!-- {seconds:.0f} s -->",
+                flush=True,
+            )
+    print("\n| view | clouds | right | undecided | wrong |\n|---|---|---|---|---|")
+    for (seen, output), (right, open_, wrong) in sorted(counts.items(), reverse=True):
+        print(f"| {seen} | {output} | {right} | {open_} | {wrong} |")
+
+
+def errors(config: SimulationConfig, timed: bool) -> tuple[list[float], str, str]:
+    """[rotation deg, translation cm, offset ms, NEES of 7], status and decision of a calibration."""
+    drive = simulate(config)
+    truth = drive.truth
+    away = np.random.default_rng([config.seed, 99]).uniform(-1.0, 1.0, 6) * np.repeat([0.08, 0.05], 3)
+    result = calibrate(drive, truth.cTl.retract(away), CalibrationConfig())
+    assert truth.time_offset_s is not None
+    error = np.append(
+        gtsam.Pose3.Logmap(truth.cTl.between(result.T_camera_lidar)),
+        result.time_offset_s - truth.time_offset_s,
+    )
+    figures = [
+        float(np.degrees(np.linalg.norm(error[:3]))),
+        float(100.0 * np.linalg.norm(error[3:6])),
+        float(1e3 * abs(error[6])),
+        float(error @ np.linalg.solve(result.covariance, error)),
+    ]
+    decision = result.diagnostics["sweep"][drive.name]["sentence"]
+    return figures, result.status, "times given" if timed else decision
+
+
+def calibrations(args: argparse.Namespace) -> None:
+    """The same streets with times for every point, without, and compensated."""
+    tables: dict[str, list[list[float]]] = {}
+    print("| street | data | rotation deg | translation cm | offset ms | NEES of 7 | status | sweep |")
+    print("|---|---|---|---|---|---|---|---|")
+    for seed in range(args.seed, args.seed + args.streets):
+        rng = np.random.default_rng([seed, 21])
+        base = SimulationConfig(
+            seed=seed,
+            frames=args.frames,
+            width=932,
+            height=282,
+            motion="mixed",
+            rolling=True,
+            time_offset_s=0.1,
+            azimuth_step_deg=0.25,
+            azimuth_limit_deg=90.0,
+            sweep_sense=str(rng.choice(["clockwise", "counterclockwise"])),  # type: ignore[arg-type]
+            sweep_start_deg=float(rng.choice([180.0, 120.0, -120.0])),
+        )
+        for output in ("times", "raw", "compensated"):
+            config = dataclasses.replace(base, sweep_output=output)  # type: ignore[arg-type]
+            figures, status, decision = errors(config, output == "times")
+            tables.setdefault(output, []).append(figures)
+            cells = " | ".join(f"{figure:.3g}" for figure in figures)
+            print(f"| {seed} | {output} | {cells} | {status} | {decision} |", flush=True)
+    for output, rows in tables.items():
+        middle = np.median(np.array(rows), axis=0)
+        print(f"\nmedian, {output}: " + ", ".join(f"{value:.3g}" for value in middle))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("decide", "calibrate"))
+    parser.add_argument("--streets", type=int, default=6)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--seed", type=int, default=500)
+    parser.add_argument("--outputs", default="compensated,raw", help="decide: which of them")
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    decide(args) if args.what == "decide" else calibrations(args)
+
+
+if __name__ == "__main__":
+    main()

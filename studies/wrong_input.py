@@ -1,0 +1,158 @@
+"""Drives made wrong on purpose, calibrated as a user would: status, named cause, error. Prints a table.
+
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --seeds 201 202
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --drive DATA --faults "Tr inverted" clean
+    OMP_NUM_THREADS=1 python studies/wrong_input.py --seeds 431 --frames 40 --subtle
+
+Streets have 30 frames (--frames) of 621x188 px, and start from the pose that the data bring. --quick leaves
+the solution out where something is certain before it: the status is then never ok. --subtle: faults that
+leave a drive plausible; wrong is a result that is ok and more than 3 sigma off on an axis, the truth of a
+real drive being known to 0.1 deg, 1 cm and 5 ms. Real drives start 1.5 deg and 5 cm off then.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from subtle_faults import SUBTLE_FAULTS, SUBTLE_NAMED
+from wrong_drives import INPUT_FAULTS, NAMED, right_camera
+
+from sst_graph import CalibrationConfig, open_source
+from sst_graph.batch.calibrate import calibrate, calibrate_prepared, prepare_drives
+from sst_graph.batch.config import Method
+from sst_graph.data.kept_drive import KeptDrive
+from sst_graph.diagnosis import preflight
+from sst_graph.errors import SstGraphError
+from sst_graph.metrics import TruthSigma, calibration_errors, tangent_error
+from sst_graph.simulator import SimulationConfig, simulate
+
+CLEAN, RIGHT = "clean", "right camera"
+MOST_SIGMAS = 3.0
+REFERENCE = TruthSigma(0.1, 0.01, 0.005)
+"""Of the published calibrations of real drives."""
+START = np.array([*np.radians([0.9, -0.9, 0.8]), 0.03, -0.03, 0.03])
+"""(6,) from the reference of a real drive to where its subtle faults start."""
+
+
+def street(seed: int, frames: int, right: bool = False) -> KeptDrive:
+    """A street of a seed, seen by its own camera or by one beside it."""
+    made = simulate(SimulationConfig(seed=seed, frames=frames, width=621, height=188, azimuth_step_deg=0.3))
+    return right_camera(made) if right else KeptDrive.of(made, sweep="auto")
+
+
+def row(name: str, drive: KeptDrive, quick: bool) -> tuple[str, bool]:
+    """A line of the table, and whether it is as it should be: a fault named and not ok, clean data silent."""
+    config = CalibrationConfig()
+    try:
+        prepared = prepare_drives([drive], config)
+        certain = preflight(prepared, drive.nominal, config.classes) if quick else ()
+        if certain:
+            sentence = certain[0].sentence
+            return f"before the solution | | {sentence}", name in NAMED and NAMED[name] in sentence
+        result = calibrate_prepared(prepared, drive.nominal, config)
+    except SstGraphError as error:
+        return f"refused | {error}", NAMED.get(name, "") in str(error) and name in NAMED
+    first = result.reasons[0] if result.reasons else ""
+    error_text = ""
+    if drive.truth is not None:
+        errors = calibration_errors(
+            result.T_camera_lidar, result.time_offset_s, drive.truth, result.covariance
+        )
+        error_text = f"{errors.qad_deg:.2f} deg, {100.0 * errors.atd_m:.1f} cm"
+    named = not any(words in first for words in NAMED.values())
+    if name in NAMED:
+        named = NAMED[name] in first and result.status != "ok"
+    return f"{result.status} | {error_text} | {first}", named
+
+
+def subtle_row(name: str, drive: KeptDrive, method: Method, real: bool) -> tuple[str, bool]:
+    """A line of the table of faults that leave a drive plausible, and whether the result can be believed.
+
+    Args:
+        real: its truth is a reference that is not exact.
+    """
+    try:
+        result = calibrate(drive, drive.nominal, CalibrationConfig(method=method))
+    except SstGraphError as error:
+        return f"refused | | | {error}", True
+    first = result.reasons[0] if result.reasons else ""
+    assert drive.truth is not None
+    late_s = result.time_offset_s - (drive.truth.time_offset_s or 0.0)
+    error = tangent_error(result.T_camera_lidar, drive.truth.cTl, late_s)
+    covariance = result.covariance + real * REFERENCE.covariance
+    sigmas = float((np.abs(error) / np.sqrt(np.diag(covariance))).max())
+    sizes = (
+        f"{np.degrees(np.linalg.norm(error[:3])):.2f} deg, {100.0 * np.linalg.norm(error[3:6]):.1f} cm, "
+        f"{1e3 * abs(late_s):.1f} ms"
+    )
+    believed = result.status != "ok" or sigmas <= MOST_SIGMAS
+    believed = believed and SUBTLE_NAMED.get(name, "") in first
+    return f"{result.status} | {sizes} | {sigmas:.1f} | {first}", believed
+
+
+def try_subtle(args: argparse.Namespace) -> None:
+    """Print the table of faults that leave a drive plausible."""
+    right, total = 0, 0
+    for name, drive, _, _ in drives(args):
+        real = name not in map(str, args.seeds)
+        if real and drive.truth is not None:
+            drive = replace(drive, nominal=drive.truth.cTl.retract(START))
+        for fault in args.faults or (CLEAN, *SUBTLE_FAULTS):
+            wrong = drive if fault == CLEAN else SUBTLE_FAULTS[fault](drive)
+            text, believed = subtle_row(fault, wrong, args.method, real)
+            right, total = right + believed, total + 1
+            print(f"{name} | {fault} | {'yes' if believed else 'NO'} | {text}", flush=True)
+    print(f"{right} of {total} as they should be")
+
+
+def drives(args: argparse.Namespace) -> Iterator[tuple[str, KeptDrive, KeptDrive, KeptDrive | None]]:
+    """Name, drive, another drive of the same size, and the drive by the right camera where it can be had."""
+    some = f":{args.frames}"
+    other = KeptDrive.of(open_source(args.other, frames=some), sweep="auto") if args.other else None
+    for path in args.drive:
+        source = open_source(path, image_shift=args.image_shift, frames=some)
+        drive = KeptDrive.of(source, sweep="auto")
+        yield path.name, drive, other or drive, None
+    for seed in args.seeds:
+        beside = street(seed, args.frames, right=True) if RIGHT in args.faults else None
+        made = street(seed, args.frames)
+        yield str(seed), made, made if args.subtle else street(seed + 1000, args.frames), beside
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seeds", type=int, nargs="*", default=[])
+    parser.add_argument("--drive", type=Path, nargs="*", default=[])
+    parser.add_argument("--other", type=Path, help="another drive, for masks and images of another drive")
+    parser.add_argument("--image-shift", type=int, default=0)
+    parser.add_argument("--frames", type=int, default=30)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--subtle", action="store_true", help="faults that leave a drive plausible")
+    parser.add_argument("--method", default="joint", help="of --subtle: joint or edges")
+    parser.add_argument("--faults", nargs="*", default=[])
+    args = parser.parse_args()
+    if args.subtle:
+        try_subtle(args)
+        return
+    args.faults = args.faults or [CLEAN, *INPUT_FAULTS, RIGHT]
+    right, total = 0, 0
+    for name, drive, other, beside in drives(args):
+        for fault in args.faults:
+            if fault == RIGHT and beside is None:
+                continue
+            wrong = (
+                drive if fault == CLEAN else beside if fault == RIGHT else INPUT_FAULTS[fault](drive, other)
+            )
+            assert wrong is not None
+            text, as_it_should = row(fault, wrong, args.quick)
+            right, total = right + as_it_should, total + 1
+            print(f"{name} | {fault} | {'yes' if as_it_should else 'NO'} | {text}", flush=True)
+    print(f"{right} of {total} as they should be")
+
+
+if __name__ == "__main__":
+    main()
