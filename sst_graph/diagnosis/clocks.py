@@ -65,8 +65,8 @@ def two_clocks(drive: Drive) -> Finding | None:
     """Scans and images of the same frames whose stamps do not advance alike."""
     if drive.statistics is None:
         return None
-    scans = dict(zip((fact.index for fact in drive.statistics.scans), drive.scan_stamps_ns, strict=False))
-    images = dict(zip((fact.index for fact in drive.statistics.images), drive.image_stamps_ns, strict=False))
+    scans = {scan.index: scan.stamp_ns for scan in drive.statistics.scans}
+    images = {image.index: image.stamp_ns for image in drive.statistics.images}
     both = sorted(scans.keys() & images.keys())
     if len(both) <= _LEAST_STEPS:
         return None

@@ -99,18 +99,20 @@ def _longest(digests: Sequence[int]) -> tuple[int, int]:
 
 def _pictures_move(drive: Drive, first: int, count: int) -> bool:
     """Whether corners move in most pictures of a run of scans; yes where they are not tracked."""
-    begin, end = drive.scan_stamps_ns[first], drive.scan_stamps_ns[first + count - 1]
+    assert drive.statistics is not None
+    scans = drive.statistics.scans
+    begin, end = scans[first].stamp_ns, scans[first + count - 1].stamp_ns
     tracks = [p.tracks for p in drive.image_pairs if begin <= p.tracks.from_ns < end and len(p.tracks)]
     if not tracks:
-        assert drive.statistics is not None
         return len({image.picture_digest for image in drive.statistics.images}) > 1
     sizes = [float(np.median(np.linalg.norm(t.uv_b - t.uv_a, axis=1))) for t in tracks]
     return bool(np.mean(np.array(sizes) > _MOVED_PX) > 0.3)
 
 
 def _lidar_moves(drive: Drive, first: int, count: int) -> bool:
-    stamps = drive.image_stamps_ns
-    begin, end = stamps[first], stamps[first + count - 1]
+    assert drive.statistics is not None
+    images = drive.statistics.images
+    begin, end = images[first].stamp_ns, images[first + count - 1].stamp_ns
     moves = [
         float(np.linalg.norm(motion.aTb.translation()))
         for motion in drive.lidar_motions

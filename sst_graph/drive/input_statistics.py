@@ -53,6 +53,7 @@ class ScanStatistics:
 
     Attributes:
         index: of its frame.
+        stamp_ns: LiDAR clock [ns].
         digest: of its points: equal ones are the same scan.
         sweep_s: between its first and last point [s]; 0 where the points carry no times.
         labelled: number of points by class.
@@ -64,6 +65,7 @@ class ScanStatistics:
     """
 
     index: int
+    stamp_ns: int
     digest: int
     sweep_s: float
     labelled: Mapping[int, int]
@@ -79,6 +81,7 @@ class ImageStatistics:
 
     Attributes:
         index: of its frame.
+        stamp_ns: camera clock [ns].
         picture_digest, mask_digest: equal ones are the same; a picture that is missing or of a single colour
             shows nothing, and has that of the mask.
         labelled: number of pixels by class.
@@ -87,6 +90,7 @@ class ImageStatistics:
     """
 
     index: int
+    stamp_ns: int
     picture_digest: int
     mask_digest: int
     labelled: Mapping[int, int]
@@ -144,7 +148,9 @@ def scan_statistics(index: int, scan: Scan, closely: bool = True) -> ScanStatist
     labelled = _counts(scan.classes)
     digest = zlib.crc32(np.ascontiguousarray(scan.points).tobytes())
     sample = _sample(scan.points)
-    return ScanStatistics(index, digest, sweep, labelled, median_range, ground, heights, sample)
+    return ScanStatistics(
+        index, scan.stamp_ns, digest, sweep, labelled, median_range, ground, heights, sample
+    )
 
 
 _FACTORS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
@@ -172,6 +178,7 @@ def image_statistics(index: int, image: CameraImage, closely: bool = True) -> Im
     mask_digest = zlib.crc32(np.ascontiguousarray(image.mask).tobytes())
     return ImageStatistics(
         index,
+        image.stamp_ns,
         zlib.crc32(np.ascontiguousarray(image.pixels).tobytes()) if shows else mask_digest,
         mask_digest,
         labelled,
