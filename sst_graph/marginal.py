@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from sst_graph.errors import DataError, EstimationError
 from sst_graph.files.json_table import JsonTable, json_table
 from sst_graph.files.reading import MARGINAL, parse_json, read_text
-from sst_graph.types import ByValue
+from sst_graph.types import ByValue, Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -80,14 +80,14 @@ class CalibrationMarginal(ByValue):
         """
         return inverse(self.information, "information of a marginal")
 
-    def best(self) -> tuple[gtsam.Pose3, float]:
-        """cTl and offset [s] of the least cost.
+    def best(self) -> Calibration:
+        """The extrinsic and the offset of the least cost.
 
         Raises:
             EstimationError: a direction without information.
         """
         d = self.covariance() @ self.vector
-        return self.cTl.retract(d[:6]), self.time_offset_s + float(d[6])
+        return Calibration(self.cTl.retract(d[:6]), self.time_offset_s + float(d[6]))
 
     def plus(self, other: CalibrationMarginal) -> CalibrationMarginal:
         """Both costs together, at this one's linearization point; exact where the two share it."""

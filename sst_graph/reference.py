@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import gtsam
-
 from sst_graph.imports import ImportOptions, import_calibration
-from sst_graph.types import GroundTruth
+from sst_graph.types import Calibration, GroundTruth
 
 
 def read_reference(path: Path, camera: str = "image_2") -> GroundTruth:
@@ -25,11 +23,11 @@ def read_reference(path: Path, camera: str = "image_2") -> GroundTruth:
     return GroundTruth(imported.cTl, imported.time_offset_s)
 
 
-def load_initial(path: Path, camera: str = "image_2") -> tuple[gtsam.Pose3, float]:
-    """Start of a calibration from a file: cTl and time offset [s], 0 where the file has none.
+def load_initial(path: Path, camera: str = "image_2") -> Calibration:
+    """Start of a calibration from a file; the time offset is 0 where the file has none.
 
     Raises:
         DataError, ConfigError, EstimationError, MissingDependencyError: as :func:`read_reference`.
     """
     reference = read_reference(path, camera)
-    return reference.cTl, reference.time_offset_s or 0.0
+    return Calibration(reference.cTl, reference.time_offset_s or 0.0)

@@ -10,7 +10,7 @@ from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import gtsam
 import numpy as np
@@ -202,6 +202,31 @@ class Frame(ByValue):
     index: int
     scan: Scan | None
     image: CameraImage | None
+
+
+class Calibration(NamedTuple):
+    """An extrinsic and a time offset, the two things that this package estimates.
+
+    Two are equal where both numbers are, bit by bit.
+
+    Attributes:
+        cTl: pose of the LiDAR in the camera.
+        time_offset_s: offset with the sign of :mod:`factors` [s].
+    """
+
+    cTl: gtsam.Pose3
+    time_offset_s: float = 0.0
+
+    def local_coordinates(self, other: Calibration) -> FloatArray:
+        """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""
+        xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
+        return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Calibration) and _value(self) == _value(other)
+
+    def __hash__(self) -> int:
+        return hash(_value(self))
 
 
 @dataclass(frozen=True, eq=False)

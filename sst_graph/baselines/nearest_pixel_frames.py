@@ -18,7 +18,7 @@ from sst_graph.factors.matches import Alignment
 from sst_graph.graph.elimination import Unknowns, marginal_covariance
 from sst_graph.graph.state import EXTRINSIC, time_offset_key
 from sst_graph.result import FrameId
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 
 FloatArray = NDArray[np.float64]
 T = TypeVar("T")
@@ -29,19 +29,6 @@ TIME_OFFSET_SIGMA_S = 1.0
 """Prior deviation of the time offset where nothing measures it [s]."""
 REST_SIGMAS = np.repeat([1.0, 3.0], 3)
 """Deviations [rad, m] that only keep the covariance of an unseen direction finite."""
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """An extrinsic and a time offset [s]."""
-
-    cTl: gtsam.Pose3
-    time_offset_s: float
-
-    def to(self, other: Calibration) -> FloatArray:
-        """(7,) step to another: Log of the poses' difference [rad, m], difference of the offsets [s]."""
-        xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
-        return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
 
 
 @dataclass(frozen=True)

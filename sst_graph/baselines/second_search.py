@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, spread
+from sst_graph.baselines.nearest_pixel_frames import MatchFrame, spread
 from sst_graph.drive.preparation import Drive
 from sst_graph.initialization.global_search import (
     FINE,
@@ -19,7 +19,7 @@ from sst_graph.initialization.global_search import (
 )
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 
 _MIN_RATIO = 0.9
 """Least score of a result as a fraction of the best one found around it: below 1, because errors of the

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sst_graph.baselines.nearest_pixel_frames import Calibration, MatchFrame, frozen_covariance, step_once
+from sst_graph.baselines.nearest_pixel_frames import MatchFrame, frozen_covariance, step_once
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, still_frames
 from sst_graph.factors import PinholeCamera
+from sst_graph.types import Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ def solve_semalign(problem: PaperProblem, guess: Calibration) -> NearestSolution
     remaining = np.zeros(7)
     for iteration in range(_ITERATIONS):
         last, at = at, step_once(still.frames, at, 0.0, max_px=TRUNCATION_PX)
-        remaining = _ITERATIONS * last.to(at)
+        remaining = _ITERATIONS * last.local_coordinates(at)
         if progress is not None:
             progress("points to pixels", iteration + 1, _ITERATIONS)
     covariance = frozen_covariance(still.frames, at, 0.0, TRUNCATION_PX)

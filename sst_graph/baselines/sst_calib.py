@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.baselines.nearest_pixel_frames import (
-    Calibration,
     FramePair,
     MatchFrame,
     frame_pairs,
@@ -30,7 +29,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import beta_regularizer
 from sst_graph.graph.state import EXTRINSIC
 from sst_graph.odometry import metric_motions, standstill_frames
-from sst_graph.types import RelativeMotion, SemanticClass
+from sst_graph.types import Calibration, RelativeMotion, SemanticClass
 
 _LOG = logging.getLogger(__name__)
 FloatArray = NDArray[np.float64]
@@ -285,7 +284,7 @@ def _static_stage(
     for weight, iterations in _STATIC_PHASES:
         for _ in range(iterations):
             last, at = at, step_once(frames, at, problem.config.weight(weight))
-            remaining = iterations * last.to(at)
+            remaining = iterations * last.local_coordinates(at)
             done += 1
             if problem.progress is not None:
                 problem.progress("static stage", done, total)
@@ -307,7 +306,7 @@ def _joint_stage(
             moving = [f.moving_at(velocity_at(motions[f.pair.drive], f.pair.image_position)) for f in moving]
         weight = problem.config.weight(_JOINT_WEIGHT)
         last, at = at, step_once(moving, at, weight, beta, offset_free=True)
-        remaining = _JOINT_ITERATIONS * last.to(at)
+        remaining = _JOINT_ITERATIONS * last.local_coordinates(at)
         if problem.progress is not None:
             problem.progress("joint stage", iteration + 1, _JOINT_ITERATIONS)
     _LOG.info("paper: offset %.4f s after %d joint iterations", at.time_offset_s, _JOINT_ITERATIONS)

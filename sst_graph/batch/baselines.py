@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from sst_graph.baselines.nearest_pixel_frames import Calibration
 from sst_graph.baselines.second_search import search_again
 from sst_graph.baselines.semalign import solve_semalign
 from sst_graph.baselines.sst_calib import NearestSolution, PaperProblem, solve_paper, solve_static
@@ -14,6 +13,7 @@ from sst_graph.batch.config import CalibrationConfig
 from sst_graph.batch.method_estimate import Guess, MethodEstimate
 from sst_graph.drive.preparation import Drive, Progress
 from sst_graph.errors import EstimationError
+from sst_graph.types import Calibration
 
 
 def paper_method(

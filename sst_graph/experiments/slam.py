@@ -30,7 +30,7 @@ from sst_graph.experiments.slam_graph import (
 )
 from sst_graph.odometry import RegisteredScan, loop_closures, scan_to_scan
 from sst_graph.simulator import SimulatedDrive, SimulationConfig, simulate
-from sst_graph.types import Frame
+from sst_graph.types import Calibration, Frame
 
 FloatArray = NDArray[np.float64]
 
@@ -155,7 +155,7 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     # 2. Calibration alone.
     alone = calibrate_prepared([drive], source.nominal, config.calibration)
     # 3. Both in one graph.
-    start = alone.T_camera_lidar, alone.time_offset_s
+    start = Calibration(alone.T_camera_lidar, alone.time_offset_s)
     both = with_camera(graph, slam, drive, start, source.nominal, config.camera)
     found = both.atPose3(EXTRINSIC), float(both.atVector(TIME_OFFSET)[0])
     errors = {

@@ -26,7 +26,7 @@ from sst_graph.factors import (
 from sst_graph.objects.tracks import ObjectId, object_tracks
 from sst_graph.odometry import LoopClosure, metric_motions
 from sst_graph.slam.align import CameraCalibration, FrameMatching, ScanMotion, align_frame
-from sst_graph.types import RelativeMotion, SemanticClass
+from sst_graph.types import Calibration, RelativeMotion, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
@@ -96,7 +96,7 @@ def with_camera(
     graph: gtsam.NonlinearFactorGraph,
     poses: gtsam.Values,
     drive: Drive,
-    start: tuple[gtsam.Pose3, float],
+    start: Calibration,
     nominal: gtsam.Pose3,
     config: CameraGraphConfig,
 ) -> gtsam.Values:
@@ -105,14 +105,14 @@ def with_camera(
     Args:
         graph, poses: :func:`pose_graph`, and where its poses are.
         drive: of the same scans; poses and scans correspond one to one.
-        start: extrinsic and time offset [s] where the first matches are made.
+        start: calibration where the first matches are made.
         nominal: what the weak prior on the extrinsic is centred on.
         config: settings.
     """
     tracks = object_tracks(drive)
     values = gtsam.Values(poses)
-    values.insert(EXTRINSIC, start[0])
-    values.insert(TIME_OFFSET, np.array([start[1]]))
+    values.insert(EXTRINSIC, start.cTl)
+    values.insert(TIME_OFFSET, np.array([start.time_offset_s]))
     values.insert(BIAS, np.zeros(1))
     for kernel_px in config.kernel_px:
         places = _places(drive, values)

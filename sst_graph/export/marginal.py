@@ -22,6 +22,7 @@ from sst_graph.marginal import EXTRINSIC, FORMAT, TIME_OFFSET, VERSION, Calibrat
 from sst_graph.marginal import carried as _carried
 from sst_graph.marginal import inverse as _inverse
 from sst_graph.result import CalibrationResult
+from sst_graph.types import Calibration
 
 __all__ = [
     "EXTRINSIC",
@@ -59,7 +60,7 @@ def marginal_of_graph(
     E_key: int = EXTRINSIC,
     D_key: int = TIME_OFFSET,
     *,
-    at: tuple[gtsam.Pose3, float] | None = None,
+    at: Calibration | None = None,
 ) -> CalibrationMarginal:
     """A graph's cost on (E, D), everything else eliminated.
 
@@ -68,8 +69,8 @@ def marginal_of_graph(
     Args:
         graph, values: the problem, and where it is linearized: its optimum, as a rule.
         E_key, D_key: keys of extrinsic and time offset in it.
-        at: another point of (cTl, offset [s]) to expand about, such as the fused estimate of several
-            drives. Extrinsic and offset are held there, and the other variables optimised.
+        at: another point to expand about, such as the fused estimate of several drives. Extrinsic and
+            offset are held there, and the other variables optimised.
 
     Raises:
         EstimationError: the other variables are not determined even when E and D are given.
@@ -100,17 +101,18 @@ def _others_at(
     values: gtsam.Values,
     E_key: int,
     D_key: int,
-    at: tuple[gtsam.Pose3, float],
+    at: Calibration,
 ) -> gtsam.Values:
     """Values with (E, D) at a point and the others at their optimum given that."""
+    cTl, time_offset_s = at
     there = gtsam.Values(values)
-    there.update(E_key, at[0])
-    there.update(D_key, np.array([at[1]]))
+    there.update(E_key, cTl)
+    there.update(D_key, np.array([time_offset_s]))
     if there.size() == 2:
         return there
     held = gtsam.NonlinearFactorGraph(graph)
-    held.add(gtsam.NonlinearEqualityPose3(E_key, at[0]))
-    held.add(gtsam.PriorFactorVector(D_key, np.array([at[1]]), gtsam.noiseModel.Constrained.All(1)))
+    held.add(gtsam.NonlinearEqualityPose3(E_key, cTl))
+    held.add(gtsam.PriorFactorVector(D_key, np.array([time_offset_s]), gtsam.noiseModel.Constrained.All(1)))
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-12)
     params.setAbsoluteErrorTol(0.0)
@@ -154,10 +156,10 @@ def fuse_graphs(
     parts = [marginal_of_graph(graph, values, E_key, D_key) for graph, values in graphs]
     fused = fuse_marginals(parts, significance=significance)
     for _ in range(max_rounds):
-        point = fused.cTl, fused.time_offset_s
+        point = Calibration(fused.cTl, fused.time_offset_s)
         parts = [marginal_of_graph(graph, values, E_key, D_key, at=point) for graph, values in graphs]
         fused = fuse_marginals(parts, significance=significance)
-        step = np.append(fused.cTl.localCoordinates(point[0]), fused.time_offset_s - point[1])
+        step = np.append(fused.cTl.localCoordinates(point.cTl), fused.time_offset_s - point.time_offset_s)
         if np.sqrt(step @ fused.information @ step) < tolerance_sigmas:
             return fused, parts
     raise EstimationError(f"fusion of {len(graphs)} drives: still moving after {max_rounds} rounds")

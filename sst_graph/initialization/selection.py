@@ -28,10 +28,10 @@ from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
 from sst_graph.stepwise import Stepwise
+from sst_graph.types import Calibration
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
-_Start = tuple[gtsam.Pose3, float]
 
 SELECTION_SCANS = 10
 """Most scans of each drive that candidates are compared on."""
@@ -79,8 +79,8 @@ class Selection:
         score: of the search's best candidate.
     """
 
-    starts: tuple[_Start, ...]
-    distant: tuple[_Start, ...]
+    starts: tuple[Calibration, ...]
+    distant: tuple[Calibration, ...]
     score: float
 
 
@@ -105,7 +105,7 @@ def select_start_steps(
     """
     candidates = yield from candidate_steps(problem, config)
     if not config.enabled:
-        start = ((candidates[0].cTl, candidates[0].time_offset_s),)
+        start = (Calibration(candidates[0].cTl, candidates[0].time_offset_s),)
         return Selection(start, start, candidates[0].score)
     candidates = candidates[: _CANDIDATES_WITHOUT_GUESS if problem.guess is None else most_candidates]
     selection = yield from select_among_steps(problem, candidates, graph, config, most_scans)
@@ -154,7 +154,8 @@ def select_among_steps(
         raise EstimationError("no candidate of the search leads to a solution near the guess")
     poses, scores = poses.take(order), scores[order]
     good = scores > _SELECTED_RATIO * scores[0]
-    starts = list(zip(_cTls(poses.take(np.flatnonzero(good))), poses.offsets[good].tolist(), strict=True))
+    cTls = _cTls(poses.take(np.flatnonzero(good)))
+    starts = [Calibration(*pair) for pair in zip(cTls, poses.offsets[good].tolist(), strict=True)]
     return Selection(_with_alternative(starts, scores[good]), _far_apart(starts), candidates[0].score)
 
 
@@ -169,21 +170,22 @@ def alternatives(solutions: Sequence[JointSolution]) -> list[JointSolution]:
     return [s for s in solutions if s is best or (agreement(s) > least and not _alike(s.state, best.state))]
 
 
-def _with_alternative(starts: Sequence[_Start], scores: FloatArray) -> tuple[_Start, ...]:
+def _with_alternative(starts: Sequence[Calibration], scores: FloatArray) -> tuple[Calibration, ...]:
     """The first of some starts, best first, after the best one an alternative to it, where there is one."""
-    for number, (cTl, _) in enumerate(starts):
-        if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(starts[0][0], cTl) > _SAME_RAD:
-            others = [start for other, start in enumerate(starts) if other not in (0, number)]
+    best = starts[0].cTl
+    for number, start in enumerate(starts):
+        if scores[number] > ALTERNATIVE_RATIO * scores[0] and _turn_rad(best, start.cTl) > _SAME_RAD:
+            others = [one for other, one in enumerate(starts) if other not in (0, number)]
             return (starts[0], starts[number], *others[: _SELECTED - 1])
     return tuple(starts[:_SELECTED])
 
 
-def _far_apart(starts: Sequence[_Start]) -> tuple[_Start, ...]:
+def _far_apart(starts: Sequence[Calibration]) -> tuple[Calibration, ...]:
     """Some starts that are turned by more than :data:`_FAR_RAD` against every better one."""
-    chosen: list[_Start] = []
-    for cTl, time_offset_s in starts:
-        if all(_turn_rad(cTl, other) > _FAR_RAD for other, _ in chosen):
-            chosen.append((cTl, time_offset_s))
+    chosen: list[Calibration] = []
+    for start in starts:
+        if all(_turn_rad(start.cTl, other.cTl) > _FAR_RAD for other in chosen):
+            chosen.append(start)
     return tuple(chosen[:_DISTANT])
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,7 @@ from sst_graph.features.mask_contour import ContourMap
 from sst_graph.fit import PointResiduals
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.report.html import jpeg, packed, text
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 
 FloatArray = NDArray[np.float64]
 
@@ -36,12 +35,12 @@ class Placements:
     """Where the cloud is drawn: before and after.
 
     Attributes:
-        before: extrinsic and time offset [s] at the start; None without a start.
-        after: of the result.
+        before: at the start; None without a start.
+        after: in the result.
     """
 
-    before: tuple[gtsam.Pose3, float] | None
-    after: tuple[gtsam.Pose3, float]
+    before: Calibration | None
+    after: Calibration
 
 
 def overlay(drawn: DrawnFrame, placements: Placements, points: PointResiduals | None) -> str:
@@ -90,7 +89,7 @@ def classes_of(points: PointResiduals | None) -> list[SemanticClass]:
 
 
 def project_points(
-    drawn: DrawnFrame, points: PointResiduals, placement: tuple[gtsam.Pose3, float]
+    drawn: DrawnFrame, points: PointResiduals, placement: Calibration
 ) -> tuple[FloatArray, FloatArray]:
     """(n, 2) pixels of boundary points of the frame [px], NaN behind the camera, and depths (n,) [m]."""
     cTl, time_offset_s = placement

@@ -39,7 +39,7 @@ from sst_graph.report.uncertainty_charts import (
     profile_charts,
 )
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Source
+from sst_graph.types import Calibration, Source
 
 PICTURES = 3
 """Pictures with the cloud, over all drives."""
@@ -180,9 +180,10 @@ def _points_of(fit: Fit, frame: MatchedFrame) -> np.ndarray[Any, np.dtype[np.boo
 
 def _placements(result: CalibrationResult, drive: str) -> Placements:
     own = {one.drive: one.time_offset_s for one in result.drive_offsets}
-    after = result.T_camera_lidar, own.get(drive, result.time_offset_s)
-    before = None if result.initial is None else (result.initial, result.initial_time_offset_s)
-    return Placements(before, after)
+    after = Calibration(result.T_camera_lidar, own.get(drive, result.time_offset_s))
+    if result.initial is None:
+        return Placements(None, after)
+    return Placements(Calibration(result.initial, result.initial_time_offset_s), after)
 
 
 def _close_ups(inputs: ReportInputs, reader: DriveReader) -> str:

@@ -20,7 +20,7 @@ from sst_graph.errors import ConfigError, MissingDependencyError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.inspect.inspection import HUMAN
 from sst_graph.tracker.track_update import TrackUpdate
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 from sst_graph.viewer.frame_view import FrameView, MatchView
 from sst_graph.viz.overlay import CLASS_COLOURS, IN_MASK, OTHER_COLOUR
 
@@ -90,7 +90,7 @@ class Recording:
         self._first_ns: int | None = None
         self._path: deque[FloatArray] = deque(maxlen=_MOST_POSES)
         self._tracks: dict[int, deque[FloatArray]] = {}
-        self._reference: tuple[gtsam.Pose3, float] | None = None
+        self._reference: Calibration | None = None
         self._said: tuple[object, ...] = ()
         self._log_static()
 
@@ -140,7 +140,7 @@ class Recording:
         if update.frame is not None:
             self._at(update.frame, update.stamp_ns if stamp_ns is None else stamp_ns)
         if self._reference is None:
-            self._reference = update.T_camera_lidar, update.time_offset_s
+            self._reference = Calibration(update.T_camera_lidar, update.time_offset_s)
         if update.covariance is not None:
             self.estimate(update.T_camera_lidar, update.time_offset_s, update.sigmas)
         rr = self._rr
@@ -159,7 +159,7 @@ class Recording:
             sigmas: (7,) [rad, m, s].
         """
         if self._reference is None:
-            self._reference = cTl, time_offset_s
+            self._reference = Calibration(cTl, time_offset_s)
         start, offset_s = self._reference
         change = HUMAN * np.array([*gtsam.Pose3.Logmap(start.inverse() * cTl), time_offset_s - offset_s])
         band = 2.0 * HUMAN * sigmas

@@ -14,7 +14,6 @@ from stored import simulated, written
 from sst_graph.association.nearest import ClassView
 from sst_graph.baselines.nearest_pixel_frames import (
     EXTRINSIC,
-    Calibration,
     MatchFrame,
     frame_pairs,
     match_frames,
@@ -39,7 +38,7 @@ from sst_graph.factors import beta_regularizer
 from sst_graph.metrics import CalibrationErrors, calibration_errors
 from sst_graph.result import CalibrationResult, read_result
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import GroundTruth, SemanticClass
+from sst_graph.types import Calibration, GroundTruth, SemanticClass
 
 METHODS = ("paper", "static", "semalign")
 OFFSET_S = 0.15
