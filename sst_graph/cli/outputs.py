@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.messages import complain
 from sst_graph.cli.pictures import ShownFrame, overlay, png, telling_positions
 from sst_graph.cli.progress import ProgressBar, ProgressStage
@@ -125,10 +126,15 @@ def exit_code(result: CalibrationResult) -> int:
     """
     if result.status == "ok":
         return 0
+    complain(why_not_ok(result))
+    return EXIT_NOT_TRUSTED
+
+
+def why_not_ok(result: CalibrationResult) -> str:
+    """Status and first reason of a result that is not ok, in one line."""
     first, *others = short_reasons(result) or ("the result carries no reason",)
     more = f" ({len(others)} more in the summary; in full in the report)" if others else ""
-    complain(f"{result.status}: {first}{more}")
-    return 3
+    return f"{result.status}: {first}{more}"
 
 
 def check_apart(

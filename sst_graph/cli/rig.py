@@ -13,17 +13,24 @@ import gtsam
 import numpy as np
 
 from sst_graph.batch import CalibrationConfig
+from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import calibration_settings, open_drives, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, mention, say
-from sst_graph.cli.outputs import CALIBRATION, check_apart, comparison, result_numbers, write_calibration
+from sst_graph.cli.outputs import (
+    CALIBRATION,
+    check_apart,
+    comparison,
+    result_numbers,
+    why_not_ok,
+    write_calibration,
+)
 from sst_graph.cli.progress import ProgressBar
 from sst_graph.cli.reading import options_of, warn_of_other_pairs
 from sst_graph.cli.video import video_of, videos_beside
 from sst_graph.errors import ConfigError
 from sst_graph.files import atomic_directory
 from sst_graph.files.strict_json import strict_json
-from sst_graph.inspect.reasons import short_reasons
 from sst_graph.inspect.report import Comparison, summary
 from sst_graph.result import CalibrationResult
 from sst_graph.rig import KnownPose, KnownRig, RelativePose, RigResult, calibrate_rig, read_rig
@@ -264,7 +271,5 @@ def _exit_code(rig: RigResult) -> int:
         return 0
     bad = {name: result for name, result in rig.cameras.items() if result.status != "ok"}
     for name, result in bad.items():
-        first, *others = short_reasons(result) or ("the result carries no reason",)
-        more = f" ({len(others)} more in the summary; in full in the report)" if others else ""
-        complain(f"{name}: {result.status}: {first}{more}")
-    return 3
+        complain(f"{name}: {why_not_ok(result)}")
+    return EXIT_NOT_TRUSTED

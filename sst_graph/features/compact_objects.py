@@ -60,11 +60,6 @@ class CompactObjects:
     kinds: NDArray[np.uint8]
     heights_m: FloatArray
 
-    @property
-    def kind_of_points(self) -> NDArray[np.uint8]:
-        """(n,) kind of each point's object."""
-        return np.asarray(self.kinds[self.numbers])
-
 
 def find_compact_objects(
     points: FloatArray, rings: NDArray[np.integer] | None, beams: Beams | None = None

@@ -17,7 +17,7 @@ from sst_graph.errors import DataError
 from sst_graph.files.checked_values import checked_pose, checked_time_offset_s
 from sst_graph.files.yaml_file import number, numbers
 from sst_graph.imports.document import Document
-from sst_graph.imports.frames import ImportOptions
+from sst_graph.imports.frames import Found, ImportOptions
 
 Table = Mapping[str, Any]
 
@@ -43,7 +43,7 @@ def dialects(table: Table) -> set[str]:
     return found
 
 
-def read_chain(document: Document, options: ImportOptions) -> tuple[gtsam.Pose3, float | None, str]:
+def read_chain(document: Document, options: ImportOptions) -> Found:
     """cTl and time offset [s] of a camera of a chain, and what was taken for what.
 
     Raises:
@@ -64,10 +64,11 @@ def read_chain(document: Document, options: ImportOptions) -> tuple[gtsam.Pose3,
         at = f"{document.path}: {lidar_name}"
         of_lidar = _seconds(lidar_entry, "timeoffset", at) or 0.0
         shift = None if shift is None else shift - of_lidar
-        return cTi * _pose(lidar_entry, "T_imu_lidar", at), shift, f"{said}, T_imu_lidar of {lidar_name}"
+        cTl = cTi * _pose(lidar_entry, "T_imu_lidar", at)
+        return Found(cTl, shift, f"{said}, T_imu_lidar of {lidar_name}")
     if options.parent is None:
-        return cTi, shift, f"{said}: the LiDAR in the IMU's place"
-    return cTi * _in_tree(options, document), shift, f"{said}: {options.parent} in the IMU's place"
+        return Found(cTi, shift, f"{said}: the LiDAR in the IMU's place")
+    return Found(cTi * _in_tree(options, document), shift, f"{said}: {options.parent} in the IMU's place")
 
 
 def _in_tree(options: ImportOptions, document: Document) -> gtsam.Pose3:

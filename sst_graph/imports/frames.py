@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import gtsam
 
@@ -27,6 +28,20 @@ _LIDAR = re.compile(
     r"lidar|laser|velodyne|ouster|livox|hesai|pandar|rslidar|robosense|(^|_)(vlp|hdl|os)[-_]?\d", re.I
 )
 _CAMERA = re.compile(r"cam|optical|image", re.I)
+
+
+class Found(NamedTuple):
+    """What a reader of one format finds in a file.
+
+    Attributes:
+        cTl: pose of the LiDAR in the camera's optical frame.
+        time_offset_s: None where the file does not say it.
+        taken: what was taken for what, in words.
+    """
+
+    cTl: gtsam.Pose3
+    time_offset_s: float | None
+    taken: str
 
 
 @dataclass(frozen=True)

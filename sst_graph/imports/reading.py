@@ -14,7 +14,7 @@ from sst_graph.data.ros.transforms import Transforms
 from sst_graph.errors import ConfigError, DataError
 from sst_graph.imports import chains, launch, records, tables, urdf
 from sst_graph.imports.document import Document, read_document
-from sst_graph.imports.frames import ImportOptions, extrinsic_between, stated_time_offset_s
+from sst_graph.imports.frames import Found, ImportOptions, extrinsic_between, stated_time_offset_s
 from sst_graph.marginal import FORMAT as MARGINAL_FORMAT
 from sst_graph.types import ByValue
 
@@ -149,16 +149,15 @@ def _kitti(document: Document, options: ImportOptions, form: str) -> ImportedCal
     return ImportedCalibration(cTl, None, form, f"Tr, carried to {camera} by its line P")
 
 
-_Found = tuple[gtsam.Pose3, float | None, str]
 _Reader = Callable[[Document, ImportOptions, str], ImportedCalibration]
 
 
-def _by(read: Callable[[Document, ImportOptions], _Found]) -> _Reader:
+def _by(read: Callable[[Document, ImportOptions], Found]) -> _Reader:
     """Of a reader that knows what the poses of its format are."""
 
     def imported(document: Document, options: ImportOptions, form: str) -> ImportedCalibration:
-        cTl, time_offset_s, taken = read(document, options)
-        return ImportedCalibration(cTl, time_offset_s, form, taken)
+        found = read(document, options)
+        return ImportedCalibration(found.cTl, found.time_offset_s, form, found.taken)
 
     return imported
 

@@ -16,15 +16,13 @@ from sst_graph.files.checked_values import checked_pose, checked_time_offset_s
 from sst_graph.files.json_table import JsonTable
 from sst_graph.files.yaml_file import number, numbers
 from sst_graph.imports.document import Document
-from sst_graph.imports.frames import ImportOptions, is_of_camera
+from sst_graph.imports.frames import Found, ImportOptions, is_of_camera
 from sst_graph.marginal import CalibrationMarginal
 from sst_graph.result import UNNAMED_CAMERA
 
 Table = Mapping[str, Any]
 _MOST_RADIANS = 100.0
 """Length of a rotation vector; what is longer is of another unit."""
-
-Found = tuple[gtsam.Pose3, float | None, str]
 
 
 def read_own(document: Document, options: ImportOptions) -> Found:
@@ -36,7 +34,8 @@ def read_own(document: Document, options: ImportOptions) -> Found:
     table = JsonTable(document.json, str(document.path))
     _check_camera(table.data.get("camera"), options.camera, document.path)
     known = table.data.get("time_offset_s") is not None
-    return table.pose("T_camera_lidar"), table.time_offset_s("time_offset_s") if known else None, "as it is"
+    time_offset_s = table.time_offset_s("time_offset_s") if known else None
+    return Found(table.pose("T_camera_lidar"), time_offset_s, "as it is")
 
 
 def _check_camera(found: object, camera: str | None, path: Path) -> None:
@@ -55,9 +54,10 @@ def read_gtsam(document: Document, options: ImportOptions) -> Found:
         DataError: no marginal.
         EstimationError: a marginal that leaves a direction open.
     """
-    cTl, time_offset_s = CalibrationMarginal.from_json(document.text, document.path).best()
+    best = CalibrationMarginal.from_json(document.text, document.path).best()
     place = f"{document.path} (optimum)"
-    return checked_pose(cTl.matrix(), place), checked_time_offset_s(time_offset_s, place), "the optimum"
+    cTl = checked_pose(best.cTl.matrix(), place)
+    return Found(cTl, checked_time_offset_s(best.time_offset_s, place), "the optimum")
 
 
 def is_opencv(table: Table) -> bool:
@@ -89,7 +89,7 @@ def read_opencv(document: Document, options: ImportOptions) -> Found:
     stated = entry.get("time_offset_s")
     at = f"{place}: time_offset_s"
     time_offset_s = None if stated is None else checked_time_offset_s(number(stated, at), at)
-    return checked_pose(matrix, f"{place}: {said}"), time_offset_s, said
+    return Found(checked_pose(matrix, f"{place}: {said}"), time_offset_s, said)
 
 
 def _opencv_cameras(table: Table) -> dict[str, Table]:
@@ -131,7 +131,7 @@ def read_nuscenes(document: Document, options: ImportOptions) -> Found:
     table = JsonTable(camera, str(document.path))
     known = camera.get("time_offset_s") is not None
     time_offset_s = table.time_offset_s("time_offset_s") if known else None
-    return cTl, time_offset_s, f"{_channel(camera)} and {_channel(lidar)} in the ego frame"
+    return Found(cTl, time_offset_s, f"{_channel(camera)} and {_channel(lidar)} in the ego frame")
 
 
 def _record(records: list[Any], name: str | None, document: Document, what: str) -> Any:

@@ -46,7 +46,6 @@ class DirectionMotion:
             direction in the basis of ``gtsam.Unit3(direction)`` in rad].
         inliers: (n,) tracks that agree.
         noise_px: sigma of a track's coordinate [px].
-        parallax_px: root mean square motion of the inliers that rotation does not explain [px].
         ok: whether the direction means anything; where False its sigma is pi, and only the
             rotation (ok or not, see its covariance) can be used.
     """
@@ -57,7 +56,6 @@ class DirectionMotion:
     covariance: FloatArray
     inliers: BoolArray
     noise_px: float
-    parallax_px: float
     ok: bool
 
 
@@ -85,9 +83,7 @@ def relative_pose(tracks: Tracks, camera: PinholeCamera) -> DirectionMotion:
     if size > _MIN_PARALLAX_RATIO * np.sqrt(2.0) * best.noise_px:
         direction = best.direction * _side(best.rotation, best.direction, fa[best.inliers], fb[best.inliers])
         found, turn = gtsam.Rot3(best.rotation), gtsam.Rot3(rotation)
-        return DirectionMotion(
-            found, turn, direction, best.covariance, best.inliers, best.noise_px, size, True
-        )
+        return DirectionMotion(found, turn, direction, best.covariance, best.inliers, best.noise_px, True)
     return _turn(rotation, left, fb, camera)
 
 
@@ -99,8 +95,8 @@ def _turn(aRb: FloatArray, left: FloatArray, fb: FloatArray, camera: PinholeCame
     if np.count_nonzero(inliers) >= _MIN_TRACKS:
         J = _rotation_jacobian(np.eye(3), fb[inliers], camera)
         covariance[:3, :3] = noise**2 * np.linalg.inv(J.T @ J)
-    size, forward = _trimmed_size(left[inliers]), np.array([0.0, 0.0, 1.0])
-    return DirectionMotion(gtsam.Rot3(aRb), gtsam.Rot3(aRb), forward, covariance, inliers, noise, size, False)
+    forward = np.array([0.0, 0.0, 1.0])
+    return DirectionMotion(gtsam.Rot3(aRb), gtsam.Rot3(aRb), forward, covariance, inliers, noise, False)
 
 
 def rays(uvs: FloatArray, camera: PinholeCamera) -> FloatArray:
@@ -328,13 +324,5 @@ def _rotation_jacobian(aRb: FloatArray, fa: FloatArray, camera: PinholeCamera) -
 def _unknown(n: int) -> DirectionMotion:
     """Nothing known: too few tracks."""
     covariance = np.diag([1.0] * 3 + [np.pi**2] * 2)
-    return DirectionMotion(
-        gtsam.Rot3(),
-        gtsam.Rot3(),
-        np.array([0.0, 0.0, 1.0]),
-        covariance,
-        np.zeros(n, np.bool_),
-        1.0,
-        0.0,
-        False,
-    )
+    rotation, forward = gtsam.Rot3(), np.array([0.0, 0.0, 1.0])
+    return DirectionMotion(rotation, rotation, forward, covariance, np.zeros(n, np.bool_), 1.0, False)

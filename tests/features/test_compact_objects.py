@@ -49,9 +49,9 @@ def test_a_box_and_a_pole_on_sloping_ground(slope: float) -> None:
     box = (np.abs(points[:, 0] - 10.0) < 1e-6) & (heights > 0.3)
     pole = (np.abs(points[:, 0] - 12.0) < 1e-6) & (heights > 0.3)
     assert len(set(found.numbers[box])) == len(set(found.numbers[pole])) == 1
-    assert (found.kind_of_points[box] == Kind.VEHICLE_LIKE).all()
-    assert (found.kind_of_points[pole] == Kind.POLE_LIKE).all()
-    assert (found.kind_of_points[heights < 0.1] == Kind.GROUND).all()
+    assert (found.kinds[found.numbers][box] == Kind.VEHICLE_LIKE).all()
+    assert (found.kinds[found.numbers][pole] == Kind.POLE_LIKE).all()
+    assert (found.kinds[found.numbers][heights < 0.1] == Kind.GROUND).all()
 
 
 def test_returns_from_below_the_road_do_not_lower_it() -> None:
@@ -69,7 +69,8 @@ def test_nothing_in_a_scan_without_points() -> None:
 
 def recall(points: np.ndarray, rings: np.ndarray | None, vehicles: np.ndarray) -> tuple[int, int]:
     """Points of vehicles within 45 m that are of compact objects, and all of them."""
-    kinds = find_compact_objects(points.astype(np.float64), rings).kind_of_points
+    found = find_compact_objects(points.astype(np.float64), rings)
+    kinds = found.kinds[found.numbers]
     near = vehicles & (np.linalg.norm(points, axis=1) < 45.0)
     compact = (kinds == Kind.VEHICLE_LIKE) | (kinds == Kind.POLE_LIKE)
     return int(np.count_nonzero(compact & near)), int(np.count_nonzero(near))

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.inputs import chosen_classes, settings, starting_point
 from sst_graph.cli.labels import check_classes
 from sst_graph.cli.messages import complain, say
@@ -202,4 +203,4 @@ def _verdict(last: TrackUpdate, result: CalibrationResult) -> int:
     if last.status == "ok":
         return 0
     complain(f"{last.status}: {'; '.join(result.reasons)}")
-    return 3
+    return EXIT_NOT_TRUSTED

@@ -171,15 +171,10 @@ class _Knots:
         return cls(some, uvs, cells, weights[:, 1], weights[:, 0], slopes[:, 1], slopes[:, 0])
 
     def joint(self) -> FloatArray:
-        """(bins, bins) joint histogram of grey levels and intensities."""
+        """(bins, bins) joint histogram of grey levels and intensities, weighted over 4 x 4 pixels."""
         weight = self.rows[:, :, None] * self.columns[:, None, :]
         histogram = np.bincount(self.cells.ravel(), weight.ravel(), _NID_BINS**2)
         return np.asarray(histogram.reshape(_NID_BINS, _NID_BINS), dtype=np.float64)
-
-
-def joint_by_spline(seen: _Seen, cTl: gtsam.Pose3) -> FloatArray:
-    """(bins, bins) joint histogram of grey levels and intensities, by B-spline weights over 4 x 4 pixels."""
-    return _Knots.of(seen, cTl).joint()
 
 
 def nid_by_spline(seen: _Seen, cTl: gtsam.Pose3) -> tuple[float, FloatArray]:

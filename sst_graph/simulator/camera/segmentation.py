@@ -29,7 +29,6 @@ BORDER_POINTS = 0.12
 
 Labels = NDArray[np.uint8]
 Numbers = NDArray[np.uint16]
-OBJECTS = (Kind.CAR, Kind.TRUCK, Kind.PERSON)
 
 
 def noisy_mask(

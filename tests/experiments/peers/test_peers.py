@@ -110,7 +110,7 @@ def test_weights_of_a_point_add_up_to_one() -> None:
     assert frame.intensities is not None
     seen = statistics._Seen(frame, frame.grey, frame.lPs, frame.intensities)
     inside, _ = frame.pixels(street()[0], frame.lPs)
-    assert statistics.joint_by_spline(seen, street()[0]).sum() == pytest.approx(len(inside))
+    assert statistics._Knots.of(seen, street()[0]).joint().sum() == pytest.approx(len(inside))
     assert statistics.joint_by_pixel(seen, street()[0]).sum() == len(inside)
 
 

@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from sst_graph.cli import EXIT_NOT_TRUSTED
 from sst_graph.cli.commands.batch.ending import children_ended
 from sst_graph.cli.commands.batch.progress import ProgressOnStderr
 from sst_graph.cli.inputs import calibration_settings
@@ -48,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         told.close()
         outcome = write_summary(drives, records, out, config)
     _say(outcome, out)
-    return 0 if outcome.all_fine else 3
+    return 0 if outcome.all_fine else EXIT_NOT_TRUSTED
 
 
 def _config(args: argparse.Namespace) -> BatchConfig:
