@@ -33,6 +33,7 @@ SECTIONS: dict[str, list[str]] = {
         "sst_graph.calibrate",
         "sst_graph.CalibrationConfig",
         "sst_graph.CalibrationResult",
+        "sst_graph.Calibration",
         "sst_graph.read_result",
         "sst_graph.inspect_result",
     ],

@@ -23,11 +23,12 @@ if TYPE_CHECKING:
     from sst_graph.slam.moving_objects import follow_objects
     from sst_graph.slam.solving import solve_with_terms
     from sst_graph.tracker import Tracker, TrackerConfig, TrackUpdate
-    from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
+    from sst_graph.types import Calibration, CameraImage, Frame, Scan, SemanticClass, Source
 
 __all__ = [
     "AlignmentKeys",
     "AlignmentTerm",
+    "Calibration",
     "CalibrationConfig",
     "CalibrationMarginal",
     "CalibrationResult",
@@ -64,6 +65,7 @@ __all__ = [
 _HOMES = {
     "AlignmentKeys": "sst_graph.slam.alignment_keys",
     "AlignmentTerm": "sst_graph.slam.alignment_term",
+    "Calibration": "sst_graph.types",
     "CalibrationConfig": "sst_graph.batch",
     "CalibrationMarginal": "sst_graph.export",
     "CalibrationResult": "sst_graph.result",

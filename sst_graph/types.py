@@ -10,7 +10,7 @@ from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, Protocol
 
 import gtsam
 import numpy as np
@@ -204,10 +204,9 @@ class Frame(ByValue):
     image: CameraImage | None
 
 
-class Calibration(NamedTuple):
-    """An extrinsic and a time offset, the two things that this package estimates.
-
-    Two are equal where both numbers are, bit by bit.
+@dataclass(frozen=True, eq=False)
+class Calibration(ByValue):
+    """An extrinsic and a time offset: what this package estimates. ``cTl, time_offset_s = calibration``.
 
     Attributes:
         cTl: pose of the LiDAR in the camera.
@@ -222,11 +221,8 @@ class Calibration(NamedTuple):
         xi = gtsam.Pose3.Logmap(self.cTl.between(other.cTl))
         return np.append(np.asarray(xi, dtype=np.float64), other.time_offset_s - self.time_offset_s)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Calibration) and _value(self) == _value(other)
-
-    def __hash__(self) -> int:
-        return hash(_value(self))
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.cTl, self.time_offset_s))
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,7 +51,7 @@ def test_result_as_a_start(tmp_path: Path) -> None:
 def test_an_unknown_offset_stays_unknown(tmp_path: Path) -> None:
     path = _write(tmp_path / "groundtruth.json", time_offset_s=None)
     assert read_reference(path).time_offset_s is None
-    assert load_initial(path)[1] == 0.0
+    assert load_initial(path).time_offset_s == 0.0
 
 
 @pytest.mark.parametrize("camera", ["image_3", {"name": "image_3"}])

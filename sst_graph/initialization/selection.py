@@ -73,8 +73,8 @@ class Selection:
     """Selected starts.
 
     Attributes:
-        starts: (cTl, offset [s]) of the best supported solutions, no two alike; the best first, then one
-            that is nearly as good and not near it, where there is one.
+        starts: the best supported solutions, no two alike; the best first, then one that is nearly as good
+            and not near it, where there is one.
         distant: the best, and those nearly as good that are far from it and from each other.
         score: of the search's best candidate.
     """

@@ -54,7 +54,7 @@ class TrackUpdate(ByValue):
         estimated: value and standard deviation of each parameter that is estimated beside the calibration, by
             its assumption's name, in its unit; empty while there is no estimate.
         undecided_sweep: that the scans do not show whether they are compensated for the sweep, where it
-            matters (:meth:`Tracker.use_sweep`); else empty.
+            matters; else empty.
     """
 
     stamp_ns: int

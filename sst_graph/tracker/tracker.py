@@ -63,8 +63,17 @@ class Tracker:
         config: TrackerConfig | None = None,
         initial: gtsam.Pose3 | None = None,
         initial_time_offset_s: float = 0.0,
+        sweep: SweepDecision | None = None,
     ) -> None:
-        """initial: rough guess of cTl, or None when nothing is known; the offset's beside it [s]."""
+        """
+        Args:
+            camera: of all images.
+            config: settings; the defaults fit driving data.
+            initial: rough guess of cTl, or None when nothing is known.
+            initial_time_offset_s: rough guess of the time offset [s].
+            sweep: what was decided of the sweep of the scans (``SweptSource.sweep_decision``). Undecided, its
+                effect is in the covariance, and where it matters no estimate is ``ok``.
+        """
         self.setup = Setup(camera, config or TrackerConfig(), initial, initial_time_offset_s)
         config = self.setup.config.estimating
         guess = Guess(initial, initial_time_offset_s, search=config.calibration.search.enabled)
@@ -72,15 +81,9 @@ class Tracker:
         self.matcher = WindowMatcher(self.inputs.window, config)
         self.initializer = Initializer(guess, config)
         self.estimate = OnlineEstimate(self.matcher, config, guess)
+        self.estimate.sweep = sweep
         self.monitor = Monitor(self.matcher, config)
         self.last_update: TrackUpdate | None = None
-
-    def use_sweep(self, decision: SweepDecision | None) -> None:
-        """Tell what was decided of the sweep of the scans (``SweptSource.sweep_decision``).
-
-        Undecided, its effect is in the covariance, and where it matters no estimate is ``ok``.
-        """
-        self.estimate.sweep = decision
 
     def add(self, frame: Frame) -> TrackUpdate:
         """Add a frame's image and scan; either may be missing, and either may be refused alone."""

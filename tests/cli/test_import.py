@@ -69,7 +69,7 @@ def test_names_of_frames(result_file: Path, tmp_path: Path, capsys: pytest.Captu
     )
     out = tmp_path / "start.json"
     assert main(["import", str(exported), *names, "--out", str(out)]) == 0
-    assert load_initial(out)[0].equals(RESULT.T_camera_lidar, 1e-9)
+    assert load_initial(out).cTl.equals(RESULT.T_camera_lidar, 1e-9)
     assert main(["import", str(exported), *names, "--out", str(out)]) == 2
     assert "--overwrite" in capsys.readouterr().err
 

@@ -40,7 +40,7 @@ from sst_graph.initialization.selection import (
     select_start_steps,
 )
 from sst_graph.stepwise import run_to_end
-from sst_graph.types import SemanticClass
+from sst_graph.types import Calibration, SemanticClass
 
 VEHICLE = SemanticClass.VEHICLE
 JOINT, START = JointConfig(), SearchConfig()
@@ -102,7 +102,7 @@ def test_the_truth_agrees_best() -> None:
 
 def test_the_best_start_comes_first_then_its_alternative() -> None:
     """An alternative is turned by more than 2 degrees and has 90 % of the score."""
-    starts = [(turned(0.0, 0.0, a), 0.1 * k) for k, a in enumerate((0.0, 1.0, 5.0, 9.0))]
+    starts = [Calibration(turned(0.0, 0.0, a), 0.1 * k) for k, a in enumerate((0.0, 1.0, 5.0, 9.0))]
     for scores, chosen in (
         ([10.0, 9.8, 9.5, 9.3], [0, 2, 1]),
         ([10.0, 9.8, 8.0, 7.5], [0, 1]),
@@ -113,8 +113,8 @@ def test_the_best_start_comes_first_then_its_alternative() -> None:
 
 
 def test_distant_starts_are_far_apart_and_the_best_comes_first() -> None:
-    starts = [(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0, 170.0)]
-    assert [round(off_deg(cTl)) for cTl, _ in _far_apart(starts)] == [0, 60, 120]
+    starts = [Calibration(turned(0.0, 0.0, a), 0.0) for a in (0.0, 10.0, 60.0, 65.0, 120.0, 170.0)]
+    assert [round(off_deg(start.cTl)) for start in _far_apart(starts)] == [0, 60, 120]
 
 
 def test_the_right_one_of_three_is_selected() -> None:
@@ -122,7 +122,7 @@ def test_the_right_one_of_three_is_selected() -> None:
         Candidate(turned(*a), 0.0, 1.0) for a in ((25.0, 0.0, 0.0), (0.0, 1.0, 2.0), (0.0, -30.0, 0.0))
     ]
     selection = run_to_end(select_among_steps(start_problem(truth()), candidates, JOINT.graph, START))
-    assert off_deg(selection.starts[0][0]) < 1.0
+    assert off_deg(selection.starts[0].cTl) < 1.0
     assert len(selection.starts) <= 3
 
 
@@ -138,7 +138,7 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
     rough = turned(8.0, -6.0, 9.0) if guess else None
     selection: Selection = run_to_end(select_start_steps(start_problem(rough), JOINT.graph, START))
     # It leads where the truth leads, which with the few vehicles of this street is 0.9 deg away.
-    start = selection.starts[0][0]
+    start = selection.starts[0].cTl
     problem = JointProblem([prepared_street()], Tracks([prepared_street()]), JOINT)
     found, best = (solve_joint(problem, State(cTl)).state.cTl for cTl in (start, truth()))
     assert off_deg(best) < 1.0
@@ -149,7 +149,7 @@ def test_a_start_from_a_rough_guess_or_none(guess: bool) -> None:
 def test_without_a_search_the_guess_is_the_start() -> None:
     off, guess = replace(START, enabled=False), turned(1.0, 0.0, 0.0)
     selection = run_to_end(select_start_steps(start_problem(guess, 0.1), JOINT.graph, off))
-    assert selection.starts == ((guess, 0.1),)
+    assert selection.starts == (Calibration(guess, 0.1),)
     with pytest.raises(EstimationError, match="no guess"):
         run_to_end(select_start_steps(start_problem(None), JOINT.graph, off))
 

@@ -25,7 +25,7 @@ from sst_graph.report.close_ups import COUNT, telling_detections
 from sst_graph.report.drawn_frame import DriveReader
 from sst_graph.report.overlay import project_points
 from sst_graph.result import CalibrationResult
-from sst_graph.types import Source
+from sst_graph.types import Calibration, Source
 
 CHROMIUM = next(
     (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))),
@@ -197,14 +197,14 @@ def test_points_are_drawn_where_their_residuals_say() -> None:
     points = fit.points.take(fit.points.frames == frame)
     drawn = DriveReader([crowded_street()]).frame(fit.frames[frame])
     assert drawn is not None
-    uvs, depths = project_points(drawn, points, (result.T_camera_lidar, result.time_offset_s))
+    uvs, depths = project_points(drawn, points, Calibration(result.T_camera_lidar, result.time_offset_s))
     across = ((uvs - points.pixels) * points.normals).sum(axis=1)
     assert np.ptp(points.residuals_px - across) < 0.05  # the mask bias, the same for all
     assert (depths > 0.0).all()
     # And so do their derivatives.
     step = np.array([2e-6, -1e-6, 3e-6, 1e-5, 2e-5, -1e-5, 1e-5])
     cTl = result.T_camera_lidar.compose(gtsam.Pose3.Expmap(step[:6]))
-    moved, _ = project_points(drawn, points, (cTl, result.time_offset_s + step[6]))
+    moved, _ = project_points(drawn, points, Calibration(cTl, result.time_offset_s + step[6]))
     assert ((moved - uvs) * points.normals).sum(axis=1) == pytest.approx(points.J @ step, abs=1e-5)
 
 

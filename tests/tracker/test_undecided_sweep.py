@@ -47,8 +47,8 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     assert decision.kind == "undecided" and len(decision.others) == 2
     trackers = []
     for of_sweep in (None, decision):
-        tracker = Tracker(drive.camera, with_overrides(TrackerConfig(), streets.SOON), drive.nominal)
-        tracker.use_sweep(of_sweep)
+        config = with_overrides(TrackerConfig(), streets.SOON)
+        tracker = Tracker(drive.camera, config, drive.nominal, sweep=of_sweep)
         lines = [tracker.add(frame) for frame in drive]
         trackers.append((tracker, lines, tracker.optimize()))
     (_, _, plain), (tracker, lines, last) = trackers
@@ -59,10 +59,10 @@ def test_tracker_and_batch_agree_about_it(tmp_path: Path) -> None:
     result = tracker.result()
     assert result.status == "not_converged" and result.reasons == (last.undecided_sweep,)
     # As much as the batch finds by solving again.
-    config = with_overrides(CalibrationConfig(), ["search.enabled=false", "use_motion=never"])
-    batch = calibrate(source, drive.nominal, config)
+    settings = with_overrides(CalibrationConfig(), ["search.enabled=false", "use_motion=never"])
+    batch = calibrate(source, drive.nominal, settings)
     assert batch.status == "not_converged" and "it matters" in batch.reasons[-1]
-    alone = calibrate(SweptSource(drive, SweepDecision("given", TIMING)), drive.nominal, config)
+    alone = calibrate(SweptSource(drive, SweepDecision("given", TIMING)), drive.nominal, settings)
     by_batch = np.sqrt(np.diag(batch.covariance - alone.covariance))
     by_tracker = np.sqrt(np.diag(last.covariance - plain.covariance))
     # Forward and time offset, which a sweep at constant speed moves, and yaw.

@@ -163,9 +163,8 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
         warn_of_other_pairs(args.init, options_of(args))
     if not (args.resume and args.checkpoint.exists()):
         initial, time_offset_s = starting_point(args.init or "dataset", source, args.camera)
-        tracker = Tracker(source.camera, config, initial, time_offset_s)
         swept = with_sweep(source, config.calibration.decide_sweep)
-        tracker.use_sweep(swept.sweep_decision)
+        tracker = Tracker(source.camera, config, initial, time_offset_s, swept.sweep_decision)
         return tracker, swept, iter(swept)
     tracker = Tracker.load(args.checkpoint)
     made = tracker.setup
@@ -176,7 +175,7 @@ def _begun(args: argparse.Namespace, source: Source) -> tuple[Tracker, SweptSour
     asked = settings(made.config, args, flags)
     check_setup(tracker, Setup(source.camera, asked, initial, time_offset_s), args.checkpoint)
     swept = with_sweep(source, made.config.calibration.decide_sweep)
-    tracker.use_sweep(swept.sweep_decision)
+    tracker.estimate.sweep = swept.sweep_decision
     return tracker, swept, frames_to_come(tracker, swept, args.checkpoint)
 
 
