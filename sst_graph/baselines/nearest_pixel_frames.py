@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -21,7 +20,6 @@ from sst_graph.result import FrameId
 from sst_graph.types import Calibration, SemanticClass
 
 FloatArray = NDArray[np.float64]
-T = TypeVar("T")
 
 TIME_OFFSET = time_offset_key(0)
 
@@ -61,12 +59,6 @@ def frame_pairs(drives: Sequence[Drive]) -> list[FramePair]:
             if image.index in scans:
                 pairs.append(FramePair(number, position, scans[image.index], image))
     return pairs
-
-
-def spread(items: Sequence[T], most: int) -> list[T]:
-    """At most ``most`` of the items, evenly spread over them."""
-    places = np.linspace(0, len(items) - 1, min(most, len(items))).round().astype(int)
-    return [items[place] for place in places]
 
 
 @dataclass(frozen=True)

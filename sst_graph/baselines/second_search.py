@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sst_graph.baselines.nearest_pixel_frames import MatchFrame, spread
+from sst_graph.baselines.nearest_pixel_frames import MatchFrame
 from sst_graph.drive.preparation import Drive
 from sst_graph.initialization.global_search import (
     FINE,
@@ -18,6 +18,7 @@ from sst_graph.initialization.global_search import (
     search_steps,
 )
 from sst_graph.initialization.label_agreement import CELLS, LabelledPoints, SearchFrame, States
+from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import run_to_end
 from sst_graph.types import Calibration, SemanticClass
 
@@ -70,7 +71,7 @@ def search_again(
     """
     numbers = [frame.pair.drive for frame in frames]
     richest = max(set(numbers), key=numbers.count)
-    own = spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
+    own = evenly_spread([frame for frame in frames if frame.pair.drive == richest], FRAMES)
     chosen = [_search_frame(frame, result) for frame in own]
     camera = drives[richest].camera
     problem = SearchProblem(chosen, camera, classes, result.cTl, result.time_offset_s, config)

@@ -20,7 +20,6 @@ from sst_graph.baselines.nearest_pixel_frames import (
     frame_pairs,
     frozen_covariance,
     match_frames,
-    spread,
     step_once,
 )
 from sst_graph.config import Settings, internal, setting
@@ -29,6 +28,7 @@ from sst_graph.errors import EstimationError
 from sst_graph.factors import beta_regularizer
 from sst_graph.graph.state import EXTRINSIC
 from sst_graph.odometry import metric_motions, standstill_frames
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import Calibration, RelativeMotion, SemanticClass
 
 _LOG = logging.getLogger(__name__)
@@ -151,7 +151,7 @@ class PaperProblem:
     def frames(self, pairs: Sequence[FramePair], most: int | None = None) -> list[MatchFrame]:
         """Frames of those pairs that show a class to both sensors; at most so many, evenly spread."""
         found = match_frames(pairs, self.drives, self.classes, _PIXEL_SHARE, self.config.seed)
-        return found if most is None else spread(found, most)
+        return found if most is None else evenly_spread(found, most)
 
     def still(self, stands: Sequence[NDArray[np.bool_]]) -> list[MatchFrame]:
         """Standing frames for the static stage."""
@@ -229,7 +229,7 @@ def still_frames(problem: PaperProblem, guess: Calibration) -> StillFrames:
         names = " or ".join(c.name.lower() for c in problem.classes)
         raise EstimationError(f"no frame in which LiDAR and camera both show {names}")
     return StillFrames(
-        tuple(spread(every, problem.config.static_frames)),
+        tuple(evenly_spread(every, problem.config.static_frames)),
         ("no frame is known to stand: motion between scan and image was ignored",),
     )
 

@@ -20,6 +20,7 @@ from sst_graph.fit import MatchedFrame
 from sst_graph.odometry.lidar import lidar_odometry
 from sst_graph.report.drawn_frame import DrawnFrame
 from sst_graph.result import CalibrationResult
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, Frame, Scan, SemanticClass, Source
 from sst_graph.viz import Placement, draw_overlay, stacked
 
@@ -193,8 +194,7 @@ def telling_positions(drive: RecentReader, result: CalibrationResult, count: int
     used = sorted(frame.frame for frame in result.frames_used if frame.drive == drive.source.name)
     chosen = []
     for part in np.array_split(np.array(used, dtype=np.int64), max(1, min(count, len(used)))):
-        few = np.unique(np.linspace(0, len(part) - 1, 4).round().astype(np.int64)) if len(part) else part
-        positions = [position_of(drive, int(index)) for index in part[few]]
+        positions = [position_of(drive, index) for index in evenly_spread(part.tolist(), 4)]
         richest = sorted(positions, key=lambda position: -_vehicle_points(drive.scan(position)))
         frames = ((p, _whole(drive, drive.frame(p), 0.0)) for p in richest)
         whole = (p for p, frame in frames if frame.scan is not None and frame.image is not None)

@@ -13,6 +13,7 @@ from sst_graph.classes import MaskEncoding, classes_of_mask, classes_of_points, 
 from sst_graph.data.arrays import read_labels
 from sst_graph.data.images import read_mask, read_picture
 from sst_graph.data.source import LabelEncoding
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import NO_PICTURE, CameraImage, SemanticClass
 
 _MASKS_TO_JUDGE = 8
@@ -61,8 +62,8 @@ def mask_encoding(masks: Mapping[int, Path], wanted: LabelEncoding, size: tuple[
     if not masks:
         return MaskEncoding.IDS
     paths = list(masks.values())
-    chosen = np.unique(np.linspace(0, len(paths) - 1, _MASKS_TO_JUDGE).round().astype(int))
-    return guess_mask_encoding((read_mask(paths[k], size) for k in chosen), paths[0].parent)
+    chosen = evenly_spread(paths, _MASKS_TO_JUDGE)
+    return guess_mask_encoding((read_mask(path, size) for path in chosen), paths[0].parent)
 
 
 def point_labels(path: Path | None, used: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:

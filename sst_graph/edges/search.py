@@ -6,7 +6,6 @@ a narrower one. What motion alone says of rotation rules out poses that contradi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -33,7 +32,7 @@ MODES = 6
 """Most starts that are returned."""
 APART_DEG, APART_S = 0.8, 0.05
 """Starts are farther apart than one of these: nearer ones lead to one estimate [deg], [s]."""
-_VETO_CHI2 = 25.0
+_GATE_CHI2 = 25.0
 """Chi-squared, of 3, of the difference from motion's rotation beyond which a pose is not tried."""
 MOTION_FLOOR_DEG = 0.7
 """Added to the sigmas of motion's rotation: its covariance leaves out what biases odometry [deg]."""
@@ -83,14 +82,14 @@ def edge_starts(edges: DriveEdges, region: SearchRegion) -> list[EdgeStart]:
     """The best poses that are :data:`APART_DEG` or :data:`APART_S` apart, best first; none where nothing is
     in view."""
     edges = edges.thinned(_POINTS)
-    first = _not_vetoed(_grid(region), region)
+    first = _gated(_grid(region), region)
     candidates = [(number, first) for number in range(len(region.time_offsets_s))]
     found: list[tuple[float, int, FloatArray]] = []
     for stage, (blur_px, step, kept) in enumerate(_STAGES):
         found, fields = [], dict[int, FloatMap]()
         for number, rotations in candidates:
             if stage:
-                rotations = _not_vetoed(_around(rotations, step * GRID_DEG), region)
+                rotations = _gated(_around(rotations, step * GRID_DEG), region)
             found += _scored(edges, region, number, rotations, (blur_px, fields))[:kept]
         found = sorted(found, key=lambda one: -one[0])[:kept]
         candidates = [
@@ -159,13 +158,9 @@ def _around(rotations: FloatArray, step_deg: float) -> FloatArray:
     return np.asarray((steps[None] @ rotations[:, None]).reshape(-1, 3, 3))
 
 
-def _not_vetoed(rotations: FloatArray, region: SearchRegion) -> FloatArray:
+def _gated(rotations: FloatArray, region: SearchRegion) -> FloatArray:
+    """Those that motion's rotation does not contradict; all, where it contradicts all."""
     if region.motion is None:
         return rotations
-    allowed = region.motion.chi2(rotations) < _VETO_CHI2
+    allowed = region.motion.chi2(rotations) < _GATE_CHI2
     return rotations[allowed] if allowed.any() else rotations
-
-
-def spread_evenly(count: int, most: int) -> Sequence[int]:
-    """At most ``most`` positions of ``count``, evenly spread."""
-    return list(np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist())

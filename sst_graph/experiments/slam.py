@@ -161,7 +161,7 @@ def solve_street(config: SlamConfig, weather: str, seed: int) -> Street:
     errors = {
         "odometry": trajectory_errors(odometry, source),
         "SLAM alone": trajectory_errors(slam, source),
-        "calibration alone": calibration_errors(*start, source),
+        "calibration alone": calibration_errors(start.cTl, start.time_offset_s, source),
         "both": trajectory_errors(both, source) | calibration_errors(*found, source),
     }
     return Street(weather, seed, len(closures), errors)

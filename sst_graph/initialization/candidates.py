@@ -26,6 +26,7 @@ from sst_graph.initialization.global_search import (
     search_steps,
 )
 from sst_graph.initialization.label_agreement import LabelledPoints, SearchFrame, States
+from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import SemanticClass
 
@@ -122,9 +123,8 @@ def _search_frames(problem: StartProblem, number: int, most: int) -> list[Search
         points = int(np.isin(scan.classes, problem.classes).sum())
         if points >= _MIN_CLASS_POINTS and image.contours:
             usable.append(pair)
-    chosen = np.unique(np.linspace(0, len(usable) - 1, most).round().astype(int))
     frames = []
-    for pair in (usable[i] for i in chosen if usable):
+    for pair in evenly_spread(usable, most):
         scan, image = drive.scans[pair.scan], drive.images[pair.image]
         sample = problem.tracks.at(number, image.stamp_ns + round(time_offset_s * 1e9))
         twist = np.zeros(6) if sample is None else sample.twist

@@ -27,6 +27,7 @@ from sst_graph.initialization.global_search import Candidate, SearchConfig
 from sst_graph.initialization.label_agreement import States
 from sst_graph.initialization.pose_batch import BatchEquations, Poses
 from sst_graph.initialization.refinement import RefinementProblem, refine_steps
+from sst_graph.sampling import evenly_spread
 from sst_graph.stepwise import Stepwise
 from sst_graph.types import Calibration
 
@@ -208,8 +209,7 @@ def _with_offsets(candidates: Sequence[Candidate], guess_time_offset_s: float) -
 
 def _thinned(drive: Drive, most: int) -> Drive:
     """The drive with at most so many scans, evenly spread."""
-    chosen = np.unique(np.linspace(0, len(drive.scans) - 1, most).round().astype(int))
-    return replace(drive, scans=tuple(drive.scans[i] for i in chosen))
+    return replace(drive, scans=tuple(evenly_spread(drive.scans, most)))
 
 
 def _poses(candidates: Sequence[Candidate], biases: int) -> Poses:

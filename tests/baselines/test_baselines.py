@@ -17,7 +17,6 @@ from sst_graph.baselines.nearest_pixel_frames import (
     MatchFrame,
     frame_pairs,
     match_frames,
-    spread,
     step_once,
 )
 from sst_graph.baselines.second_search import SecondSearch
@@ -268,8 +267,3 @@ def test_truncated_distances_by_hand(drive: Drive) -> None:
 )
 def test_a_second_search(scores: tuple[float, float, float], reasons: int) -> None:
     assert len(SecondSearch(*scores).reasons) == reasons
-
-
-def test_spread() -> None:
-    assert spread(range(10), 4) == [0, 3, 6, 9]
-    assert spread([1, 2], 5) == [1, 2] and spread([], 5) == []

@@ -12,6 +12,7 @@ from sst_graph.batch.by_edges.label_parts import labelled_stamps
 from sst_graph.batch.config import CalibrationConfig, Method
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.drive.preparation import Drive
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import SemanticClass, Source
 
 _LOOKS = 8
@@ -59,8 +60,10 @@ class _Looks:
 
     @classmethod
     def at(cls, source: Source) -> _Looks:
-        images = [image for k in _some(image_positions(source)) if (image := image_at(source, k)) is not None]
-        scans = [scan for k in _some(scan_positions(source)) if (scan := scan_at(source, k)) is not None]
+        places = evenly_spread(image_positions(source), _LOOKS)
+        images = [image for k in places if (image := image_at(source, k)) is not None]
+        places = evenly_spread(scan_positions(source), _LOOKS)
+        scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
         return cls(
             tuple(_classes(scan.classes) for scan in scans),
             tuple(_classes(image.mask) for image in images),
@@ -89,9 +92,3 @@ def _method(looks: Sequence[_Looks], config: CalibrationConfig) -> Method:
 def _classes(labels: np.ndarray) -> frozenset[int]:
     """Classes that occur."""
     return frozenset(np.flatnonzero(np.bincount(labels.reshape(-1))).tolist()) - {int(SemanticClass.IGNORE)}
-
-
-def _some(positions: Sequence[int]) -> list[int]:
-    count = len(positions)
-    chosen = np.linspace(0, count - 1, min(count, _LOOKS)).round().astype(int) if count else ()
-    return [positions[int(k)] for k in chosen]

@@ -18,12 +18,13 @@ from sst_graph.batch.by_edges.reasons import MIN_OVER_OTHER
 from sst_graph.batch.contradictions import FALSE_ALARM
 from sst_graph.covariance.contradiction import Difference, PartEstimate, name_step
 from sst_graph.edges.agreement import score
-from sst_graph.edges.search import SearchRegion, edge_starts, spread_evenly
+from sst_graph.edges.search import SearchRegion, edge_starts
 from sst_graph.errors import EstimationError
 from sst_graph.graph.matching import edges_of
 from sst_graph.graph.outer_loop import JointProblem, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import difference
+from sst_graph.sampling import evenly_spread
 
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ def _half(
     if len(scans) < _LEAST_SCANS:
         return None
     drive, tracks = problem.drives[number].part(scans), problem.tracks.part(number, scans)
-    few = spread_evenly(len(scans), _SEARCHED_SCANS)
+    few = evenly_spread(range(len(scans)), _SEARCHED_SCANS)
     edges = edges_of([drive.part(few)], tracks.part(0, few), problem.config.graph)
     if not edges:
         return None

@@ -29,7 +29,6 @@ from sst_graph.edges.search import (
     SearchRegion,
     angle_deg,
     edge_starts,
-    spread_evenly,
     turned,
 )
 from sst_graph.errors import EstimationError
@@ -38,6 +37,7 @@ from sst_graph.graph.matching import DriveEdges, edges_of
 from sst_graph.graph.outer_loop import JointProblem, JointSolution, solve_joint
 from sst_graph.graph.state import State
 from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
+from sst_graph.sampling import evenly_spread
 
 FloatArray = NDArray[np.float64]
 
@@ -232,7 +232,7 @@ def _some_scans(drive: Drive, time_offset_s: float) -> list[int]:
     found = pair_by_time(drive.scan_stamps_ns, drive.image_stamps_ns, time_offset_s, drive.image_period_s)
     scans = sorted({pair.scan for pair in found if not drive.have_labels(pair.scan, pair.image)})
     scans = scans or list(range(len(drive.scans)))
-    return [scans[k] for k in spread_evenly(len(scans), SEARCH_SCANS)]
+    return evenly_spread(scans, SEARCH_SCANS)
 
 
 def _tells_offset(motion: MotionSolution) -> bool:

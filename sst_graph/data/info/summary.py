@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sst_graph.data.frame_parts import image_at, image_positions, scan_at, scan_positions
 from sst_graph.data.info.facts import FactsReader, SensorFacts, SourceFacts
 from sst_graph.data.info.methods import Content, missing_for
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
 LONG_INTERVAL = 1.5
@@ -128,8 +129,10 @@ def drive_info(source: Source) -> DriveInfo:
     Raises:
         DataError: one of them cannot be read.
     """
-    scans = [scan for k in _spread(scan_positions(source)) if (scan := scan_at(source, k)) is not None]
-    images = [image for k in _spread(image_positions(source)) if (image := image_at(source, k)) is not None]
+    places = evenly_spread(scan_positions(source), SAMPLED)
+    scans = [scan for k in places if (scan := scan_at(source, k)) is not None]
+    places = evenly_spread(image_positions(source), SAMPLED)
+    images = [image for k in places if (image := image_at(source, k)) is not None]
     facts = source.facts() if isinstance(source, FactsReader) else None
     scan_sensor = _sensor(facts.scan if facts else None, scans, len(source))
     image_sensor = _sensor(facts.image if facts else None, images, len(source))
@@ -158,14 +161,6 @@ def drive_info(source: Source) -> DriveInfo:
         notes=facts.notes,
         missing=missing_for(content),
     )
-
-
-def _spread(positions: Sequence[int]) -> list[int]:
-    """A few of the positions, the first and the last among them."""
-    if not len(positions):
-        return []
-    chosen = np.unique(np.linspace(0, len(positions) - 1, SAMPLED).round().astype(int))
-    return [positions[k] for k in chosen.tolist()]
 
 
 def _sensor(

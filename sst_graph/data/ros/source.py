@@ -25,6 +25,7 @@ from sst_graph.data.ros.topics import Topics, choose_topics
 from sst_graph.data.source import TURNS, Loader, SourceOptions
 from sst_graph.data.two_clocks import DriveProperties, Sensor, merged
 from sst_graph.errors import ConfigError, DataError, printable
+from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import SweepTiming
 from sst_graph.types import CameraImage, Scan, SemanticClass, Source
 
@@ -167,10 +168,9 @@ def _encoding(bag: Bag, topics: Topics, index: BagIndex, options: SourceOptions)
         return None
     if options.label_encoding != "auto":
         return MaskEncoding(options.label_encoding)
-    chosen = np.unique(np.linspace(0, len(index.masks) - 1, _MASKS_TO_JUDGE).round().astype(int))
     masks = (
         mask_of(_read(bag, topics, index, place, mask.type), mask.type, _place(bag, place))
-        for place in (index.masks[k] for k in chosen)
+        for place in evenly_spread(index.masks, _MASKS_TO_JUDGE)
     )
     return guess_mask_encoding(masks, f"{bag.path}, {mask.name}")
 

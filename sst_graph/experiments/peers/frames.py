@@ -15,6 +15,7 @@ from sst_graph.drive.preparation import Drive
 from sst_graph.errors import DataError
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.features.lidar_beams import arrange_beams
+from sst_graph.sampling import evenly_spread
 from sst_graph.types import CameraImage, RelativeMotion, Scan, SemanticClass, Source, intensities_of
 
 FloatArray = NDArray[np.float64]
@@ -109,11 +110,9 @@ def peer_frames(
     shown = [(image, image.stamp_ns + round(1e9 * time_offset_s)) for image in drive.images]
     half_ns = round(0.5e9 * drive.scan_period_s)
     covered = [one for one in shown if stamps[0] - half_ns <= one[1] <= stamps[-1] + half_ns]
-    chosen = np.unique(np.linspace(0, len(covered) - 1, min(count, len(covered))).round().astype(int))
     positions = {number_at(source, k): k for k in range(len(source))}
     frames = []
-    for k in chosen:
-        image, instant_ns = covered[k]
+    for image, instant_ns in evenly_spread(covered, count):
         nearest = drive.scans[int(np.abs(stamps - instant_ns).argmin())]
         scan = scan_at(source, positions[nearest.index])
         # Read as a frame: apart, an image may come without its instances.

@@ -89,7 +89,8 @@ def smoothed(drives: Sequence[DriveEstimate], steps: Collection[int], config: Wa
     found = []
     for upto, after in zip(ways.upto, ways.after, strict=True):
         both = upto if after is None else upto.plus(after)
-        found.append(Smoothed(*both.best(), both.covariance()))
+        best = both.best()
+        found.append(Smoothed(best.cTl, best.time_offset_s, both.covariance()))
     return found
 
 

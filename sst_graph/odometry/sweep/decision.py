@@ -12,6 +12,7 @@ import numpy as np
 from sst_graph.odometry.lidar import LidarOdometry
 from sst_graph.odometry.sweep.estimate import SweepEstimate, at_hypothesis, estimate, start_of
 from sst_graph.odometry.sweep.window import SECTORS, Window
+from sst_graph.sampling import evenly_spread
 from sst_graph.sweep_timing import LONGEST_TURN_S, SweepStamp, SweepTiming
 from sst_graph.types import FloatArray, Scan
 
@@ -207,7 +208,7 @@ def decide_sweep(
 def _pair_motions(scan_at: Callable[[int], Scan | None], count: int) -> list[_PairMotion]:
     """Motions at pairs of scans spread over the drive."""
     found = []
-    for k in np.unique(np.linspace(0, max(count - 2, 0), _SAMPLED_PAIRS).round().astype(int)).tolist():
+    for k in evenly_spread(range(max(count - 1, 1)), _SAMPLED_PAIRS):
         a, b = scan_at(k), scan_at(k + 1) if k + 1 < count else None
         if a is None or b is None or b.stamp_ns <= a.stamp_ns:
             continue

@@ -92,7 +92,7 @@ class ChangeDetector:
 
     From the first frame past the threshold on, the estimate from before the frames compared is kept as the
     reference, and all frames since are compared with it: the running estimate uses them, and would follow a
-        step before it is detected.
+    step before it is detected.
 
     Attributes:
         statistic: of the latest frames.

@@ -1,0 +1,26 @@
+"""Some items of many."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from sst_graph.sampling import evenly_spread
+
+
+@pytest.mark.parametrize(
+    ("count", "most", "expected"),
+    [(9, 3, [0, 4, 8]), (4, 9, [0, 1, 2, 3]), (7, 1, [0]), (0, 5, []), (5, 0, [])],
+)
+def test_items_are_evenly_spread(count: int, most: int, expected: list[int]) -> None:
+    assert evenly_spread(range(count), most) == expected
+
+
+@pytest.mark.parametrize("count", [2, 5, 11, 100])
+@pytest.mark.parametrize("most", [2, 3, 4, 7, 11])
+def test_no_item_comes_twice_and_gaps_differ_by_one_at_most(count: int, most: int) -> None:
+    found = evenly_spread(range(count), most)
+    gaps = {b - a for a, b in itertools.pairwise(found)}
+    assert len(found) == min(count, most) and found[0] == 0 and found[-1] == count - 1
+    assert min(gaps) >= 1 and max(gaps) - min(gaps) <= 1
