@@ -1,4 +1,4 @@
-"""Some items of many."""
+"""Items chosen evenly from a sequence."""
 
 from __future__ import annotations
 

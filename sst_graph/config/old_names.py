@@ -1,4 +1,4 @@
-"""Settings that are given by a name they do not have any more."""
+"""Settings given by an earlier name: read under their name, or refused with what replaces them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings by names that they do not have: the name, or what stands in their place.
+"""Earlier names of settings: for each, the setting's name, or the constant in its place.
 
 Names are dotted as ``--set`` takes them: of ``calibrate``, or of ``track`` and the experiments for their own.
 """
