@@ -113,7 +113,7 @@ def with_floors(side: float, side_frame: float, match: float) -> ErrorModel:
 def freedom_of_sides(sides: int, objects: int) -> float:
     """Share of the variance of sides that is left in their residuals.
 
-    The pose and a mask bias of each object are fitted to the same sides and swallow the rest.
+    The pose and a mask bias of each object are fitted to the same sides and absorb the rest.
     """
     return max((sides - objects - 6) / max(sides, 1), _LEAST_FREEDOM)
 
