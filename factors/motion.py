@@ -40,9 +40,11 @@ _SERIES_LIMIT = 1.0
 
 def write_cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """a x b over the first axis into ``out``; the other axes broadcast (np.cross is several times slower)."""
+    other = np.empty(out.shape[1:])
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=out[i])
-        out[i] -= a[k] * b[j]
+        np.multiply(a[k], b[j], out=other)
+        out[i] -= other
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -64,7 +66,6 @@ def _series_table() -> FloatArray:
 
 
 _SERIES = _series_table()
-_POWERS = np.arange(_TERMS)
 
 
 def exponential_coefficients(x: FloatArray) -> FloatArray:
@@ -103,18 +104,8 @@ def twist_ad(xi: FloatArray) -> FloatArray:
 
 
 def se3_left_jacobian(xi: FloatArray) -> FloatArray:
-    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order.
-
-    J_l = sum ad^k / (k+1)! = I + (b - x b') ad + (c - x c') ad^2 - b' ad^3 - c' ad^4, the powers above 4
-    reduced by ad^5 = -2 x ad^3 - x^2 ad (Barfoot, State Estimation for Robotics, 7.95).
-    """
-    x = float(xi[:3] @ xi[:3])
-    # Of one number a sum of powers is made much faster than by Horner's rule.
-    small = x < _SERIES_LIMIT
-    b, c, b_x, c_x = x**_POWERS @ _SERIES if small else exponential_coefficients(np.asarray(x))
-    ad = twist_ad(xi)
-    ad2 = ad @ ad
-    return np.asarray(np.eye(6) + (b - x * b_x) * ad + (c - x * c_x) * ad2 - (b_x * ad + c_x * ad2) @ ad2)
+    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order; gtsam has the right one, J_l(-xi)."""
+    return np.asarray(gtsam.Pose3.ExpmapDerivative(-xi))
 
 
 def _skew(a: FloatArray) -> FloatArray:
