@@ -73,7 +73,7 @@ class Alignment:
             raise FactorError("sigmas_px of an alignment", f"{self.sigmas_px.min():.3g}", "values above 0")
         if self.normals is not None:
             store(self, "normals", checked_array("normals of an alignment", self.normals, (n, 2)))
-            lengths = np.linalg.norm(self.normals, axis=1)
+            lengths = np.sqrt(np.vecdot(self.normals, self.normals))
             if n and float(np.abs(lengths - 1.0).max()) > 1e-3:
                 worst = lengths[np.abs(lengths - 1.0).argmax()]
                 raise FactorError("normals of an alignment", f"one of length {worst:.3g}", "unit vectors")
