@@ -25,7 +25,7 @@ from .camera import MIN_DEPTH_M
 from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
-from .motion import CameraTwist, move_points
+from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, move_points
 
 FloatArray = NDArray[np.float64]
 
@@ -117,7 +117,8 @@ class Evaluated:
     Attributes:
         rows: (m, k, n): rows that ``lift`` turns into the Jacobian's first 13 columns, the bias's column
             where there is one, and the residual last.
-        lift: (13, 6), or None where the first 13 rows are the columns themselves.
+        lift: (13, 6), or (g, 13, 6) one for each group of matches, or None where the first 13 rows are the
+            columns themselves.
         behind: (n,) points behind the camera, or None where there is none.
     """
 
@@ -159,19 +160,21 @@ class Evaluated:
         short = gram(self.rows.reshape(len(self.rows), -1))
         if self.lift is None:
             return short
-        lift = self._whole_lift()
+        lift = self.whole_lift()
         return np.asarray(lift @ short @ lift.T)
 
     def root(self) -> FloatArray:
         """R (m, cols + 1) with R^T R the Gram matrix of [J r], with as many rows as the short form has."""
         R = square_root(gram(self.rows.reshape(len(self.rows), -1)))
-        return R if self.lift is None else np.asarray(R @ self._whole_lift().T)
+        return R if self.lift is None else np.asarray(R @ self.whole_lift().T)
 
-    def _whole_lift(self) -> FloatArray:
-        """(cols + 1, m) from all rows of the short form."""
+    def whole_lift(self) -> FloatArray:
+        """(cols + 1, m) from all rows of the short form; (g, cols + 1, m) of groups."""
         assert self.lift is not None
-        lift = np.eye(len(self.rows) + 7, len(self.rows), -7)
-        lift[:13, :6] = self.lift
+        m = len(self.rows)
+        lift = np.zeros((*self.lift.shape[:-2], m + 7, m))
+        lift[..., :13, :6] = self.lift
+        lift[..., 13:, 6:] = np.eye(m - 6)
         return lift
 
 
@@ -184,14 +187,24 @@ def evaluate(
     jacobians: bool,
 ) -> Evaluated:
     """Residuals and, where ``jacobians`` is true, their derivatives; arguments as in :func:`residuals`."""
-    if bias_px is not None and alignment.normals is None:
-        raise FactorError(
-            "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
-        )
     twist = np.asarray(c_twist, dtype=np.float64)
     motion = CameraTwist(twist, alignment.c_acceleration.T)
     taus_s, lPs = alignment.taus_s(float(time_offset_s)), alignment.columns[0]
     moved = move_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
+    return evaluate_moved(alignment, moved, bias_px, jacobians)
+
+
+def evaluate_moved(
+    alignment: Alignment,
+    moved: RigidlyMoved | GroupsMoved | PointwiseMoved,
+    bias_px: float | FloatArray | None,
+    jacobians: bool,
+) -> Evaluated:
+    """The same of points that were moved to their image's instant already."""
+    if bias_px is not None and alignment.normals is None:
+        raise FactorError(
+            "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
+        )
     Z = moved.cPs[2]
     behind = Z <= MIN_DEPTH_M
     any_behind = bool(behind.any())

@@ -23,7 +23,7 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import CameraTwist, move_points
+from sst_graph.factors.motion import CameraTwist, group_poses, move_points, transformed
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
@@ -193,11 +193,7 @@ class PairedEdges:
         if poses is None:
             each = CameraTwist(*(self.repeated(rows).T for rows in self.motion_rows))
             return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
-        cPs = np.empty_like(columns)
-        for pose, (a, b) in zip(poses, self.spans, strict=True):
-            np.matmul(pose[:3, :3], columns[:, a:b], out=cPs[:, a:b])
-        cPs += self.repeated(poses[:, :3, 3]).T
-        return cPs.T
+        return transformed(poses, columns, self.bounds).T
 
     def poses(self, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray | None:
         """(g, 4, 4) pose of the LiDAR in the camera with the motion, of groups that move as one rigid body;
@@ -207,9 +203,7 @@ class PairedEdges:
         base_taus_s = self.base_taus_s[np.minimum(self.bounds[:-1], len(self.base_taus_s) - 1)]
         if not np.array_equal(self.base_taus_s, self.repeated(base_taus_s)):
             return None
-        taus_s, (twists, accelerations) = (time_offset_s + base_taus_s)[:, None], self.motion_rows
-        xis = -taus_s * (twists - 0.5 * taus_s * accelerations)
-        return np.array([(gtsam.Pose3.Expmap(xi) * cTl).matrix() for xi in xis])
+        return group_poses(cTl, time_offset_s + base_taus_s, CameraTwist(*self.motion_rows))
 
     def accelerations(self, counts: IntArray) -> FloatArray:
         """(6,) where all groups share it, else (m, 6): of the image of each of so many points a group (g,)
