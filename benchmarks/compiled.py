@@ -2,7 +2,8 @@
 matches, no array between the steps.
 
 They give what the package gives (``ratios.py`` compares the results), on the inputs of its production path:
-whole scans that share one time, pinhole images, contours of masks, static objects.
+whole scans that share one time, pinhole images, contours of masks, static objects. What others then take,
+gtsam's linear factor or frozen matches, is made by the same constructors; ``alone`` are the loops without it.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from sst_graph.association.edge_matching import (
     MIN_OBJECT_SHARE,
     SIDE_OF,
     SIDES,
+    EdgeMatches,
     MatchConfig,
     PairedEdges,
 )
-from sst_graph.association.nearest import ClassView
-from sst_graph.factors import Alignment, PinholeCamera, RobustKernel
+from sst_graph.association.nearest import ClassView, NearestMatches, frozen
+from sst_graph.factors import Alignment, PinholeCamera, RobustKernel, Vector, custom_factor
 from sst_graph.factors.camera import MIN_DEPTH_M
 from sst_graph.features.mask_contour import BORDER_PX, MIN_GRADIENT, ContourMap
 from sst_graph.graph.frozen_problem import FrozenPoint, FrozenProblem, NormalEquations
@@ -145,30 +147,63 @@ def _frame_products(
     return S, cost
 
 
+@njit(cache=True)
+def _frame_system(
+    matches: tuple[FloatArray, FloatArray, FloatArray, float, FloatArray],
+    pose: tuple[FloatArray, FloatArray],
+    twist: FloatArray,
+    tau: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Error (8,) and Jacobian (8, 13) of the same cost, gradient and Hessian as all matches."""
+    lPs, pixels, scales, kernel_px, camera = matches
+    xi = -tau * twist
+    R, t = _moved(pose[0], pose[1], xi)
+    S, cost = _frame_products(lPs, pixels, scales, kernel_px, camera, (R, t))
+    root, lift = np.linalg.cholesky(S), _lift(R, t, xi, twist, tau)
+    error, J = np.zeros(8), np.zeros((8, 13))
+    for k in range(7):
+        error[k] = root[6, k]
+        for i in range(13):
+            for j in range(6):
+                J[k, i] += lift[i, j] * root[j, k]
+    error[7] = np.sqrt(max(2.0 * cost - S[6, 6], 0.0))
+    return error, J
+
+
 class CompiledFrame:
-    """Alignments of one image that share one time: gradient and Hessian as those of their frame factor."""
+    """Alignments of one image that share one time, as their frame factor."""
 
     def __init__(self, alignments: Sequence[Alignment]) -> None:
         first = alignments[0]
         taus = {alignment.common_tau_s for alignment in alignments}
         assert len(taus) == 1 and None not in taus and first.kernel.kind == "geman_mcclure"
-        self._tau_s, self._kernel_px, self._camera = taus.pop(), first.kernel.scale, _camera(first.camera)
         assert all((a.weights == 1.0).all() and a.kernel == first.kernel for a in alignments)
-        self._lPs = np.concatenate([a.lPs for a in alignments])
-        self._pixels = np.concatenate([a.pixels for a in alignments])
-        self._scales = np.concatenate([1.0 / a.sigmas_px for a in alignments])
-
-    def linearized(self, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray) -> tuple[Any, float]:
-        """(14, 14) Gram matrix of [J r], and the cost."""
-        tau = time_offset_s + self._tau_s
-        R, t = np.ascontiguousarray(cTl.rotation().matrix()), np.asarray(cTl.translation())
-        R, t = _moved(R, t, -tau * c_twist)
-        S, cost = _frame_products(
-            self._lPs, self._pixels, self._scales, self._kernel_px, self._camera, (R, t)
+        self._tau_s = taus.pop()
+        self._matches = (
+            np.concatenate([a.lPs for a in alignments]),
+            np.concatenate([a.pixels for a in alignments]),
+            np.concatenate([1.0 / a.sigmas_px for a in alignments]),
+            first.kernel.scale,
+            _camera(first.camera),
         )
-        whole = np.zeros((14, 7))
-        whole[:13, :6], whole[13, 6] = _lift(R, t, -tau * c_twist, c_twist, tau), 1.0
-        return whole @ S @ whole.T, cost
+
+    def alone(self, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray) -> tuple[Any, Any]:
+        """Error and Jacobian."""
+        R, t = np.ascontiguousarray(cTl.rotation().matrix()), np.asarray(cTl.translation())
+        found = _frame_system(self._matches, (R, t), c_twist, time_offset_s + self._tau_s)
+        return found[0], found[1]
+
+    def factor(self, E: int, D: int, V: int) -> gtsam.CustomFactor:
+        """On extrinsic, time offset and twist."""
+
+        def function(
+            cTl: gtsam.Pose3, time_offset_s: FloatArray, c_twist: FloatArray, *, jacobians: bool
+        ) -> tuple[FloatArray, list[FloatArray]]:
+            error, J = self.alone(cTl, float(time_offset_s[0]), c_twist)
+            return error, [J[:, :6], J[:, 6:7], J[:, 7:]]
+
+        kinds = [gtsam.Pose3, Vector(1), Vector(6)]
+        return custom_factor(gtsam.noiseModel.Unit.Create(8), [E, D, V], function, kinds, 8)
 
 
 @njit(cache=True)
@@ -386,6 +421,7 @@ class CompiledEdges:
         assert SIDES == 4 and paired.velocities is None
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
         assert len(maps) == len(paired.contours) and all(each.stretch is None for each in maps)
+        self._paired, self._kernel = paired, kernel
         points, starts = paired.points, [min(a, len(paired.points) - 1) for a, _ in paired.spans]
         assert all((paired.base_taus_s[a:b] == paired.base_taus_s[a:b][:1]).all() for a, b in paired.spans)
         self._points = points.lPs, points.outward, points.edges, paired.owners
@@ -407,12 +443,29 @@ class CompiledEdges:
             SIDE_OF.astype(np.int64),
         )
 
-    def match(self, cTl: gtsam.Pose3, time_offset_s: float) -> tuple[Any, ...]:
+    def alone(self, cTl: gtsam.Pose3, time_offset_s: float) -> tuple[Any, ...]:
         """As ``_match``."""
         R, t = np.ascontiguousarray(cTl.rotation().matrix()), np.asarray(cTl.translation())
         taus = time_offset_s + self._base_taus_s
         poses = R, t, taus, self._twists, self._accelerations
         return tuple(_match(self._points, self._bounds, poses, self._fields, self._biases_px, self._setting))
+
+    def match(self, cTl: gtsam.Pose3, time_offset_s: float) -> EdgeMatches:
+        """As ``match_edges`` gives them."""
+        index, sides, found, seen = self.alone(cTl, time_offset_s)
+        bounds = np.searchsorted(index, self._bounds)
+        alignment = Alignment(
+            camera=self._paired.camera,
+            lPs=self._points[0][index],
+            base_taus_s=self._paired.base_taus_s[index],
+            pixels=found[:, :2],
+            sigmas_px=found[:, 4],
+            normals=found[:, 2:4],
+            kernel=self._kernel,
+            c_acceleration=np.repeat(self._accelerations, np.diff(bounds), axis=0),
+            weights=found[:, 5],
+        )
+        return EdgeMatches(index, sides, alignment, bounds, seen)
 
 
 @njit(cache=True)
@@ -479,7 +532,7 @@ class CompiledNearest:
     def __init__(self, view: ClassView) -> None:
         self._view, self._camera = view, _camera(view.camera)
 
-    def match(
+    def alone(
         self, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Points and their pixels, and the points nearest to the view's pixels."""
@@ -491,3 +544,13 @@ class CompiledNearest:
         )
         lPs = view.lPs[on]
         return lPs, targets, lPs[chosen]
+
+    def match(
+        self, cTl: gtsam.Pose3, time_offset_s: float, c_twist: FloatArray, pixel_weight: float
+    ) -> NearestMatches:
+        """As ``match_nearest`` gives them."""
+        lPs, targets, chosen = self.alone(cTl, time_offset_s, c_twist)
+        weight = pixel_weight * len(lPs) / len(self._view.pixels)
+        return NearestMatches(
+            frozen(self._view, lPs, targets, 1.0), frozen(self._view, chosen, self._view.pixels, weight)
+        )

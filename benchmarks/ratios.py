@@ -50,6 +50,7 @@ from sst_graph.graph.state import EXTRINSIC, object_bias_key, time_offset_key, t
 FloatArray = NDArray[np.float64]
 Ways = dict[str, Callable[[], object]]
 OURS, SINGLE, SCIPY, COMPILED = "ours", "one factor a match", "scipy", "compiled loop"
+LOOP = "the loop alone"
 
 
 def plain_residuals(
@@ -85,19 +86,20 @@ def frame_ways() -> Ways:
         J = np.concatenate([J.reshape(-1, 13) for _, J in parts])
         return least_squares(lambda x: r, np.zeros(13), lambda x: J, max_nfev=1)
 
-    solution, (products, cost) = by_scipy(), compiled.linearized(POSE, TIME_OFFSET_S, C_TWIST)
-    H, g = products[:13, :13], products[:13, 13]
-    linear, near = factor.linearize(values), {"atol": 1e-9 * np.abs(H).max()}
-    np.testing.assert_allclose(linear.information(), H, **near)
-    np.testing.assert_allclose(linear.augmentedInformation()[:13, 13], -g, **near)
-    np.testing.assert_allclose(factor.error(values), cost, rtol=1e-9)
-    np.testing.assert_allclose(solution.jac.T @ solution.jac, H, **near)
-    np.testing.assert_allclose(solution.grad, g, **near)
+    fused = compiled.factor(E, D, V)
+    system = factor.linearize(values).augmentedInformation()
+    near = {"atol": 1e-9 * np.abs(system).max()}
+    np.testing.assert_allclose(fused.linearize(values).augmentedInformation(), system, **near)
+    np.testing.assert_allclose(fused.error(values), factor.error(values), rtol=1e-9)
+    solution = by_scipy()
+    np.testing.assert_allclose(solution.jac.T @ solution.jac, system[:13, :13], **near)
+    np.testing.assert_allclose(solution.grad, -system[:13, 13], **near)
     return {
         OURS: lambda: factor.linearize(values),
         SINGLE: lambda: graph.linearize(values),
         SCIPY: by_scipy,
-        COMPILED: lambda: compiled.linearized(POSE, TIME_OFFSET_S, C_TWIST),
+        COMPILED: lambda: fused.linearize(values),
+        LOOP: lambda: compiled.alone(POSE, TIME_OFFSET_S, C_TWIST),
     }
 
 
@@ -122,8 +124,10 @@ def nearest_ways() -> Ways:
     ours = match_nearest(view, POSE, TIME_OFFSET_S, C_TWIST, 5.0)
     assert ours is not None and ours.pixel_to_point is not None
     matched = ours.point_to_pixel.lPs, ours.point_to_pixel.pixels, ours.pixel_to_point.lPs
-    for one, other in zip(matched, compiled.match(POSE, TIME_OFFSET_S, C_TWIST), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-9)
+    fused = compiled.match(POSE, TIME_OFFSET_S, C_TWIST, 5.0)
+    for one, other in zip(ours.alignments, fused.alignments, strict=True):
+        for name in ("lPs", "pixels", "weights"):
+            np.testing.assert_allclose(getattr(one, name), getattr(other, name), atol=1e-9)
     points, pixels, nearest = by_scipy()
     np.testing.assert_allclose(points, matched[0])
     np.testing.assert_allclose(nearest, matched[2])
@@ -133,7 +137,8 @@ def nearest_ways() -> Ways:
     return {
         OURS: lambda: match_nearest(view, POSE, TIME_OFFSET_S, C_TWIST, 5.0),
         SCIPY: by_scipy,
-        COMPILED: lambda: compiled.match(POSE, TIME_OFFSET_S, C_TWIST),
+        COMPILED: lambda: compiled.match(POSE, TIME_OFFSET_S, C_TWIST, 5.0),
+        LOOP: lambda: compiled.alone(POSE, TIME_OFFSET_S, C_TWIST),
     }
 
 
@@ -230,19 +235,22 @@ def edge_ways(work: DriveWork) -> Ways:
     paired = replace(paired, velocities=None)
     at = state.cTl, state.time_offset_s(0)
     compiled = CompiledEdges(paired, KERNEL, config)
-    ours, (index, sides, found, seen) = match_edges(paired, *at, KERNEL, config), compiled.match(*at)
-    np.testing.assert_array_equal(ours.index, index)
-    np.testing.assert_array_equal(ours.sides, sides)
-    np.testing.assert_array_equal(ours.seen, seen)
-    each = ours.alignment
-    rows = np.column_stack([each.pixels, each.normals, each.sigmas_px, each.weights])
-    np.testing.assert_allclose(rows, found, atol=1e-3)
-    return {OURS: lambda: match_edges(paired, *at, KERNEL, config), COMPILED: lambda: compiled.match(*at)}
+    ours, fused = match_edges(paired, *at, KERNEL, config), compiled.match(*at)
+    for name in ("index", "sides", "bounds", "seen"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(fused, name))
+    for name in ("lPs", "base_taus_s", "c_acceleration", "pixels", "normals", "sigmas_px", "weights"):
+        each = (getattr(matches.alignment, name) for matches in (ours, fused))
+        np.testing.assert_allclose(*each, atol=1e-3)
+    return {
+        OURS: lambda: match_edges(paired, *at, KERNEL, config),
+        COMPILED: lambda: compiled.match(*at),
+        LOOP: lambda: compiled.alone(*at),
+    }
 
 
 def table(rows: Sequence[tuple[str, Ways]], rounds: int) -> str:
-    others = SINGLE, SCIPY, COMPILED
-    lines = [f"| | ours [ms] | {' | '.join(others)} | ours / {COMPILED} |", "|---|---|---|---|---|---|"]
+    others = SINGLE, SCIPY, COMPILED, LOOP
+    lines = [f"| | ours [ms] | {' | '.join(others)} | ours / {COMPILED} |", "|---|---|---|---|---|---|---|"]
     for name, ways in rows:
         slow = {key: ways[key] for key in ways if key == SINGLE}
         took = best_seconds({key: ways[key] for key in ways if key not in slow}, rounds)

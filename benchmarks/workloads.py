@@ -115,10 +115,10 @@ class DriveWork:
 def best_seconds(works: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, float]:
     """Least processor time of a call of each [s], the calls taking turns so that all see the same machine.
 
-    A turn is long enough for the clock: as many calls as take 2 ms.
+    A turn is long enough for the clock and for warm caches: as many calls as take 10 ms.
     """
     timers = {name: timeit.Timer(work, timer=time.process_time) for name, work in works.items()}
-    calls = {name: max(1, round(2e-3 / timer.timeit(1))) for name, timer in timers.items()}
+    calls = {name: max(1, round(1e-2 / min(timer.repeat(3, 1)))) for name, timer in timers.items()}
     best = dict.fromkeys(works, np.inf)
     for _ in range(rounds):
         for name, timer in timers.items():

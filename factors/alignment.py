@@ -23,7 +23,7 @@ from .condensed import condense, condense_root, cost_rows
 from .custom.factor import custom_factor, recipe_of
 from .custom.variables import Argument, Variables, Vector, checked_key, is_key, number_or_key, pose_or_key
 from .errors import FactorError
-from .matches import Alignment
+from .matches import Alignment, joined_points
 from .reprojection import Evaluated, alignment_cost, cost, evaluate, residuals, weigh, weighted_residuals
 
 __all__ = [
@@ -353,13 +353,15 @@ class FrameResidual:
 
     def condensed(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         weighted = [self._weighted(part, values) for part in self.parts]
-        evaluated, constant = weighted[0]
-        if len(weighted) > 1 or len(evaluated.rows) > self.cols + 1:
+        counts = [len(evaluated.rows) for evaluated, _ in weighted]
+        if sum(counts) > self.cols + 1:
             return condense(*self._gram(weighted))
-        # Of a single alignment there is a root at once: that of its rows' short form.
-        R = np.zeros((len(evaluated.rows), self.cols + 1))
-        R[:, self.parts[0].targets] = evaluated.root()[:, self.parts[0].columns]
-        return condense_root(R, constant)
+        # There are roots at once: those of the rows' short forms.
+        R, end = np.zeros((sum(counts), self.cols + 1)), 0
+        for part, (evaluated, _), count in zip(self.parts, weighted, counts, strict=True):
+            R[end : end + count, part.targets] = evaluated.root()[:, part.columns]
+            end += count
+        return condense_root(R, sum(constant for _, constant in weighted))
 
     def stacked(self, values: Sequence[Any]) -> tuple[FloatArray, FloatArray]:
         blocks, constant = [], 0.0
@@ -416,6 +418,9 @@ def frame_residual(
     twist = _twist_or_key(name, quantities.c_twist)
     biases = [_biases_and_groups(name, bias) for bias in _bias_of_each(alignments, biases_px)]
     terms_of_each = _terms_of_each(alignments, terms)
+    if not any(own for own, _ in biases) and not any(terms_of_each):
+        alignments = joined_points(alignments)
+        biases, terms_of_each = biases[: len(alignments)], terms_of_each[: len(alignments)]
     arguments = [
         Argument("cTl", pose, gtsam.Pose3),
         Argument("time_offset_s", offset, Vector(1)),

@@ -14,20 +14,20 @@ FloatArray = NDArray[np.float64]
 
 def checked_array(what: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """A read-only float64 copy of ``value`` with the given shape (None: any length), all finite."""
-    wanted = "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise FactorError(what, described(value), f"numbers of shape {wanted}") from None
-    matches = array.ndim == len(shape) and all(
-        n is None or n == m for n, m in zip(shape, array.shape, strict=True)
-    )
-    if not matches:
-        raise FactorError(what, f"shape {array.shape}", f"shape {wanted}")
+        raise FactorError(what, described(value), f"numbers of shape {_wanted(shape)}") from None
+    if array.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, array.shape, strict=True)):
+        raise FactorError(what, f"shape {array.shape}", f"shape {_wanted(shape)}")
     if not np.isfinite(array).all():
         raise FactorError(what, f"{np.count_nonzero(~np.isfinite(array))} values NaN or inf", "finite values")
     array.flags.writeable = False
     return array
+
+
+def _wanted(shape: tuple[int | None, ...]) -> str:
+    return "(" + ", ".join("n" if n is None else str(n) for n in shape) + ")"
 
 
 def checked_covariance(what: str, value: ArrayLike, size: int) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import get_args
@@ -72,7 +73,7 @@ class Alignment:
             raise FactorError("sigmas_px of an alignment", f"{self.sigmas_px.min():.3g}", "values above 0")
         if self.normals is not None:
             store(self, "normals", checked_array("normals of an alignment", self.normals, (n, 2)))
-            lengths = np.linalg.norm(self.normals, axis=1)
+            lengths = np.sqrt(np.vecdot(self.normals, self.normals))
             if n and float(np.abs(lengths - 1.0).max()) > 1e-3:
                 worst = lengths[np.abs(lengths - 1.0).argmax()]
                 raise FactorError("normals of an alignment", f"one of length {worst:.3g}", "unit vectors")
@@ -139,6 +140,22 @@ class Alignment:
         return np.ascontiguousarray(self.lPs.T), np.ascontiguousarray(self.pixels.T), normals
 
     @cached_property
+    def centred(self) -> FloatArray:
+        """(2, n) pixels from the principal point [px]."""
+        return self.columns[1] - np.array([[self.camera.cx], [self.camera.cy]])
+
+    @cached_property
+    def slopes(self) -> FloatArray:
+        """(2, k, n or 1) derivatives of the k residuals of a match by X/Z and Y/Z of its point [px]."""
+        focal, normals = np.array([self.camera.fx, self.camera.fy]), self.columns[2]
+        return np.diag(focal)[:, :, None] if normals is None else (focal[:, None] * normals)[:, None, :]
+
+    @cached_property
+    def row_scales(self) -> FloatArray:
+        """(n,) factor on the rows of a match: sqrt(weight) / sigma [1/px]."""
+        return np.asarray(np.sqrt(self.weights) / self.sigmas_px)
+
+    @cached_property
     def velocity_columns(self) -> FloatArray | None:
         """l_velocities (3, n), contiguous by row, for the hot path."""
         return None if self.l_velocities is None else np.ascontiguousarray(self.l_velocities.T)
@@ -154,3 +171,20 @@ class Alignment:
         if self.common_tau_s is not None:
             return time_offset_s + self.common_tau_s
         return np.asarray(time_offset_s + self.base_taus_s)
+
+
+def joined_points(alignments: Sequence[Alignment]) -> Sequence[Alignment]:
+    """Point-to-pixel matches of one image as one alignment, where they differ in nothing but their matches:
+    with the few thousand of a frame, the calls for a second one would cost as much as its work."""
+    first = alignments[0]
+    alike = all(
+        (each.camera, each.kernel, each.motion_model) == (first.camera, first.kernel, first.motion_model)
+        and np.array_equal(each.c_acceleration, first.c_acceleration)
+        and each.normals is None
+        and each.l_velocities is None
+        for each in alignments
+    )
+    if len(alignments) == 1 or not alike:
+        return alignments
+    names = ("lPs", "base_taus_s", "pixels", "sigmas_px", "weights")
+    return [replace(first, **{name: np.concatenate([getattr(a, name) for a in alignments]) for name in names})]

@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import gtsam
@@ -31,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
 MotionModel = Literal["se3", "translation"]
 
 _TERMS = 10
@@ -40,9 +42,11 @@ _SERIES_LIMIT = 1.0
 
 def write_cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """a x b over the first axis into ``out``; the other axes broadcast (np.cross is several times slower)."""
+    other = np.empty(out.shape[1:])
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         np.multiply(a[j], b[k], out=out[i])
-        out[i] -= a[k] * b[j]
+        np.multiply(a[k], b[j], out=other)
+        out[i] -= other
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -64,7 +68,6 @@ def _series_table() -> FloatArray:
 
 
 _SERIES = _series_table()
-_POWERS = np.arange(_TERMS)
 
 
 def exponential_coefficients(x: FloatArray) -> FloatArray:
@@ -103,18 +106,8 @@ def twist_ad(xi: FloatArray) -> FloatArray:
 
 
 def se3_left_jacobian(xi: FloatArray) -> FloatArray:
-    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order.
-
-    J_l = sum ad^k / (k+1)! = I + (b - x b') ad + (c - x c') ad^2 - b' ad^3 - c' ad^4, the powers above 4
-    reduced by ad^5 = -2 x ad^3 - x^2 ad (Barfoot, State Estimation for Robotics, 7.95).
-    """
-    x = float(xi[:3] @ xi[:3])
-    # Of one number a sum of powers is made much faster than by Horner's rule.
-    small = x < _SERIES_LIMIT
-    b, c, b_x, c_x = x**_POWERS @ _SERIES if small else exponential_coefficients(np.asarray(x))
-    ad = twist_ad(xi)
-    ad2 = ad @ ad
-    return np.asarray(np.eye(6) + (b - x * b_x) * ad + (c - x * c_x) * ad2 - (b_x * ad + c_x * ad2) @ ad2)
+    """(6, 6) J_l: Exp(xi + d) = Exp(J_l(xi) d) Exp(xi) to first order; gtsam has the right one, J_l(-xi)."""
+    return np.asarray(gtsam.Pose3.ExpmapDerivative(-xi))
 
 
 def _skew(a: FloatArray) -> FloatArray:
@@ -175,8 +168,29 @@ class RigidlyMoved:
 
     def write_rows(self, g: FloatArray, out: FloatArray) -> None:
         """Wrenches [cP x g; g] into out (6, k, n), from the gradients g (3, k, n) by cP."""
-        write_cross(self.cPs[:, None, :], g, out[:3])
-        out[3:] = g
+        _write_wrenches(self.cPs, g, out)
+
+
+@dataclass(frozen=True)
+class GroupsMoved:
+    """Groups of points, each of one image and one tau, so that every group moves as one rigid body.
+
+    Attributes:
+        cPs: (3, n) points in the camera at their image's instant [m].
+        lift: (g, 13, 6) that of :class:`RigidlyMoved` for each group.
+    """
+
+    cPs: FloatArray
+    lift: FloatArray
+
+    def write_rows(self, g: FloatArray, out: FloatArray) -> None:
+        """As of :class:`RigidlyMoved`."""
+        _write_wrenches(self.cPs, g, out)
+
+
+def _write_wrenches(cPs: FloatArray, g: FloatArray, out: FloatArray) -> None:
+    write_cross(cPs[:, None, :], g, out[:3])
+    out[3:] = g
 
 
 class _Exponential(NamedTuple):
@@ -309,11 +323,47 @@ def _move_rigidly(
     return RigidlyMoved(R @ lPs + t.reshape(3, 1), moved, tau_s, xi, rate, model)
 
 
-def moved_pose(
-    cTl: gtsam.Pose3, tau_s: float, motion: CameraTwist, model: MotionModel = "se3"
-) -> gtsam.Pose3:
-    """cTl' of all points that share one tau, cP = cTl' . lP; arguments as in :func:`move_points`."""
-    return _moved_pose(cTl, -tau_s * (motion.c_twist - 0.5 * tau_s * motion.c_acceleration), model)
+def move_groups(
+    cTl: gtsam.Pose3, lPs: FloatArray, bounds: IntArray, taus_s: FloatArray, motion: CameraTwist
+) -> GroupsMoved:
+    """As :func:`move_points` of groups of points that share one tau and one image each.
+
+    Args:
+        lPs: (3, n) points, one group after the other [m].
+        bounds: (g + 1,) where each group begins, and the end.
+        taus_s: (g,) intervals [s].
+        motion: its rows are (g, 6), of each group's image.
+    """
+    taus, xis = taus_s[:, None], _group_xis(taus_s, motion)
+    poses = [gtsam.Pose3.Expmap(xi) * cTl for xi in xis]
+    left = np.array([se3_left_jacobian(xi) for xi in xis])
+    rates = motion.c_twist - taus * motion.c_acceleration
+    lift = np.empty((len(xis), 13, 6))
+    lift[:, :6] = np.array([pose.AdjointMap() for pose in poses]).transpose(0, 2, 1)
+    lift[:, 6] = -(left @ rates[:, :, None])[:, :, 0]
+    lift[:, 7:] = -taus[:, :, None] * left.transpose(0, 2, 1)
+    return GroupsMoved(transformed(np.array([pose.matrix() for pose in poses]), lPs, bounds), lift)
+
+
+def group_poses(cTl: gtsam.Pose3, taus_s: FloatArray, motion: CameraTwist) -> FloatArray:
+    """(g, 4, 4) poses cTl' of groups of points, cP = cTl' . lP; arguments as in :func:`move_groups`."""
+    xis = _group_xis(taus_s, motion)
+    return np.array([(gtsam.Pose3.Expmap(xi) * cTl).matrix() for xi in xis])
+
+
+def _group_xis(taus_s: FloatArray, motion: CameraTwist) -> FloatArray:
+    """(g, 6) twists of the displacements, -tau w."""
+    taus = taus_s[:, None]
+    return np.asarray(-taus * (motion.c_twist - 0.5 * taus * motion.c_acceleration))
+
+
+def transformed(poses: FloatArray, points: FloatArray, bounds: IntArray) -> FloatArray:
+    """(3, n) points (3, n) of groups under the pose (g, 4, 4) of each; bounds (g + 1,)."""
+    moved = np.empty_like(points)
+    for pose, (a, b) in zip(poses, pairwise(bounds.tolist()), strict=True):
+        np.matmul(pose[:3, :3], points[:, a:b], out=moved[:, a:b])
+    moved += np.repeat(poses[:, :3, 3].T, np.diff(bounds), axis=1)
+    return moved
 
 
 def _moved_pose(cTl: gtsam.Pose3, xi: FloatArray, model: MotionModel) -> gtsam.Pose3:

@@ -21,11 +21,11 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import MIN_DEPTH_M, PinholeCamera
+from .camera import MIN_DEPTH_M
 from .condensed import gram, square_root
 from .errors import FactorError
 from .matches import Alignment
-from .motion import CameraTwist, move_points
+from .motion import CameraTwist, GroupsMoved, PointwiseMoved, RigidlyMoved, move_points
 
 FloatArray = NDArray[np.float64]
 
@@ -117,7 +117,8 @@ class Evaluated:
     Attributes:
         rows: (m, k, n): rows that ``lift`` turns into the Jacobian's first 13 columns, the bias's column
             where there is one, and the residual last.
-        lift: (13, 6), or None where the first 13 rows are the columns themselves.
+        lift: (13, 6), or (g, 13, 6) one for each group of matches, or None where the first 13 rows are the
+            columns themselves.
         behind: (n,) points behind the camera, or None where there is none.
     """
 
@@ -159,19 +160,21 @@ class Evaluated:
         short = gram(self.rows.reshape(len(self.rows), -1))
         if self.lift is None:
             return short
-        lift = self._whole_lift()
+        lift = self.whole_lift()
         return np.asarray(lift @ short @ lift.T)
 
     def root(self) -> FloatArray:
         """R (m, cols + 1) with R^T R the Gram matrix of [J r], with as many rows as the short form has."""
         R = square_root(gram(self.rows.reshape(len(self.rows), -1)))
-        return R if self.lift is None else np.asarray(R @ self._whole_lift().T)
+        return R if self.lift is None else np.asarray(R @ self.whole_lift().T)
 
-    def _whole_lift(self) -> FloatArray:
-        """(cols + 1, m) from all rows of the short form."""
+    def whole_lift(self) -> FloatArray:
+        """(cols + 1, m) from all rows of the short form; (g, cols + 1, m) of groups."""
         assert self.lift is not None
-        lift = np.eye(len(self.rows) + 7, len(self.rows), -7)
-        lift[:13, :6] = self.lift
+        m = len(self.rows)
+        lift = np.zeros((*self.lift.shape[:-2], m + 7, m))
+        lift[..., :13, :6] = self.lift
+        lift[..., 13:, 6:] = np.eye(m - 6)
         return lift
 
 
@@ -184,62 +187,71 @@ def evaluate(
     jacobians: bool,
 ) -> Evaluated:
     """Residuals and, where ``jacobians`` is true, their derivatives; arguments as in :func:`residuals`."""
-    lPs, pixels, normals = alignment.columns
-    if bias_px is not None and normals is None:
+    twist = np.asarray(c_twist, dtype=np.float64)
+    motion = CameraTwist(twist, alignment.c_acceleration.T)
+    taus_s, lPs = alignment.taus_s(float(time_offset_s)), alignment.columns[0]
+    moved = move_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
+    return evaluate_moved(alignment, moved, bias_px, jacobians)
+
+
+def evaluate_moved(
+    alignment: Alignment,
+    moved: RigidlyMoved | GroupsMoved | PointwiseMoved,
+    bias_px: float | FloatArray | None,
+    jacobians: bool,
+) -> Evaluated:
+    """The same of points that were moved to their image's instant already."""
+    if bias_px is not None and alignment.normals is None:
         raise FactorError(
             "bias_px", f"{bias_px} for point-to-pixel matches", "None: only silhouettes have a bias"
         )
-    twist = np.asarray(c_twist, dtype=np.float64)
-    taus_s = alignment.taus_s(float(time_offset_s))
-    motion = CameraTwist(twist, alignment.c_acceleration.T)
-    moved = move_points(cTl, lPs, taus_s, motion, alignment.motion_model, alignment.velocity_columns)
-    X, Y, Z = moved.cPs
+    Z = moved.cPs[2]
     behind = Z <= MIN_DEPTH_M
     any_behind = bool(behind.any())
     inverse_z = np.where(behind, 0.0, 1.0 / np.where(behind, 1.0, Z)) if any_behind else 1.0 / Z
+    xy = moved.cPs[:2] * inverse_z
 
-    n, k = len(alignment), alignment.rows_per_match
-    camera = alignment.camera
-    x, y = X * inverse_z, Y * inverse_z
-    error = np.empty((2, n))
-    error[0] = camera.fx * x + (camera.cx - pixels[0])
-    error[1] = camera.fy * y + (camera.cy - pixels[1])
     lift = moved.lift if jacobians else None
     motion_rows = (13 if lift is None else 6) if jacobians else 0
-    rows = np.empty((motion_rows + (jacobians and bias_px is not None) + 1, k, n))
-    if normals is None:
-        rows[-1] = error
-    else:
-        rows[-1, 0] = normals[0] * error[0] + normals[1] * error[1]
-        if bias_px is not None:
-            rows[-1, 0] += bias_px
+    has_bias = jacobians and bias_px is not None
+    rows = np.empty((motion_rows + has_bias + 1, alignment.rows_per_match, len(alignment)))
+    _write_residuals(alignment, xy, bias_px, rows[-1])
     if jacobians:
-        moved.write_rows(_gradients(camera, x, y, inverse_z, normals), rows[:motion_rows])
+        moved.write_rows(_gradients(alignment.slopes, xy, inverse_z), rows[:motion_rows])
         rows[motion_rows:-1] = 1.0  # by the bias
     if any_behind:
         rows[:, :, behind] = 0.0
     return Evaluated(rows, lift, behind if any_behind else None)
 
 
-def _gradients(
-    camera: PinholeCamera, x: FloatArray, y: FloatArray, inverse_z: FloatArray, normals: FloatArray | None
-) -> FloatArray:
-    """(3, k, n) gradients of the residuals by cP [px/m]; x, y: X/Z and Y/Z."""
-    u_scale, v_scale = camera.fx * inverse_z, camera.fy * inverse_z
+def _write_residuals(
+    alignment: Alignment, xy: FloatArray, bias_px: float | FloatArray | None, out: FloatArray
+) -> None:
+    """Residuals into out (k, n); xy (2, n): X/Z and Y/Z."""
+    camera, normals = alignment.camera, alignment.columns[2]
+    error = out if normals is None else np.empty_like(xy)
+    np.multiply(xy, [[camera.fx], [camera.fy]], out=error)
+    error -= alignment.centred
     if normals is not None:
-        u_scale, v_scale = normals[0] * u_scale, normals[1] * v_scale
-        return np.stack([u_scale, v_scale, -(u_scale * x + v_scale * y)])[:, None, :]
-    g = np.zeros((3, 2, len(x)))
-    g[0, 0], g[2, 0] = u_scale, -u_scale * x
-    g[1, 1], g[2, 1] = v_scale, -v_scale * y
+        error *= normals
+        np.add(error[0], error[1], out=out[0])
+        if bias_px is not None:
+            out += bias_px
+
+
+def _gradients(slopes: FloatArray, xy: FloatArray, inverse_z: FloatArray) -> FloatArray:
+    """(3, k, n) gradients of the residuals by cP [px/m]: (a, b, -(a x + b y)) / Z of slopes (a, b)."""
+    g = np.empty((3, slopes.shape[1], len(inverse_z)))
+    np.multiply(slopes, inverse_z, out=g[:2])
+    np.multiply(g[0], -xy[0], out=g[2])
+    g[2] -= g[1] * xy[1]
     return g
 
 
-def _sizes(alignment: Alignment, evaluated: Evaluated) -> FloatArray:
-    """(n,) size of each match's whitened residual."""
-    r = evaluated.rows[-1]
-    size = np.abs(r[0]) if len(r) == 1 else np.sqrt(r[0] * r[0] + r[1] * r[1])
-    return np.asarray(size / alignment.sigmas_px)
+def _squares(alignment: Alignment, evaluated: Evaluated) -> FloatArray:
+    """(n,) square of each match's whitened residual."""
+    squares = np.square(evaluated.rows[-1] / alignment.sigmas_px)
+    return squares[0] if len(squares) == 1 else np.add(squares[0], squares[1])
 
 
 def _behind_costs(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
@@ -249,7 +261,8 @@ def _behind_costs(alignment: Alignment, behind: NDArray[np.bool_]) -> float:
 
 
 def cost(alignment: Alignment, evaluated: Evaluated) -> float:
-    cost = float(alignment.weights @ alignment.kernel.loss(_sizes(alignment, evaluated)))
+    _, losses = alignment.kernel.weight_and_loss(_squares(alignment, evaluated))
+    cost = float(alignment.weights @ losses)
     if evaluated.behind is not None:
         cost += _behind_costs(alignment, evaluated.behind)
     return cost
@@ -257,15 +270,13 @@ def cost(alignment: Alignment, evaluated: Evaluated) -> float:
 
 def weigh(alignment: Alignment, evaluated: Evaluated) -> float:
     """Multiply the rows by sqrt(weight w) / sigma in place; return 2 cost - |weighted r|^2."""
-    scale = np.sqrt(alignment.weights) / alignment.sigmas_px
-    if alignment.kernel.kind == "none":
-        np.multiply(evaluated.rows, scale, out=evaluated.rows)
-        constant = 0.0
-    else:
-        x = _sizes(alignment, evaluated)
-        w = alignment.kernel.weight(x)
-        np.multiply(evaluated.rows, scale * np.sqrt(w), out=evaluated.rows)
-        constant = float(alignment.weights @ (2.0 * alignment.kernel.loss(x) - w * x * x))
+    scales, rows, constant = alignment.row_scales, evaluated.rows, 0.0
+    if alignment.kernel.kind != "none":
+        squares = _squares(alignment, evaluated)
+        w, losses = alignment.kernel.weight_and_loss(squares)
+        scales = scales * np.sqrt(w)
+        constant = float(alignment.weights @ (2.0 * losses - w * squares))
+    np.multiply(rows, scales, out=rows)
     if evaluated.behind is not None:
         constant += 2.0 * _behind_costs(alignment, evaluated.behind)
     return max(constant, 0.0)

@@ -37,17 +37,29 @@ class RobustKernel:
 
     def weight(self, x: ArrayLike) -> FloatArray:
         """w = rho'(x) / x, in [0, 1]; any shape."""
-        x = np.asarray(x, dtype=np.float64)
+        return self.weight_and_loss(np.square(np.asarray(x, dtype=np.float64)))[0]
+
+    def loss(self, x: ArrayLike) -> FloatArray:
+        """rho(x), any shape."""
+        return self.weight_and_loss(np.square(np.asarray(x, dtype=np.float64)))[1]
+
+    def weight_and_loss(self, squares: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Both from x^2, any shape: a linearization wants both, and most of their work is the same."""
         if self.kind == "none":
-            return np.ones_like(x)
+            return np.ones_like(squares), np.asarray(0.5 * squares)
         if self.kind == "huber":
-            return np.asarray(self.scale / np.maximum(np.abs(x), self.scale))
-        z = np.square(x / self.scale)
+            size = np.sqrt(squares)
+            inside = np.minimum(size, self.scale)
+            return np.asarray(self.scale / np.maximum(size, self.scale)), inside * (size - 0.5 * inside)
+        z = squares * self.scale**-2.0
+        half = 0.5 * self.scale**2
         if self.kind == "cauchy":
-            return np.asarray(1.0 / (1.0 + z))
+            return np.asarray(1.0 / (1.0 + z)), np.asarray(half * np.log1p(z))
         if self.kind == "geman_mcclure":
-            return np.asarray(1.0 / np.square(1.0 + z))
-        return np.asarray(np.square(np.maximum(1.0 - z, 0.0)))
+            root = 1.0 / (1.0 + z)
+            return np.square(root), half * (z * root)
+        rest = np.maximum(1.0 - z, 0.0)
+        return np.square(rest), np.asarray(half / 3.0 * (1.0 - rest**3))
 
     def curvature(self, x: ArrayLike) -> FloatArray:
         """rho''(x), any shape: negative where a kernel redescends."""
@@ -62,20 +74,3 @@ class RobustKernel:
         if self.kind == "geman_mcclure":
             return np.asarray((1.0 - 3.0 * z) / (1.0 + z) ** 3)
         return np.asarray(np.maximum(1.0 - z, 0.0) * (1.0 - 5.0 * z) * (z < 1.0))
-
-    def loss(self, x: ArrayLike) -> FloatArray:
-        """rho(x), any shape."""
-        x = np.asarray(x, dtype=np.float64)
-        if self.kind == "none":
-            return np.asarray(0.5 * np.square(x))
-        if self.kind == "huber":
-            size = np.abs(x)
-            inside = np.minimum(size, self.scale)
-            return np.asarray(inside * (size - 0.5 * inside))
-        z = np.square(x / self.scale)
-        half = 0.5 * self.scale**2
-        if self.kind == "cauchy":
-            return np.asarray(half * np.log1p(z))
-        if self.kind == "geman_mcclure":
-            return np.asarray(half * (z / (1.0 + z)))
-        return np.asarray(half / 3.0 * (1.0 - np.maximum(1.0 - z, 0.0) ** 3))

@@ -23,7 +23,7 @@ from sst_graph.assumptions.model import Effect, Scene
 from sst_graph.config import Settings, internal, setting
 from sst_graph.factors.alignment import Alignment
 from sst_graph.factors.camera import PinholeCamera
-from sst_graph.factors.motion import CameraTwist, move_points, moved_pose
+from sst_graph.factors.motion import CameraTwist, group_poses, move_points, transformed
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.lidar_edges import Boundaries, Edge, joined
 from sst_graph.features.mask_contour import ContourFeet, ContourMap, nearest_contours, stretches
@@ -170,46 +170,60 @@ class PairedEdges:
         """(n, ...) the value of each point's group, from those of the groups (g, ...)."""
         return np.repeat(np.asarray(of_groups), np.diff(self.bounds), axis=0)
 
-    def projected(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
+    def projected(
+        self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float, poses: FloatArray | None = None
+    ) -> FloatArray:
         """(n, 2) pixels of points (n, 3) of the groups, moved to their images' instant; NaN behind the
-        camera."""
-        return self.camera.project(self.moved(lPs, cTl, time_offset_s))
+        camera. Arguments as in :meth:`moved`."""
+        return self.camera.project(self.moved(lPs, cTl, time_offset_s, poses))
 
-    def moved(self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray:
-        """(n, 3) points (n, 3) of the groups at their images' instant, in the camera [m]."""
+    def moved(
+        self, lPs: FloatArray, cTl: gtsam.Pose3, time_offset_s: float, poses: FloatArray | None = None
+    ) -> FloatArray:
+        """(n, 3) points (n, 3) of the groups at their images' instant, in the camera [m].
+
+        Args:
+            poses: what :meth:`poses` gives, of these or of all points, where it is known.
+        """
         columns, taus = np.ascontiguousarray(lPs.T), time_offset_s + self.base_taus_s
         if self.velocities is not None:
             columns = columns + taus * self.velocities.T
-        groups = [(a, b, motion) for (a, b), motion in zip(self.spans, self.motions, strict=True) if b > a]
-        starts = [a for a, _, _ in groups]
-        if not np.array_equal(taus, np.repeat(taus[starts], [b - a for a, b, _ in groups])):
-            each = CameraTwist(*(self.repeated(rows).T for rows in self._motion_rows()))
+        if poses is None:
+            poses = self.poses(cTl, time_offset_s)
+        if poses is None:
+            each = CameraTwist(*(self.repeated(rows).T for rows in self.motion_rows))
             return np.asarray(move_points(cTl, columns, taus, each).cPs.T)
-        # Every group moves as one rigid body.
-        cPs = np.empty_like(columns)
-        for (a, b, motion), tau_s in zip(groups, taus[starts].tolist(), strict=True):
-            moved = moved_pose(cTl, tau_s, motion)
-            np.matmul(moved.rotation().matrix(), columns[:, a:b], out=cPs[:, a:b])
-            cPs[:, a:b] += np.asarray(moved.translation()).reshape(3, 1)
-        return cPs.T
+        return transformed(poses, columns, self.bounds).T
 
-    def accelerations(self) -> FloatArray:
-        """(6,) where all groups share it, else (n, 6): of each point's image [rad/s^2, m/s^2]."""
+    def poses(self, cTl: gtsam.Pose3, time_offset_s: float) -> FloatArray | None:
+        """(g, 4, 4) pose of the LiDAR in the camera with the motion, of groups that move as one rigid body;
+        None where the points of a group have times of their own."""
+        if len(self.base_taus_s) == 0:
+            return None
+        base_taus_s = self.base_taus_s[np.minimum(self.bounds[:-1], len(self.base_taus_s) - 1)]
+        if not np.array_equal(self.base_taus_s, self.repeated(base_taus_s)):
+            return None
+        return group_poses(cTl, time_offset_s + base_taus_s, CameraTwist(*self.motion_rows))
+
+    def accelerations(self, counts: IntArray) -> FloatArray:
+        """(6,) where all groups share it, else (m, 6): of the image of each of so many points a group (g,)
+        [rad/s^2, m/s^2]."""
         first = self.motions[0]
         if all(motion is first for motion in self.motions):
             return first.c_acceleration
-        return self.repeated(self._motion_rows()[1])
+        return np.repeat(self.motion_rows[1], counts, axis=0)
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
         """Where each group begins and ends."""
         return list(pairwise(self.bounds.tolist()))
 
-    def _motion_rows(self) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def motion_rows(self) -> tuple[FloatArray, FloatArray]:
         """(g, 6) twists and accelerations."""
         return (
-            np.stack([motion.c_twist for motion in self.motions]),
-            np.stack([motion.c_acceleration for motion in self.motions]),
+            np.array([motion.c_twist for motion in self.motions]),
+            np.array([motion.c_acceleration for motion in self.motions]),
         )
 
 
@@ -329,65 +343,66 @@ def match_edges(
             camera.
     """
     # 1. Project the points into their images.
-    uvs, shift = paired.projected(paired.points.lPs, cTl, time_offset_s), None
+    poses = paired.poses(cTl, time_offset_s)
+    uvs, shift = paired.projected(paired.points.lPs, cTl, time_offset_s, poses), None
     if deviation is not None:
-        paired = _deviated(paired, deviation, uvs)
+        paired, poses = _deviated(paired, deviation, uvs), None
         ideal = paired.projected(paired.points.lPs, cTl, time_offset_s)
         shift = _pixel_shift(deviation, paired, ideal)
         uvs = ideal + shift
     index = np.flatnonzero(paired.camera.in_image(uvs))
-    paired, uvs = paired.take(index), uvs[index]
-    seen, objects_seen = np.diff(paired.bounds), np.bincount(paired.owners)
+    some, uvs = paired.take(index), uvs[index]
+    seen, objects_seen = np.diff(some.bounds), np.bincount(some.owners)
     # 2. Find the nearest contours within the gate.
     if any(isinstance(contour, PictureGradients) for contour in paired.contours):
-        tips = paired.projected(paired.points.outward, cTl, time_offset_s)
+        tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
         ways = tips - (uvs if shift is None else ideal[index])
-        feet, shares = _contours_or_gradients(paired, uvs, ways, kernel, config.edge_peaks)
+        feet, shares = _contours_or_gradients(some, uvs, ways, kernel, config.edge_peaks)
     else:
         maps = [contour for contour in paired.contours if isinstance(contour, ContourMap)]
-        feet, shares = nearest_contours(maps, paired.spans, uvs), None
-    enlarged = stretches(paired.contours, paired.spans, feet)
+        feet, shares = nearest_contours(maps, some.spans, uvs), None
+    enlarged = stretches(some.contours, some.spans, feet)
     distances = feet.distances if enlarged is None else feet.distances / enlarged
-    residuals = distances + paired.repeated(paired.biases_px)
+    residuals = distances + some.repeated(some.biases_px)
     near = np.flatnonzero(feet.valid & (np.abs(residuals) < GATE * kernel.scale))
-    paired, uvs, index = paired.take(near), uvs[near], index[near]
-    enlarged = None if enlarged is None else enlarged[near]
-    normals, pixels = feet.normals[near], feet.feet[near]
+    index, uvs, normals, pixels = index[near], uvs[near], feet.normals[near], feet.feet[near]
+    some = paired.take(index)
     # 3. Keep contours that face the outward direction of the object.
-    tips = paired.projected(paired.points.outward, cTl, time_offset_s)
+    tips = some.projected(some.points.outward, cTl, time_offset_s, poses)
     if shift is not None and deviation is not None:
         shift = shift[index]
-        tips = tips + _pixel_shift(deviation.take(index), paired, tips)
+        tips = tips + _pixel_shift(deviation.take(index), some, tips)
         pixels = pixels - shift
     outward = tips - uvs
-    length = np.linalg.norm(outward, axis=1)
+    length = np.sqrt(np.vecdot(outward, outward))
     outward = outward / np.maximum(length, 1e-9)[:, None]
-    cosine = (outward * normals).sum(axis=1)
+    cosine = np.vecdot(outward, normals)
     # 4. Keep objects of which enough points have a match.
-    on = np.flatnonzero(of_matched_objects(faces(cosine), paired.owners, objects_seen, MIN_OBJECT_SHARE))
-    paired, index, length = paired.take(on), index[on], length[on]
+    on = np.flatnonzero(of_matched_objects(faces(cosine), some.owners, objects_seen, MIN_OBJECT_SHARE))
+    index, owners, length = index[on], some.owners[on], length[on]
     if enlarged is not None:
-        enlarged = enlarged[on]
+        enlarged = enlarged[near][on]
         length = length / enlarged
     sigmas = match_sigmas(length, cosine[on], config)
-    sides = sides_of(paired.points.edges, outward[on, 0])
-    weights = side_weights(paired.owners, sides, sigmas, config)
+    sides = sides_of(paired.points.edges[index], outward[on, 0])
+    weights = side_weights(owners, sides, sigmas, config)
     if shares is not None:
         weights = weights * shares[near][on]
+    bounds = np.searchsorted(index, paired.bounds)
     alignment = Alignment(
         camera=paired.camera,
-        lPs=paired.points.lPs,
-        base_taus_s=paired.base_taus_s,
+        lPs=paired.points.lPs[index],
+        base_taus_s=paired.base_taus_s[index],
         pixels=pixels[on],
         sigmas_px=sigmas,
         normals=normals[on],
         kernel=kernel,
-        c_acceleration=paired.accelerations(),
+        c_acceleration=paired.accelerations(np.diff(bounds)),
         weights=weights,
-        l_velocities=paired.velocities,
+        l_velocities=None if paired.velocities is None else paired.velocities[index],
         stretches=enlarged,
     )
-    return EdgeMatches(index, sides, alignment, paired.bounds, seen)
+    return EdgeMatches(index, sides, alignment, bounds, seen)
 
 
 def _contours_or_gradients(

@@ -156,21 +156,22 @@ def match_nearest(
         lPs, uvs, targets = lPs[near], uvs[near], targets[near]
         if len(lPs) == 0:
             return None
-
-    def frozen(points: FloatArray, pixels: FloatArray, weight: float) -> Alignment:
-        return Alignment(
-            view.camera,
-            points,
-            np.asarray(view.base_tau_s),
-            pixels,
-            np.asarray(1.0),
-            motion_model=_MOTION_MODEL,
-            weights=np.asarray(weight),
-        )
-
-    point_to_pixel = frozen(lPs, targets, 1.0)
+    point_to_pixel = frozen(view, lPs, targets, 1.0)
     if pixel_weight == 0.0:
         return NearestMatches(point_to_pixel, None)
     chosen = nearest_points(uvs, view.pixels)
     weight = pixel_weight * len(lPs) / len(view.pixels)
-    return NearestMatches(point_to_pixel, frozen(lPs[chosen], view.pixels, weight))
+    return NearestMatches(point_to_pixel, frozen(view, lPs[chosen], view.pixels, weight))
+
+
+def frozen(view: ClassView, lPs: FloatArray, pixels: FloatArray, weight: float) -> Alignment:
+    """Matches of points (n, 3) of a view with pixels (n, 2), all of one weight."""
+    return Alignment(
+        view.camera,
+        lPs,
+        np.asarray(view.base_tau_s),
+        pixels,
+        np.asarray(1.0),
+        motion_model=_MOTION_MODEL,
+        weights=np.asarray(weight),
+    )

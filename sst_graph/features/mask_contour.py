@@ -25,8 +25,8 @@ REACH_PX = 64
 """The field ends this far around the class [px]: beyond every gate (``gate`` times the widest kernel)."""
 MIN_GRADIENT = 0.3
 """A distance field whose gradient is shorter than this has no clear nearest contour (a ridge)."""
-_CROSS = np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])[:, :, None]
-"""A pixel and its neighbours: columns and rows, (2, 5, 1)."""
+_CROSS = np.array([[0.0, 1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, -1.0]])[:, None, :]
+"""A pixel and its neighbours: columns and rows, (2, 1, 5)."""
 
 
 @dataclass(frozen=True)
@@ -155,14 +155,14 @@ def nearest_contours(
     corners = np.array([(contour.left, contour.top) for contour in contours])
     corner = corners.T if len(contours) == 1 else np.repeat(corners, counts, axis=0).T
     safe = np.where(valid, uvs.T, BORDER_PX + 1.0)
-    u, v = (safe - corner)[:, None] + _CROSS
-    u, v = u.astype(np.float32), v.astype(np.float32)
-    samples = np.empty((5, n), np.float32)
+    u, v = ((safe - corner)[:, :, None] + _CROSS).astype(np.float32)
+    samples = np.empty((n, 5), np.float32)
     for contour, (a, b) in zip(contours, spans, strict=True):
         if b > a:
-            samples[:, a:b] = sampled(contour.distance, u[:, a:b], v[:, a:b])
-    centre, right, left, below, above = samples.astype(np.float64)
-    gradient = 0.5 * np.stack([right - left, below - above])
+            own = sampled(contour.distance, u[a:b].reshape(1, -1), v[a:b].reshape(1, -1))
+            samples[a:b] = own.reshape(-1, 5)
+    centre, right, left, below, above = samples.T.astype(np.float64)
+    gradient = 0.5 * np.array([right - left, below - above])
     length = np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
     steep = length > 1e-6
     normals = np.where(steep, gradient / np.where(steep, length, 1.0), [[1.0], [0.0]])
@@ -198,14 +198,14 @@ def are_unknown(
 ) -> NDArray[np.bool_]:
     """(n,) whether nothing is known of the contours at columns and rows (2, n) of their boxes; spans as in
     :func:`nearest_contours`."""
-    column, row = np.maximum(np.rint(places).astype(np.intp), 0)
+    boxes = np.array([contour.box for contour in contours])
+    boxes = np.repeat(boxes, [b - a for a, b in spans], axis=0).T
+    column, row = np.clip(np.rint(places).astype(np.intp), 0, boxes - 1)
+    at = row * boxes[0] + column
     found = np.empty(places.shape[1], np.uint8)
     for contour, (a, b) in zip(contours, spans, strict=True):
         if b > a:
-            unknown = contour.unknown
-            rows, columns = unknown.shape
-            at = np.minimum(row[a:b], rows - 1) * columns + np.minimum(column[a:b], columns - 1)
-            found[a:b] = unknown.reshape(-1)[at]
+            found[a:b] = contour.unknown.take(at[a:b])
     return found > 0
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -20,7 +21,8 @@ from numpy.typing import NDArray
 from sst_graph.assumptions import named_sigmas
 from sst_graph.drive.trajectory import camera_covariances
 from sst_graph.factors.matches import Alignment
-from sst_graph.factors.reprojection import evaluate, weigh
+from sst_graph.factors.motion import CameraTwist, move_groups
+from sst_graph.factors.reprojection import Evaluated, evaluate, evaluate_moved, weigh
 from sst_graph.factors.velocity import transferred
 from sst_graph.graph.building import UNKNOWN_TWIST_SIGMAS, prior_graph
 from sst_graph.graph.linear import information_inverse
@@ -37,6 +39,7 @@ from sst_graph.graph.state import (
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
+BoolArray = NDArray[np.bool_]
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e5
 """Damping of the Levenberg-Marquardt steps: of the first, least, most."""
@@ -128,6 +131,13 @@ class _Images:
     clocks: IntArray
     offsets_s: FloatArray
 
+    @cached_property
+    def by_clock(self) -> list[tuple[BoolArray, IntArray, tuple[IntArray, ...]]]:
+        """For each time offset its images (f,), the columns of the extrinsic and of it, and where these stand
+        in H_mixed."""
+        parts = [(self.clocks == c, np.array([*range(6), c])) for c in np.unique(self.clocks).tolist()]
+        return [(own, columns, np.ix_(own, range(6), columns)) for own, columns in parts]
+
 
 @dataclass(frozen=True)
 class _Frames:
@@ -138,20 +148,65 @@ class _Frames:
         images: (m,) number of the image of each.
         biases: (m,) column of its mask bias.
         clock: column of the drive's time offset.
-        terms: (t, m) derivatives of the residuals by the parameters that are estimated.
+        term_columns: of the parameters that are estimated.
+        terms: (t, m) derivatives of the residuals by them.
         terms_at: (t,) where they were made.
-        spans: number, first match and end of each image.
-        cells: first match of each image's matches that share a bias.
     """
 
     alignment: Alignment
     images: IntArray
     biases: IntArray
     clock: int
+    term_columns: Sequence[int]
     terms: FloatArray
     terms_at: FloatArray
-    spans: list[tuple[int, int, int]]
-    cells: IntArray
+
+    @cached_property
+    def bounds(self) -> IntArray:
+        """(f + 1,) first match of each image that has one, and the end."""
+        return np.append(np.flatnonzero(np.diff(self.images, prepend=-1)), len(self.images))
+
+    @cached_property
+    def places(self) -> IntArray:
+        """(f,) numbers of these images."""
+        return self.images[self.bounds[:-1]]
+
+    @cached_property
+    def spans(self) -> list[tuple[int, int, int]]:
+        """Number, first match and end of each of them."""
+        bounds = self.bounds.tolist()
+        return list(zip(self.places.tolist(), bounds[:-1], bounds[1:], strict=True))
+
+    @cached_property
+    def cells(self) -> IntArray:
+        """First match of each image's matches that share a bias."""
+        new_image, new_bias = np.diff(self.images, prepend=-1) != 0, np.diff(self.biases, prepend=-1) != 0
+        return np.flatnonzero(new_image | new_bias)
+
+    @cached_property
+    def cell_spans(self) -> IntArray:
+        """Which of ``spans`` each cell lies in."""
+        return np.searchsorted(self.bounds, self.cells, side="right") - 1
+
+    @cached_property
+    def accelerations(self) -> FloatArray | None:
+        """(f, 6) of the twist at each image where its matches move as one rigid body, else None."""
+        alignment, starts = self.alignment, self.bounds[:-1]
+        each = np.broadcast_to(alignment.c_acceleration, (len(alignment), 6))
+        own = np.column_stack([alignment.base_taus_s, each])
+        rigid = np.array_equal(own, np.repeat(own[starts], np.diff(self.bounds), axis=0))
+        rigid = rigid and alignment.l_velocities is None and alignment.motion_model == "se3"
+        return each[starts] if rigid else None
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Of the extrinsic, the time offset and the parameters."""
+        return np.array([*range(6), self.clock, *self.term_columns])
+
+    @cached_property
+    def into_mixed(self) -> tuple[IntArray, ...]:
+        """Where the products of twists and ``columns`` stand in H_mixed."""
+        return np.ix_(self.places, range(6), self.columns)
 
 
 class FrozenProblem:
@@ -287,50 +342,66 @@ class FrozenProblem:
         WJ = images.information @ J
         system.H_twists[:] += images.information
         system.g_twists[:] += weighted
-        for clock in np.unique(images.clocks).tolist():
-            own, columns = images.clocks == clock, [*range(6), clock]
-            system.H[np.ix_(columns, columns)] += np.einsum("fij,fik->jk", J[own], WJ[own])
-            system.g[columns] += np.einsum("fij,fi->j", J[own], weighted[own])
-            system.H_mixed[np.ix_(own, range(6), columns)] += WJ[own]
+        for own, columns, into in images.by_clock:
+            rows = J[own].reshape(-1, 7).T
+            system.H[columns[:, None], columns] += rows @ WJ[own].reshape(-1, 7)
+            system.g[columns] += rows @ weighted[own].reshape(-1)
+            system.H_mixed[into] += WJ[own]
         return 0.5 * float((error * weighted).sum())
 
     def _add(self, frames: _Frames, system: NormalEquations, point: FrozenPoint) -> float:
         """Add the matches of a drive to the normal equations; their cost."""
-        # 1. Weighted rows: 13 of the motion, the parameters that are estimated, bias, residual.
-        alignment = frames.alignment
-        time_offset_s, biases_px = point.scalars[frames.clock - 6], point.scalars[frames.biases - 6]
-        twists = point.twists[frames.images].T
-        evaluated = evaluate(alignment, point.cTl, float(time_offset_s), twists, biases_px, True)
-        if self._terms:
-            steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
-            evaluated = evaluated.with_terms(frames.terms, steps, True)
-        constant = weigh(alignment, evaluated)
+        # 1. Weighted rows: those of the motion, the parameters that are estimated, bias, residual.
+        evaluated = self._evaluated(frames, point)
+        constant = weigh(frames.alignment, evaluated)
         rows = evaluated.rows[:, 0]
-        # 2. Of each image the sums of the products of its rows.
+        # 2. Of each image the sums of the products of its rows; of the matches that share a bias, with it.
         products = np.empty((len(frames.spans), len(rows), len(rows)))
         for G, (_, start, end) in zip(products, frames.spans, strict=True):
             own = rows[:, start:end]
             np.matmul(own, own.T, out=G)
-        places = [image for image, _, _ in frames.spans]
-        columns = [*range(6), frames.clock, *self._terms]
+        cells = np.add.reduceat(rows * rows[-2], frames.cells, axis=1)
+        if evaluated.lift is not None:
+            lift = evaluated.whole_lift()
+            products = lift @ products @ lift.transpose(0, 2, 1)
+            cells = (lift[frames.cell_spans] @ cells.T[:, :, None])[:, :, 0].T
+        # 3. They belong to the extrinsic, the time offset and the parameters, to the twists,
+        places, columns = frames.places, frames.columns
         shared, twist = [*range(7), *range(13, 13 + len(frames.terms))], slice(7, 13)
-        total = products.sum(axis=0)
-        system.H[np.ix_(columns, columns)] += total[np.ix_(shared, shared)]
-        system.g[columns] += total[shared, -1]
+        of_shared = products[:, :, shared]
+        total = of_shared.sum(axis=0)
+        system.H[columns[:, None], columns] += total[shared]
+        system.g[columns] += total[-1]
         system.H_twists[places] += products[:, twist, twist]
         system.g_twists[places] += products[:, twist, -1]
-        system.H_mixed[np.ix_(places, range(6), columns)] += products[:, twist][:, :, shared]
-        # 3. The same of the matches of an image that share a bias, with the bias.
-        cells = np.add.reduceat(rows * rows[-2], frames.cells, axis=1)
+        system.H_mixed[frames.into_mixed] += of_shared[:, twist]
+        # and to the biases.
         bias, image_of = frames.biases[frames.cells], frames.images[frames.cells]
         by_bias = np.zeros((len(system.g), len(cells)))
         np.add.at(by_bias, bias, cells.T)
         system.H[columns] += by_bias[:, shared].T
         system.H[:, columns] += by_bias[:, shared]
-        system.H[np.diag_indices(len(by_bias))] += by_bias[:, -2]
+        np.fill_diagonal(system.H, system.H.diagonal() + by_bias[:, -2])
         system.g[...] += by_bias[:, -1]
         system.H_mixed[image_of, :, bias] += cells[twist].T
         return 0.5 * (float(rows[-1] @ rows[-1]) + constant)
+
+    def _evaluated(self, frames: _Frames, point: FrozenPoint) -> Evaluated:
+        """Residuals of a drive's matches and their derivatives, not weighted."""
+        alignment, time_offset_s = frames.alignment, float(point.scalars[frames.clock - 6])
+        biases_px = point.scalars[frames.biases - 6]
+        if frames.accelerations is None:
+            twists = point.twists[frames.images].T
+            evaluated = evaluate(alignment, point.cTl, time_offset_s, twists, biases_px, True)
+        else:
+            motion = CameraTwist(point.twists[frames.places], frames.accelerations)
+            taus_s = time_offset_s + alignment.base_taus_s[frames.bounds[:-1]]
+            moved = move_groups(point.cTl, alignment.columns[0], frames.bounds, taus_s, motion)
+            evaluated = evaluate_moved(alignment, moved, biases_px, True)
+        if not self._terms:
+            return evaluated
+        steps = point.scalars[np.array(self._terms) - 6] - frames.terms_at
+        return evaluated.with_terms(frames.terms, steps, True)
 
     def _frames_of(self, matches: DriveMatches, places: dict[int, int]) -> _Frames:
         number = matches.number
@@ -344,17 +415,14 @@ class FrozenProblem:
             if self._names
             else np.zeros((0, len(order)))
         )
-        starts = np.flatnonzero(np.diff(images, prepend=-1))
-        ends = [*starts[1:].tolist(), len(images)]
         return _Frames(
             matches.alignment.take(order),
             images,
             biases,
             self._columns[time_offset_key(self.state.clock(number))],
+            self._terms,
             terms[:, order],
             np.array([self.state.nuisances.get(name, 0.0) for name in self._names]),
-            list(zip(images[starts].tolist(), starts.tolist(), ends, strict=True)),
-            np.flatnonzero((np.diff(images, prepend=-1) != 0) | (np.diff(biases, prepend=-1) != 0)),
         )
 
 
