@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import gtsam
 import numpy as np
 
 from sst_graph.batch.config import CalibrationConfig
@@ -25,9 +24,9 @@ def motion_method(
     """
     solutions = solve_motion(drives, guess.cTl, guess.time_offset_s, config.search.time_offset_s, progress)
     best = solutions[0]
-    pairs = [term.pair for term in best.terms]
-    frames = tuple(FrameId(drives[p.camera.drive].name, p.camera.image) for p in pairs)
-    gained = pair_gains(best.terms, frames, best.state)
+    cameras = best.terms.pairs.cameras
+    frames = tuple(FrameId(drives[camera.drive].name, camera.image) for camera in cameras)
+    gained = pair_gains(best.terms.each(), frames, best.state)
     return MethodEstimate(
         best.state.cTl,
         best.state.time_offsets_s[0],
@@ -36,8 +35,8 @@ def motion_method(
         reasons=_reasons(solutions),
         diagnostics={
             "outer_iterations": best.outer_iterations,
-            "pairs": len(pairs),
-            "directions": sum(term.has_direction for term in best.terms),
+            "pairs": len(cameras),
+            "directions": int(best.terms.residuals.directed.sum()),
             "noise_scales": {"rotation": best.scales.rotation, "direction": best.scales.direction},
             "turned_deg": _turned_deg(best),
             KEY: to_document(gained),
@@ -47,7 +46,7 @@ def motion_method(
 
 def _turned_deg(solution: MotionSolution) -> float:
     """How far the vehicle turned in all, to and fro [deg]."""
-    turns = [np.linalg.norm(gtsam.Rot3.Logmap(term.pair.camera.rotation)) for term in solution.terms]
+    turns = [np.linalg.norm(camera.turned) for camera in solution.terms.pairs.cameras]
     return float(np.degrees(np.sum(turns)))
 
 

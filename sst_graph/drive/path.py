@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 from sst_graph.types import RelativeMotion
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.intp]
+
+_NODES = 4
+"""Most poses that a cubic passes through."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,45 @@ class PathStep:
     twist_covariance: FloatArray
 
 
+@dataclass(frozen=True)
+class PathSteps:
+    """Motions of a sensor over m intervals; each attribute is that of :class:`PathStep`, stacked.
+
+    Attributes:
+        found: (m,) which of the intervals that were asked for these are: the path does not reach the others.
+        aTbs: (m, 4, 4).
+        twists_a, twists_b: (m, 6).
+        covariances, covariance_rates, twist_covariances: (m, 6, 6).
+    """
+
+    found: IntArray
+    aTbs: FloatArray
+    twists_a: FloatArray
+    twists_b: FloatArray
+    covariances: FloatArray
+    covariance_rates: FloatArray
+    twist_covariances: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.found)
+
+    def __getitem__(self, number: int) -> PathStep:
+        return PathStep(
+            gtsam.Pose3(self.aTbs[number]),
+            self.twists_a[number],
+            self.twists_b[number],
+            self.covariances[number],
+            self.covariance_rates[number],
+            self.twist_covariances[number],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[PathSteps]) -> PathSteps:
+        """Those of several paths, one after the other; ``found`` counts through all."""
+        columns = zip(*(vars(part).values() for part in parts), strict=True)
+        return cls(*(np.concatenate(column) for column in columns))
+
+
 class SensorPath:
     """Poses at stamps, joined smoothly: Exp of a cubic through the four nearest poses' logarithms.
 
@@ -53,48 +96,94 @@ class SensorPath:
         broken = np.array([not motion.ok for motion in motions], np.int64)
         self._piece = np.concatenate([[0], np.cumsum(broken)])
         self._cubics: dict[int, _Cubic] = {}
+        self._ok = np.array([motion.ok for motion in motions], np.bool_)
+        self._covariances = np.array([motion.covariance for motion in motions]).reshape(-1, 6, 6)
+        self._matrices = np.array([pose.matrix() for pose in self._poses])
 
     def at(self, stamp_ns: int) -> tuple[gtsam.Pose3, FloatArray] | None:
         """Pose in the first stamp's frame, and twist (6,); None where the path does not reach."""
-        i = self._interval(stamp_ns)
-        if i is None:
+        stamps = np.array([stamp_ns], np.int64)
+        intervals = self._intervals(stamps)
+        if intervals[0] < 0:
             return None
-        log, rate = self._powers(i, stamp_ns) @ self._cubic(i).coefficients
-        pose = self._poses[i].compose(gtsam.Pose3.Expmap(log))
-        return pose, np.asarray(gtsam.Pose3.ExpmapDerivative(log)) @ rate
+        poses, twists, _ = self._interpolated(intervals, stamps)
+        return gtsam.Pose3(poses[0]), twists[0]
 
     def step(self, from_ns: int, to_ns: int) -> PathStep | None:
         """Motion from one time to a later one; None where the path does not reach."""
-        a, b = self.at(from_ns), self.at(to_ns)
-        if a is None or b is None:
-            return None
-        first, last = self._interval(from_ns), self._interval(to_ns)
-        if first is None or last is None or self._piece[first + 1] != self._piece[last]:
-            return None
+        steps = self.steps(np.array([from_ns], np.int64), np.array([to_ns], np.int64))
+        return steps[0] if len(steps) else None
+
+    def steps(self, from_ns: NDArray[np.int64], to_ns: NDArray[np.int64]) -> PathSteps:
+        """Motions from some times to later ones [ns], (n,) each, where the path reaches."""
+        first, last = self._intervals(from_ns), self._intervals(to_ns)
+        joined = self._piece[first + 1] == self._piece[last]
+        found = np.flatnonzero((first >= 0) & (last >= 0) & joined)
+        first, last, n = first[found], last[found], len(found)
+        # Each time once: mostly, one step ends where the next begins.
+        times, place = np.unique(np.concatenate([from_ns[found], to_ns[found]]), return_inverse=True)
+        place = place.reshape(2, n)
+        poses, twists, weights = self._interpolated(self._intervals(times), times)
         # Every pose errs by itself: what the step takes from each of them, and how that changes.
-        of_a, of_b = self._weights(first, from_ns), self._weights(last, to_ns)
-        shares = {k: np.zeros(2) for k in (*of_a, *of_b)}
-        for weights, sign in ((of_a, -1.0), (of_b, 1.0)):
-            for k, weight in weights.items():
-                shares[k] += sign * weight
-        share = np.stack(list(shares.values()))
-        of_pose = 0.5 * np.mean([self._motions[i].covariance for i in range(first, last + 1)], axis=0)
-        return PathStep(
-            a[0].between(b[0]),
-            a[1],
-            b[1],
-            of_pose * (share[:, 0] @ share[:, 0]),
-            of_pose * (2.0 * share[:, 0] @ share[:, 1]),
-            of_pose * (share[:, 1] @ share[:, 1]),
+        oldest = np.maximum(np.array([first, last]) - 1, 0)
+        ahead = oldest[1] - oldest[0]
+        shares = np.zeros((n, int(ahead.max(initial=0)) + _NODES, 2))
+        columns, rows = np.arange(_NODES), np.arange(n)[:, None]
+        shares[rows, columns] -= weights[place[0]]
+        shares[rows, ahead[:, None] + columns] += weights[place[1]]
+        products = np.swapaxes(shares, 1, 2) @ shares
+        of_pose = 0.5 * self._mean_covariances(first, last)
+        a, b = poses[place[0]], poses[place[1]]
+        aTbs = np.tile(np.eye(4), (n, 1, 1))
+        back = np.swapaxes(a[:, :3, :3], 1, 2)
+        aTbs[:, :3, :3] = back @ b[:, :3, :3]
+        aTbs[:, :3, 3] = (back @ (b[:, :3, 3] - a[:, :3, 3])[..., None])[..., 0]
+        return PathSteps(
+            found,
+            aTbs,
+            twists[place[0]],
+            twists[place[1]],
+            of_pose * products[:, 0, 0, None, None],
+            of_pose * (2.0 * products[:, 0, 1, None, None]),
+            of_pose * products[:, 1, 1, None, None],
         )
 
-    def _interval(self, stamp_ns: int) -> int | None:
-        """Number of the measured interval that holds a time."""
+    def _intervals(self, stamps_ns: NDArray[np.int64]) -> IntArray:
+        """(n,) number of the measured interval that holds each time (n,) [ns]; -1 where none does."""
         n = len(self._motions)
-        if n == 0 or not self._stamps[0] <= stamp_ns <= self._stamps[-1]:
-            return None
-        i = min(int(np.searchsorted(self._stamps, stamp_ns, side="right")) - 1, n - 1)
-        return i if self._motions[i].ok else None
+        if n == 0:
+            return np.full(len(stamps_ns), -1)
+        inside = (self._stamps[0] <= stamps_ns) & (stamps_ns <= self._stamps[-1])
+        i = np.clip(np.searchsorted(self._stamps, stamps_ns, side="right") - 1, 0, n - 1)
+        return np.where(inside & self._ok[i], i, -1)
+
+    def _interpolated(
+        self, intervals: IntArray, stamps_ns: NDArray[np.int64]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """(n, 4, 4) poses, (n, 6) twists, and (n, _NODES, 2) weights of the poses from the one before the
+        interval on, with the weights' derivatives [1/s], at times (n,) in intervals (n,).
+        """
+        if not len(stamps_ns):
+            return np.zeros((0, 4, 4)), np.zeros((0, 6)), np.zeros((0, _NODES, 2))
+        cubics = [self._cubic(i) for i in intervals.tolist()]
+        seconds = (stamps_ns - self._stamps[intervals]) * 1e-9
+        powers = seconds[:, None] ** np.arange(_NODES)
+        rates = np.arange(_NODES) * np.column_stack([np.zeros(len(seconds)), powers[:, :-1]])
+        both = np.stack([powers, rates], axis=1)
+        logs, slopes = np.swapaxes(both @ np.array([cubic.coefficients for cubic in cubics]), 0, 1)
+        weights = both @ np.array([cubic.inverse for cubic in cubics])
+        starts = self._matrices[intervals]
+        moved = np.array([gtsam.Pose3.Expmap(log).matrix() for log in logs])
+        derivatives = np.array([gtsam.Pose3.ExpmapDerivative(log) for log in logs])
+        return starts @ moved, (derivatives @ slopes[..., None])[..., 0], np.swapaxes(weights, 1, 2)
+
+    def _mean_covariances(self, first: IntArray, last: IntArray) -> FloatArray:
+        """(n, 6, 6) mean over the motions from the first to the last of each step."""
+        total, longest = np.zeros((len(first), 6, 6)), int((last - first).max(initial=0))
+        for k in range(longest + 1):
+            within = (first + k <= last)[:, None, None]
+            total += np.where(within, self._covariances[np.minimum(first + k, last)], 0.0)
+        return np.asarray(total / (last - first + 1)[:, None, None])
 
     def _cubic(self, i: int) -> _Cubic:
         """The polynomial of interval i."""
@@ -106,20 +195,13 @@ class SensorPath:
             ]
             times = (self._stamps[around] - self._stamps[i]) * 1e-9
             logs = [gtsam.Pose3.Logmap(self._poses[i].between(self._poses[k])) for k in around]
-            inverse = _blended(times, around.index(i))
-            self._cubics[i] = _Cubic(tuple(around), inverse, inverse @ np.stack(logs))
+            blended = _blended(times, around.index(i))
+            coefficients, inverse = np.zeros((_NODES, 6)), np.zeros((_NODES, _NODES))
+            coefficients[: len(blended)] = blended @ np.stack(logs)
+            oldest = around[0] - max(i - 1, 0)
+            inverse[: len(blended), oldest : oldest + len(around)] = blended
+            self._cubics[i] = _Cubic(inverse, coefficients)
         return self._cubics[i]
-
-    def _powers(self, i: int, stamp_ns: int) -> FloatArray:
-        """(2, m) powers of the seconds since interval i began, and their derivatives."""
-        t, m = (stamp_ns - int(self._stamps[i])) * 1e-9, len(self._cubic(i).poses)
-        powers = t ** np.arange(m)
-        return np.stack([powers, np.arange(m) * np.concatenate([[0.0], powers[:-1]])])
-
-    def _weights(self, i: int, stamp_ns: int) -> dict[int, FloatArray]:
-        """By pose: its weight (2,) in the interpolated one, and the weight's derivative [1/s]."""
-        cubic = self._cubic(i)
-        return dict(zip(cubic.poses, (self._powers(i, stamp_ns) @ cubic.inverse).T, strict=True))
 
 
 @dataclass(frozen=True)
@@ -127,12 +209,11 @@ class _Cubic:
     """Polynomial of one interval.
 
     Attributes:
-        poses: numbers of the m <= 4 poses that it passes through.
-        inverse: (m, m) from values at these poses to coefficients by power of the seconds.
-        coefficients: (m, 6) of the logarithm in the frame of the interval's first pose.
+        inverse: (_NODES, _NODES) from values at the poses from the one before the interval on to coefficients
+            by power of the seconds; 0 for poses that it does not pass through.
+        coefficients: (_NODES, 6) of the logarithm in the frame of the interval's first pose.
     """
 
-    poses: tuple[int, ...]
     inverse: FloatArray
     coefficients: FloatArray
 

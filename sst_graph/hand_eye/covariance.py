@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.graph.linear import unit_scale, with_ridge
-from sst_graph.graph.state import EXTRINSIC, time_offset_key
-from sst_graph.hand_eye.graph import PRIOR_SIGMAS, HandEyeTerm
+from sst_graph.graph.state import State
+from sst_graph.hand_eye.graph import PRIOR_SIGMAS, CameraStep, HandEyeTerms
 
 FloatArray = NDArray[np.float64]
 
@@ -56,37 +56,28 @@ SHARED_ERRORS = SharedErrors()
 
 
 def hand_eye_covariance(
-    graph: gtsam.NonlinearFactorGraph,
-    values: gtsam.Values,
-    terms: Sequence[HandEyeTerm],
-    errors: SharedErrors = SHARED_ERRORS,
+    terms: HandEyeTerms, state: State, hessian: FloatArray, errors: SharedErrors = SHARED_ERRORS
 ) -> FloatArray:
     """(7, 7) covariance of [extrinsic 6, offset]: sandwich over neighbours, at most the priors' own.
 
     Args:
-        graph: the terms' factors and the priors, at its optimum ``values``.
         terms: in the order of drive and time.
+        state: the optimum of their graph.
+        hessian: (7, 7) information there of the whole graph, the priors among it.
         errors: the errors that all pairs share.
     """
-    ordering = gtsam.Ordering()
-    ordering.push_back(EXTRINSIC)
-    ordering.push_back(time_offset_key())
-    hessian = graph.linearize(values).hessian(ordering)[0]
-    noise = NOISE_INFORMATION_MARGIN * np.sum([_noise_information(term) for term in terms], axis=0)
-    bread = _inverse_without(hessian, noise)
-    blocks, scores, shared = [], [], np.zeros((7, 6))
-    for term in terms:
-        J, r, root = _whitened(term, values)
-        blocks.append(J.T @ J)
-        scores.append(J.T @ r)
-        rotation = (
-            np.radians(errors.turn_rate_deg_s) * 1e-9 * (term.pair.camera.to_ns - term.pair.camera.from_ns)
-        )
-        shared[:, :3] += rotation * J.T @ root[:, :3]
-        if term.has_direction:
-            shared[:, 3:] += np.radians(errors.direction_deg) * J.T @ root[:, 3:]
-    residuals = sum(5 if term.has_direction else 3 for term in terms)
-    excess = _excess(np.stack(scores), np.sum(blocks, axis=0), _breaks(terms), residuals)
+    J, r = terms.linearized(state)
+    cameras, directed = terms.pairs.cameras, terms.residuals.directed
+    bread = _inverse_without(hessian, NOISE_INFORMATION_MARGIN * _noise_information(terms))
+    scores = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
+    # The rows of a direction that is not used are 0 in J.
+    moved = np.swapaxes(J, 1, 2) @ np.linalg.inv(np.linalg.cholesky(terms.covariances))
+    seconds = 1e-9 * np.array([camera.to_ns - camera.from_ns for camera in cameras])
+    shared = np.zeros((7, 6))
+    shared[:, :3] = np.radians(errors.turn_rate_deg_s) * np.tensordot(seconds, moved[:, :, :3], 1)
+    shared[:, 3:] = np.radians(errors.direction_deg) * moved[:, :, 3:].sum(axis=0)
+    residuals = int(np.where(directed, 5, 3).sum())
+    excess = _excess(scores, np.einsum("nki,nkj->ij", J, J), _breaks(cameras), residuals)
     covariance = _sandwich(bread, excess) + bread @ shared @ shared.T @ bread
     return _capped(covariance)
 
@@ -106,16 +97,19 @@ def _capped(covariance: FloatArray) -> FloatArray:
     return np.asarray((vectors * np.minimum(values, 1.0)) @ vectors.T * both)
 
 
-def _noise_information(term: HandEyeTerm) -> FloatArray:
-    """(7, 7) information that the noise of the LiDAR's motion seems to bring, as if it were turns."""
-    step, H = term.pair.lidar, term.rows_H_step
-    weight = np.linalg.inv(term.covariance)
+def _noise_information(terms: HandEyeTerms) -> FloatArray:
+    """(7, 7) information that the noise of the LiDAR's motions seems to bring, as if they were turns."""
+    lidars, H = terms.pairs.lidars, terms.rows_H_step
+    weights = np.linalg.inv(terms.covariances)
+    back = np.swapaxes(H, 1, 2) @ weights @ H
     result = np.zeros((7, 7))
-    result[6, 6] = np.trace(weight @ H @ step.twist_covariance @ H.T)
-    variances, axes = np.linalg.eigh(step.covariance)
-    for variance, axis in zip(variances, axes.T, strict=True):
-        J = H @ gtsam.Pose3.adjointMap(axis)
-        result[:6, :6] += max(variance, 0.0) * J.T @ weight @ J
+    result[6, 6] = np.einsum("nij,nji->", back, lidars.twist_covariances)
+    variances, axes = np.linalg.eigh(lidars.covariances)
+    # ad(axis) is linear in the axis.
+    generators = np.array([gtsam.Pose3.adjointMap(unit) for unit in np.eye(6)])
+    for variance, axis in zip(np.maximum(variances, 0.0).T, axes.transpose(2, 0, 1), strict=True):
+        ad = np.tensordot(axis, generators, 1)
+        result[:6, :6] += np.einsum("n,nki,nkl,nlj->ij", variance, ad, back, ad, optimize=True)
     return result
 
 
@@ -129,16 +123,8 @@ def _inverse_without(hessian: FloatArray, noise: FloatArray) -> FloatArray:
     return np.asarray((root / np.maximum(values, LEAST_INFORMATION)) @ root.T * both)
 
 
-def _whitened(term: HandEyeTerm, values: gtsam.Values) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Whitened Jacobian (m, 7), residual (m,), and square root of the information (m, m)."""
-    matrix, negative = term.factor.linearize(values).jacobian()
-    root = np.linalg.inv(np.linalg.cholesky(term.covariance))
-    return np.asarray(matrix), -np.asarray(negative).reshape(-1), root
-
-
-def _breaks(terms: Sequence[HandEyeTerm]) -> NDArray[np.bool_]:
-    """(n,) whether a term does not go on where the one before ended."""
-    cameras = [term.pair.camera for term in terms]
+def _breaks(cameras: Sequence[CameraStep]) -> NDArray[np.bool_]:
+    """(n,) whether a motion does not go on where the one before ended."""
     return np.array([True] + [a.drive != b.drive or a.to_ns != b.from_ns for a, b in pairwise(cameras)])
 
 

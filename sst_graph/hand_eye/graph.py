@@ -6,14 +6,15 @@ the extrinsic that is to be estimated.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from sst_graph.drive.path import PathStep, SensorPath
+from sst_graph.drive.path import PathStep, PathSteps, SensorPath
 from sst_graph.drive.preparation import Drive
 from sst_graph.factors import (
     CameraMotion,
@@ -25,6 +26,7 @@ from sst_graph.factors import (
 from sst_graph.factors.custom.factor import recipe_of
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
+from sst_graph.hand_eye.residuals import MotionResiduals, residuals_factor
 from sst_graph.odometry.relative import DirectionMotion
 from sst_graph.odometry.standstill import zero_velocity_update
 
@@ -68,6 +70,22 @@ class CameraStep:
         """Rotation of the second camera in the first."""
         return self.motion.rotation if self.motion.ok else self.motion.turn
 
+    @cached_property
+    def matrix(self) -> FloatArray:
+        """(3, 3) that rotation."""
+        return np.asarray(self.rotation.matrix())
+
+    @cached_property
+    def turned(self) -> FloatArray:
+        """(3,) its rotation vector [rad]."""
+        return np.asarray(gtsam.Rot3.Logmap(self.rotation))
+
+    @cached_property
+    def across(self) -> FloatArray:
+        """(3, 2) how the two unknowns of the direction move the translation, by its length, in the second
+        camera."""
+        return np.asarray(self.matrix.T @ gtsam.Unit3(self.motion.direction).basis())
+
 
 @dataclass(frozen=True)
 class MotionPair:
@@ -105,60 +123,140 @@ def lidar_paths(drives: Sequence[Drive]) -> list[SensorPath]:
     return [SensorPath(zero_velocity_update(drive.lidar_motions, together=1)) for drive in drives]
 
 
+@dataclass(frozen=True)
+class MotionPairs:
+    """Pairs of a camera's motion and the LiDAR's over the same time: a sequence of :class:`MotionPair`."""
+
+    cameras: tuple[CameraStep, ...]
+    lidars: PathSteps
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def __iter__(self) -> Iterator[MotionPair]:
+        return (MotionPair(camera, self.lidars[k]) for k, camera in enumerate(self.cameras))
+
+
 def pair_motions(
     steps: Sequence[CameraStep], paths: Sequence[SensorPath], time_offset_s: float
-) -> list[MotionPair]:
+) -> MotionPairs:
     """Each camera motion with the LiDAR's over its stamps + offset, where the path reaches."""
     shift = round(time_offset_s * 1e9)
-    found = ((step, paths[step.drive].step(step.from_ns + shift, step.to_ns + shift)) for step in steps)
-    return [MotionPair(step, lidar) for step, lidar in found if lidar is not None]
+    stamps = np.array([(step.from_ns, step.to_ns) for step in steps], np.int64).reshape(-1, 2) + shift
+    drive_of = np.array([step.drive for step in steps], np.intp)
+    parts = []
+    for number, path in enumerate(paths):
+        own = np.flatnonzero(drive_of == number)
+        part = path.steps(*stamps[own].T)
+        parts.append(replace(part, found=own[part.found]))
+    lidars = PathSteps.joined(parts)
+    return MotionPairs(tuple(steps[k] for k in lidars.found), lidars)
 
 
 @dataclass(frozen=True)
 class HandEyeTerm:
-    """One factor of the graph and what it was made of.
+    """What one pair of motions contributes to the graph.
 
     Attributes:
         pair: the motions.
         factor: on E and D.
         covariance: (6, 6) of [rotation rad, direction], or (3, 3) where only the rotation is used.
-        noise_pull: half of the expected change of the squared whitened residual as the offset grows and
-            the LiDAR's noise is averaged more or less [1/s].
-        rows_H_step: (6, 6) or (3, 6) the residual by a right perturbation of the LiDAR's motion, in units of
-            the scaled noise.
     """
 
     pair: MotionPair
-    factor: gtsam.CustomFactor
+    factor: gtsam.NonlinearFactor
     covariance: FloatArray
-    noise_pull: float
-    rows_H_step: FloatArray
 
     @property
     def has_direction(self) -> bool:
         return len(self.covariance) == 6
 
-    def residual(self, values: gtsam.Values) -> FloatArray:
-        """(6,) or (3,) predicted - measured, unwhitened."""
-        return np.asarray(self.factor.unwhitenedError(values))
 
+@dataclass(frozen=True, eq=False)
+class HandEyeTerms:
+    """All pairs of the graph, one factor together, and what it was made of.
 
-def hand_eye_terms(pairs: Sequence[MotionPair], state: State) -> tuple[list[HandEyeTerm], NoiseScales]:
-    """A factor for every pair, and the scales at which half of the residuals are within their sigmas.
+    Rows of a direction that is not used are 0, and their block of the covariance is the identity.
 
-    The factors' noise is scaled so; robust weights are frozen at the state.
+    Attributes:
+        pairs: the motions.
+        residuals: of the motions.
+        covariances: (n, 6, 6) of [rotation rad, direction].
+        noise_pulls: (n,) half of the expected change of the squared whitened residual as the offset grows and
+            the LiDAR's noise is averaged more or less [1/s].
+        rows_H_step: (n, 6, 6) the residual by a right perturbation of the LiDAR's motion, in units of the
+            scaled noise.
     """
-    values = state_values(state)
-    terms = [_term(pair, state) for pair in pairs]
-    turns, swerves = np.array([_sizes(term, values) for term in terms]).T
-    directed = swerves[np.isfinite(swerves)]
+
+    pairs: MotionPairs
+    residuals: MotionResiduals
+    covariances: FloatArray
+    noise_pulls: FloatArray
+    rows_H_step: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    @cached_property
+    def roots(self) -> FloatArray:
+        """(n, 6, 6) square roots of the information, upper triangles."""
+        information = np.linalg.inv(self.covariances)
+        return np.swapaxes(np.linalg.cholesky(0.5 * (information + np.swapaxes(information, 1, 2))), 1, 2)
+
+    def factor(self) -> gtsam.CustomFactor:
+        """One factor of all pairs, on E and D."""
+        return residuals_factor(EXTRINSIC, time_offset_key(), self.residuals, self.roots)
+
+    def linearized(self, state: State) -> tuple[FloatArray, FloatArray]:
+        """Whitened Jacobians (n, 6, 7) by [E, D], and residuals (n, 6)."""
+        error, H = self.residuals.evaluate(state.cTl, state.time_offsets_s[0], True)
+        return self.roots @ H, (self.roots @ error[..., None])[..., 0]
+
+    def each(self) -> list[HandEyeTerm]:
+        """A factor for each pair by itself."""
+        return [self._term(k, pair) for k, pair in enumerate(self.pairs)]
+
+    def _term(self, number: int, pair: MotionPair) -> HandEyeTerm:
+        step, residuals, D = pair.lidar, self.residuals, time_offset_key()
+        motion = LidarMotion(step.aTb, step.twist_a, step.twist_b, residuals.time_offset_0_s)
+        if not residuals.directed[number]:
+            own = self.covariances[number][:3, :3]
+            return HandEyeTerm(pair, rotation_hand_eye(EXTRINSIC, D, pair.camera.rotation, motion, own), own)
+        own = self.covariances[number]
+        measured = CameraMotion(
+            gtsam.Pose3(pair.camera.rotation, pair.camera.motion.direction), np.eye(6), scale_known=False
+        )
+        factor = hand_eye_factor(EXTRINSIC, D, measured, motion)
+        recipe = recipe_of(factor)
+        assert recipe is not None
+        noise = gtsam.noiseModel.Gaussian.Covariance(own)
+        return HandEyeTerm(pair, replace(recipe, noise=noise).build(), own)
+
+
+def hand_eye_terms(pairs: MotionPairs, state: State) -> tuple[HandEyeTerms, NoiseScales]:
+    """The terms of all pairs, and the scales at which half of the residuals are within their sigmas.
+
+    The noise is scaled so; robust weights are frozen at the state.
+    """
+    terms = _terms(pairs, state)
+    directed = terms.residuals.directed
+    error, C = terms.residuals.evaluate(state.cTl, state.time_offsets_s[0], False)[0], terms.covariances
+    turns = _whitened_lengths(error[:, :3], C[:, :3, :3])
+    swerves = _whitened_lengths(error[:, 3:], C[:, 3:, 3:])
     scales = NoiseScales(
-        max(_scale(turns, 3), _LEAST_SCALE), max(_scale(directed, 2), _LEAST_SCALE) if len(directed) else 1.0
+        max(_scale(turns, 3), _LEAST_SCALE),
+        max(_scale(swerves[directed], 2), _LEAST_SCALE) if directed.any() else 1.0,
     )
     turn_weights = _KERNEL.weight(turns / (scales.rotation * np.sqrt(3.0)))
-    swerve_weights = _KERNEL.weight(np.nan_to_num(swerves) / (scales.direction * np.sqrt(2.0)))
+    swerve_weights = _KERNEL.weight(swerves / (scales.direction * np.sqrt(2.0)))
     weights = np.maximum(np.stack([turn_weights, swerve_weights], axis=1), 1e-6)
-    return [_scaled(term, scales, w) for term, w in zip(terms, weights, strict=True)], scales
+    return _scaled(terms, scales, weights), scales
+
+
+def _whitened_lengths(errors: FloatArray, covariances: FloatArray) -> FloatArray:
+    """(n,) lengths of errors (n, k) in units of covariances (n, k, k)."""
+    whitened = np.linalg.solve(covariances, errors[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", errors, whitened)))
 
 
 def _scale(sizes: FloatArray, freedom: int) -> float:
@@ -166,16 +264,15 @@ def _scale(sizes: FloatArray, freedom: int) -> float:
     return float(np.sqrt(np.median(sizes**2) / _MEDIAN_CHI2[freedom]))
 
 
-def hand_eye_graph(terms: Sequence[HandEyeTerm], centre: State) -> gtsam.NonlinearFactorGraph:
+def hand_eye_graph(terms: HandEyeTerms, centre: State) -> gtsam.NonlinearFactorGraph:
     """The terms and the priors around ``centre``."""
     graph = gtsam.NonlinearFactorGraph()
-    for term in terms:
-        graph.add(term.factor)
+    graph.add(terms.factor())
     noise, sigma_s = gtsam.noiseModel.Diagonal.Sigmas(PRIOR_SIGMAS[:6]), float(PRIOR_SIGMAS[6])
     graph.add(gtsam.PriorFactorPose3(EXTRINSIC, centre.cTl, noise))
     # An offset between two stamps of the LiDAR averages its noise, which looks like a better fit. A linear
     # cost takes back what that is expected to gain; together with the prior it is a prior elsewhere.
-    pull = sum(term.noise_pull for term in terms)
+    pull = float(terms.noise_pulls.sum())
     mean_s = centre.time_offsets_s[0] + pull * sigma_s**2
     graph.add(time_offset_prior(time_offset_key(), mean_s, sigma_s))
     return graph
@@ -189,61 +286,55 @@ def state_values(state: State) -> gtsam.Values:
     return values
 
 
-def _term(pair: MotionPair, state: State) -> HandEyeTerm:
-    """The factor of a pair, with the noise that the odometry states."""
-    step, motion = pair.lidar, pair.camera.motion
-    predicted = state.cTl * step.aTb * state.cTl.inverse()
-    length = float(np.linalg.norm(predicted.translation()))
-    directed = motion.ok and length >= MIN_LENGTH_M
+def _terms(pairs: MotionPairs, state: State) -> HandEyeTerms:
+    """The terms with the noise that the odometry states."""
+    cameras, lidars, n = pairs.cameras, pairs.lidars, len(pairs)
+    ok = np.array([camera.motion.ok for camera in cameras])
+    turns = np.array([camera.matrix for camera in cameras])
+    directions = np.array([camera.motion.direction for camera in cameras])
+    residuals = MotionResiduals(
+        lidars.aTbs, lidars.twists_a, lidars.twists_b, state.time_offsets_s[0], turns, directions, ok
+    )
+    predicted = residuals.predicted(state.cTl, state.time_offsets_s[0])
+    lengths = np.linalg.norm(predicted[:, :3, 3], axis=1)
+    residuals = replace(residuals, directed=ok & (lengths >= MIN_LENGTH_M))
     # 1. The noise of both motions as that of a pose of the predicted length.
-    basis = np.asarray(gtsam.Unit3(motion.direction).basis())
-    across = np.zeros((6, 5))
-    across[:3, :3] = np.eye(3)
-    across[3:, 3:] = length * pair.camera.rotation.matrix().T @ basis
+    across = np.zeros((n, 6, 5))
+    across[:, :3, :3] = np.eye(3)
+    across[:, 3:, 3:] = lengths[:, None, None] * np.array([camera.across for camera in cameras])
+    motion_covariances = np.array([camera.motion.covariance for camera in cameras])
     Ad = np.asarray(state.cTl.AdjointMap())
-    covariance = Ad @ step.covariance @ Ad.T + across @ motion.covariance @ across.T
-    # 2. The factor.
-    turn, D = pair.camera.rotation, time_offset_key()
-    lidar_motion = LidarMotion(step.aTb, step.twist_a, step.twist_b, state.time_offsets_s[0])
-    if directed:
-        measured = gtsam.Pose3(turn, length * motion.direction)
-        camera_motion = CameraMotion(measured, covariance, scale_known=False)
-        factor = hand_eye_factor(EXTRINSIC, D, camera_motion, lidar_motion)
-        noise = factor.noiseModel()
-        assert isinstance(noise, gtsam.noiseModel.Gaussian)
-        own = np.asarray(noise.covariance())
-    else:
-        own = covariance[:3, :3]
-        factor = rotation_hand_eye(EXTRINSIC, D, turn, lidar_motion, own)
+    covariances = Ad @ lidars.covariances @ Ad.T
+    covariances += across @ motion_covariances @ np.swapaxes(across, 1, 2)
+    # 2. The same of rotation and unit direction. Along the direction, where the difference of two unit
+    # vectors is of second order, the mean of the two across keeps it regular.
+    along = directions[:, :, None] * directions[:, None, :]
+    transfer = np.zeros((n, 6, 6))
+    transfer[:, :3, :3] = np.eye(3)
+    transfer[:, 3:, 3:] = (np.eye(3) - along) / np.maximum(lengths, MIN_LENGTH_M)[:, None, None] @ turns
+    own = transfer @ covariances @ np.swapaxes(transfer, 1, 2)
+    own[:, 3:, 3:] += 0.5 * np.trace(own[:, 3:, 3:], axis1=1, axis2=2)[:, None, None] * along
+    own = 0.5 * (own + np.swapaxes(own, 1, 2))
     # 3. How the LiDAR's noise reaches the residual.
-    transfer = np.eye(6)
-    d = motion.direction
-    transfer[3:, 3:] = (np.eye(3) - np.outer(d, d)) / max(length, MIN_LENGTH_M) @ turn.matrix()
-    carried = (transfer @ Ad)[: len(own)]
-    return HandEyeTerm(pair, factor, own, _noise_pull(own, carried, step), carried)
+    carried = transfer @ Ad
+    own[~residuals.directed, 3:] = own[~residuals.directed, :, 3:] = carried[~residuals.directed, 3:] = 0.0
+    own[~residuals.directed, 3:, 3:] = np.eye(3)
+    return HandEyeTerms(pairs, residuals, own, _noise_pulls(own, carried, lidars), carried)
 
 
-def _scaled(term: HandEyeTerm, scales: NoiseScales, weights: FloatArray) -> HandEyeTerm:
-    """A term with its sigmas multiplied by the scales; weights (2,) of rotation and direction."""
-    spread = np.repeat([scales.rotation, scales.direction], 3)[: len(term.covariance)]
-    widened = spread / np.repeat(np.sqrt(weights), 3)[: len(spread)]
-    own, carried = np.outer(widened, widened) * term.covariance, spread[:, None] * term.rows_H_step
-    recipe = recipe_of(term.factor)
-    assert recipe is not None
-    factor = replace(recipe, noise=gtsam.noiseModel.Gaussian.Covariance(own)).build()
-    return HandEyeTerm(term.pair, factor, own, _noise_pull(own, carried, term.pair.lidar), carried)
+def _scaled(terms: HandEyeTerms, scales: NoiseScales, weights: FloatArray) -> HandEyeTerms:
+    """The terms with sigmas multiplied by the scales; weights (n, 2) of rotation and direction."""
+    spread = np.tile(np.repeat([scales.rotation, scales.direction], 3), (len(terms), 1))
+    spread[~terms.residuals.directed, 3:] = 1.0
+    widened = spread / np.repeat(np.sqrt(weights), 3, axis=1)
+    widened[~terms.residuals.directed, 3:] = 1.0
+    own = widened[:, :, None] * widened[:, None, :] * terms.covariances
+    carried = spread[:, :, None] * terms.rows_H_step
+    pulls = _noise_pulls(own, carried, terms.pairs.lidars)
+    return replace(terms, covariances=own, noise_pulls=pulls, rows_H_step=carried)
 
 
-def _noise_pull(covariance: FloatArray, rows_H_step: FloatArray, step: PathStep) -> float:
-    """``noise_pull`` of a :class:`HandEyeTerm`."""
-    rate = rows_H_step @ step.covariance_rate @ rows_H_step.T
-    return 0.5 * float(np.trace(np.linalg.solve(covariance, rate)))
-
-
-def _sizes(term: HandEyeTerm, values: gtsam.Values) -> tuple[float, float]:
-    """Whitened length of the rotation's and of the direction's residual; NaN where there is none."""
-    r, C = term.residual(values), term.covariance
-    turn = float(np.sqrt(r[:3] @ np.linalg.solve(C[:3, :3], r[:3])))
-    if not term.has_direction:
-        return turn, np.nan
-    return turn, float(np.sqrt(r[3:] @ np.linalg.solve(C[3:, 3:], r[3:])))
+def _noise_pulls(covariances: FloatArray, rows_H_step: FloatArray, lidars: PathSteps) -> FloatArray:
+    """``noise_pulls`` of :class:`HandEyeTerms`."""
+    rates = rows_H_step @ lidars.covariance_rates @ np.swapaxes(rows_H_step, 1, 2)
+    return np.asarray(0.5 * np.trace(np.linalg.solve(covariances, rates), axis1=1, axis2=2))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sst_graph.drive.path import SensorPath
-from sst_graph.hand_eye.graph import CameraStep, MotionPair, pair_motions
+from sst_graph.hand_eye.graph import CameraStep, MotionPairs, pair_motions
 
 FloatArray = NDArray[np.float64]
 
@@ -78,9 +78,7 @@ def _minima(found: Sequence[MotionStart | None]) -> list[MotionStart]:
     return sorted((one for one, low in zip(found, lowest, strict=True) if one and low), key=lambda s: s.cost)
 
 
-def _best_rotation(
-    pairs: Sequence[MotionPair], time_offset_s: float, guess: gtsam.Rot3 | None
-) -> MotionStart:
+def _best_rotation(pairs: MotionPairs, time_offset_s: float, guess: gtsam.Rot3 | None) -> MotionStart:
     """Robust Kabsch over rotation vectors and directions."""
     l_vectors, c_vectors, sigmas = _vectors(pairs)
     prior = np.zeros((3, 3)) if guess is None else guess.matrix() / _GUESS_SIGMA_RAD**2
@@ -96,22 +94,30 @@ def _best_rotation(
     return MotionStart(gtsam.Rot3(R), time_offset_s, cost)
 
 
-def _vectors(pairs: Sequence[MotionPair]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """(n, 3) vectors in the LiDAR, (n, 3) the same in the camera, (n,) sigmas: rotations, directions."""
-    of_lidar, of_camera, sigmas = [], [], []
-    for pair in pairs:
-        motion, step = pair.camera.motion, pair.lidar
-        turn = gtsam.Rot3.Logmap(step.aTb.rotation())
-        of_lidar.append(turn)
-        of_camera.append(gtsam.Rot3.Logmap(pair.camera.rotation))
-        variance = np.trace(motion.covariance[:3, :3]) + np.trace(step.covariance[:3, :3])
-        sigmas.append(np.sqrt(variance / 3.0))
-        length = float(np.linalg.norm(step.aTb.translation()))
-        lever = _LEVER_SIGMA_M * float(np.linalg.norm(turn))
-        if not motion.ok or length < 2.0 * lever or length < 1e-3:
-            continue
-        of_lidar.append(step.aTb.translation() / length)
-        of_camera.append(motion.direction)
-        across = np.trace(step.covariance[3:, 3:]) / 3.0 + lever**2
-        sigmas.append(np.sqrt(np.trace(motion.covariance[3:, 3:]) / 2.0 + across / length**2))
-    return np.array(of_lidar), np.array(of_camera), np.array(sigmas)
+def _vectors(pairs: MotionPairs) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """(n, 3) vectors in the LiDAR, (n, 3) the same in the camera, (n,) sigmas: rotations, then directions."""
+    lidars, motions = pairs.lidars, [camera.motion for camera in pairs.cameras]
+    of_lidar = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(aTb[:3, :3])) for aTb in lidars.aTbs])
+    of_camera = np.array([camera.turned for camera in pairs.cameras])
+    by_camera = np.array([motion.covariance for motion in motions])
+    by_lidar = lidars.covariances
+    variances = _trace(by_camera[:, :3, :3]) + _trace(by_lidar[:, :3, :3])
+    translations = lidars.aTbs[:, :3, 3]
+    lengths = np.linalg.norm(translations, axis=1)
+    levers = _LEVER_SIGMA_M * np.linalg.norm(of_lidar, axis=1)
+    ok = np.array([motion.ok for motion in motions])
+    directed = np.flatnonzero(ok & (lengths >= 2.0 * levers) & (lengths >= 1e-3))
+    lengths = lengths[directed]
+    across = _trace(by_lidar[directed, 3:, 3:]) / 3.0 + levers[directed] ** 2
+    sigmas = np.sqrt(_trace(by_camera[directed, 3:, 3:]) / 2.0 + across / lengths**2)
+    directions = np.array([motions[k].direction for k in directed]).reshape(-1, 3)
+    return (
+        np.concatenate([of_lidar, translations[directed] / lengths[:, None]]),
+        np.concatenate([of_camera, directions]),
+        np.concatenate([np.sqrt(variances / 3.0), sigmas]),
+    )
+
+
+def _trace(matrices: FloatArray) -> FloatArray:
+    """(n,) traces of matrices (n, k, k)."""
+    return np.asarray(np.trace(matrices, axis1=1, axis2=2))

@@ -23,7 +23,7 @@ from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.covariance import hand_eye_covariance
 from sst_graph.hand_eye.graph import (
     CameraStep,
-    HandEyeTerm,
+    HandEyeTerms,
     NoiseScales,
     camera_steps,
     hand_eye_graph,
@@ -59,7 +59,7 @@ class MotionSolution:
     Attributes:
         state: the estimate.
         centre: of the priors.
-        terms: its factors, under the noise that the residuals have.
+        terms: its pairs, under the noise that the residuals have.
         scales: that noise, in multiples of what odometry states.
         covariance: (7, 7).
         cost: log of the noise that the residuals have, over all pairs: a negative log-likelihood.
@@ -69,7 +69,7 @@ class MotionSolution:
 
     state: State
     centre: State
-    terms: list[HandEyeTerm]
+    terms: HandEyeTerms
     scales: NoiseScales
     covariance: FloatArray
     cost: float
@@ -168,10 +168,10 @@ def _solve(
         # 2. Inner optimisation.
         graph = hand_eye_graph(terms, centre)
         values = _optimise(graph, state_values(state))
-        covariance = hand_eye_covariance(graph, values, terms)
+        moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
+        covariance = hand_eye_covariance(terms, moved, _information(graph, values))
         # 3. Move, by less and less of the step where robust weights and the LiDAR's motion at the new offset
         # alternate; stop when the step is small.
-        moved = State(values.atPose3(EXTRINSIC), (float(values.atVector(time_offset_key())[0]),))
         step = step_share(outer) * difference(state, moved)
         state = State(state.cTl.retract(step[:6]), (state.time_offsets_s[0] + float(step[6]),))
         converged = float(step @ np.linalg.solve(covariance, step)) < STEP_SIGMAS**2
@@ -189,6 +189,14 @@ def _optimise(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.
     params.setMaxIterations(_INNER_ITERATIONS)
     params.setlambdaInitial(1e-6)
     return gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+
+
+def _information(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> FloatArray:
+    """(7, 7) of [E, D]."""
+    ordering = gtsam.Ordering()
+    ordering.push_back(EXTRINSIC)
+    ordering.push_back(time_offset_key())
+    return np.asarray(graph.linearize(values).hessian(ordering)[0])
 
 
 def _too_few(pairs: int) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,13 @@ from sst_graph.association.edge_matching import (
     sides_of,
 )
 from sst_graph.association.time_pairing import nearest_images
+from sst_graph.drive.preparation import ImageFeatures
 from sst_graph.factors.camera import PinholeCamera
 from sst_graph.factors.motion import cross
 from sst_graph.factors.robust import RobustKernel
 from sst_graph.features.mask_contour import MIN_GRADIENT, ContourMap, are_unknown, well_inside
 from sst_graph.graph.matching import DriveEdges
+from sst_graph.types import SemanticClass
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
@@ -41,6 +43,8 @@ _REACH_M = 3.0
 _MIN_OBJECT_SHARE = 0.3
 """Of an object's boundary that must meet a contour. More than in the graph: under a wrong pose many objects
 cross some contour, and a pose must not gain by them."""
+_KEPT_FIELDS = 80
+"""Most contours that are kept in memory: of ten scans, with offsets of a third of a second to both sides."""
 _NEAR_NS = 4_000_000
 """Twists this close in time are one [ns]: at 5 m/s^2 they differ by 2 cm/s, and less is looked up."""
 
@@ -130,11 +134,33 @@ class _InImage:
         )
 
 
+class _Fields:
+    """Contours in memory, those that were needed last: every pose is compared with the same few images."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[int, SemanticClass], ContourMap | None] = {}
+
+    def of(self, image: ImageFeatures, kind: SemanticClass) -> ContourMap | None:
+        """The contours of a class in an image; None where it has none."""
+        key = image.stamp_ns, kind
+        if key not in self._kept:
+            if len(self._kept) >= _KEPT_FIELDS:
+                self._kept.pop(next(iter(self._kept)))
+            field = image.contours.get(kind)
+            stored = isinstance(field, ContourMap)
+            self._kept[key] = (
+                replace(field, distance=field.distance, unknown=field.unknown) if stored else None
+            )
+        return self._kept[key]
+
+
 class PoseBatch:
     """The boundary points of a drive, by columns, to be matched under many poses."""
 
-    def __init__(self, edges: DriveEdges) -> None:
+    def __init__(self, edges: DriveEdges, fields: _Fields | None = None) -> None:
+        """fields: contours that are in memory already."""
         self.edges = edges
+        self._fields = fields or _Fields()
         self.camera: PinholeCamera = edges.drive.camera
         self.classes = sorted(set(edges.classes))
         points = edges.points
@@ -149,7 +175,7 @@ class PoseBatch:
 
     def thinned(self, most: int) -> PoseBatch:
         """Evenly spread points, at most so many."""
-        return PoseBatch(self.edges.thinned(most))
+        return PoseBatch(self.edges.thinned(most), self._fields)
 
     def equations(self, poses: Poses, kernel: RobustKernel) -> BatchEquations:
         """Match every pose's boundary points to the nearest contours; the kernel's scale is in pixels."""
@@ -261,17 +287,14 @@ class PoseBatch:
         key = image * len(self.classes) + self._classes[seen.point]
         order = np.argsort(key, kind="stable")
         names, starts = np.unique(key[order], return_index=True)
-        images = self.edges.drive.images
+        images, kinds = self.edges.drive.images, len(self.classes)
         contours = [
-            images[number].contours.get(self.classes[kind])
-            for number, kind in (divmod(name, len(self.classes)) for name in names.tolist())
+            self._fields.of(images[name // kinds], self.classes[name % kinds]) for name in names.tolist()
         ]
         ends = [*starts[1:].tolist(), len(order)]
         spans = list(zip(starts.tolist(), ends, strict=True))
         known = [
-            (contour, a, b)
-            for contour, (a, b) in zip(contours, spans, strict=True)
-            if isinstance(contour, ContourMap)
+            (contour, a, b) for contour, (a, b) in zip(contours, spans, strict=True) if contour is not None
         ]
         some = np.concatenate([order[:0], *(order[a:b] for _, a, b in known)])
         if len(some):

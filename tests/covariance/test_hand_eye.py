@@ -9,9 +9,9 @@ import gtsam
 import numpy as np
 import pytest
 
-from sst_graph.graph.state import EXTRINSIC, time_offset_key
+from sst_graph.graph.state import State
 from sst_graph.hand_eye.covariance import MOST_TAKEN_OFF, SharedErrors, hand_eye_covariance
-from sst_graph.hand_eye.graph import HandEyeTerm
+from sst_graph.hand_eye.graph import HandEyeTerms, MotionPairs
 
 PAIRS = 600
 NOTHING_SHARED = SharedErrors(direction_deg=0.0, turn_rate_deg_s=0.0)
@@ -21,22 +21,17 @@ def _covariance(noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Covariance with residuals (n, 6) of n consecutive pairs of like rows, and that of independent ones."""
     J = np.random.default_rng(1).normal(size=(6, 7)) * 20.0
     J = np.vstack([J, np.random.default_rng(2).normal(size=(6, 7)) * 20.0])
-    values = gtsam.Values()
-    values.insert(EXTRINSIC, gtsam.Pose3())
-    values.insert(time_offset_key(), np.zeros(1))
-    unit, still = gtsam.noiseModel.Unit.Create(6), np.zeros((6, 6))
-    step = SimpleNamespace(covariance=still, twist_covariance=still)
-    graph, terms = gtsam.NonlinearFactorGraph(), []
-    for k, row in enumerate(noise):
-        block = J[6 * (k // (PAIRS // 2)) :][:6]  # two sorts of views, one after the other
-        linear = gtsam.JacobianFactor(EXTRINSIC, block[:, :6], time_offset_key(), block[:, 6:], row, unit)
-        factor: Any = gtsam.LinearContainerFactor(linear, values)
-        camera = SimpleNamespace(drive=0, from_ns=k, to_ns=k + 1)
-        pair: Any = SimpleNamespace(camera=camera, lidar=step)
-        graph.add(factor)
-        terms.append(HandEyeTerm(pair, factor, np.eye(6), 0.0, still))
-    found = hand_eye_covariance(graph, values, terms, NOTHING_SHARED)
+    still = np.zeros((PAIRS, 6, 6))
+    blocks = J.reshape(2, 6, 7).repeat(PAIRS // 2, axis=0)  # two sorts of views, one after the other
+    cameras: Any = tuple(SimpleNamespace(drive=0, from_ns=k, to_ns=k + 1) for k in range(PAIRS))
+    lidars: Any = SimpleNamespace(covariances=still, twist_covariances=still)
+    residuals: Any = SimpleNamespace(
+        directed=np.ones(PAIRS, bool), evaluate=lambda cTl, time_offset_s, jacobians: (noise, blocks)
+    )
+    units = np.tile(np.eye(6), (PAIRS, 1, 1))
+    terms = HandEyeTerms(MotionPairs(cameras, lidars), residuals, units, np.zeros(PAIRS), still)
     H = PAIRS // 2 * (J[:6].T @ J[:6] + J[6:].T @ J[6:])
+    found = hand_eye_covariance(terms, State(gtsam.Pose3()), H, NOTHING_SHARED)
     return found, np.linalg.inv(H)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
+from moving_drives import OFFSET_S, TRUE, made_drive, resting, straight, weaving
 from stored import written
 
 from sst_graph.batch import CalibrationConfig, calibrate, calibrate_prepared
@@ -17,73 +17,14 @@ from sst_graph.batch.motion_factor import gaussian_factor
 from sst_graph.cli import main
 from sst_graph.config import with_overrides
 from sst_graph.data import open_source
-from sst_graph.drive.preparation import Drive, ImageFeatures
 from sst_graph.errors import ConfigError
-from sst_graph.factors.camera import PinholeCamera
 from sst_graph.graph.state import EXTRINSIC, State, time_offset_key
 from sst_graph.hand_eye.graph import NoiseScales, camera_steps, hand_eye_terms, lidar_paths, pair_motions
 from sst_graph.hand_eye.initialization import motion_starts
 from sst_graph.hand_eye.solution import MotionSolution, alternative, difference, solve_motion
 from sst_graph.metrics import calibration_errors
-from sst_graph.odometry.features import Tracks as ImageTracks
-from sst_graph.odometry.relative import DirectionMotion
-from sst_graph.odometry.visual import ImagePair
 from sst_graph.result import read_result
 from sst_graph.simulator import SimulationConfig
-from sst_graph.types import RelativeMotion
-
-TRUE = gtsam.Pose3(
-    gtsam.Rot3(np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])), np.array([0.1, -0.2, -0.3])
-).retract(np.array([0.03, -0.05, 0.02, 0.0, 0.0, 0.0]))
-OFFSET_S = 0.13
-PERIOD_S = 0.1
-SIGMA_RAD, SIGMA_M, SIGMA_DIRECTION = 1e-4, 2e-3, 1e-3
-PoseAt = Callable[[float], gtsam.Pose3]
-
-
-def weaving(t: float) -> gtsam.Pose3:
-    """Turns to both sides on a hilly, rough road."""
-    rotation = gtsam.Rot3.RzRyRx(0.02 * np.sin(5.0 * t), 0.1 * np.sin(1.1 * t), 0.8 * np.sin(0.9 * t))
-    return gtsam.Pose3(rotation, np.array([8.0 * t, 3.0 * np.sin(0.9 * t), 0.5 * np.sin(1.1 * t)]))
-
-
-def straight(t: float) -> gtsam.Pose3:
-    """10 m/s, dead straight, on a road as smooth as none is."""
-    return gtsam.Pose3(gtsam.Rot3(), np.array([10.0 * t, 0.0, 0.0]))
-
-
-def resting(t: float) -> gtsam.Pose3:
-    return gtsam.Pose3()
-
-
-def made_drive(wTl: PoseAt, frames: int = 50, seed: int = 0, noise: float = 1.0) -> Drive:
-    """Odometry of both sensors under known noise; the LiDAR's poses err, not its steps."""
-    rng = np.random.default_rng(seed)
-    sigmas = noise * np.repeat([SIGMA_RAD, SIGMA_M], 3)
-    stamps = [round(k * PERIOD_S * 1e9) for k in range(frames)]
-    poses = [wTl(s * 1e-9).retract(sigmas * rng.standard_normal(6)) for s in stamps]
-    lidar = tuple(
-        RelativeMotion(a, b, p.between(q), np.diag(2.0 * np.repeat([SIGMA_RAD, SIGMA_M], 3) ** 2))
-        for a, b, p, q in zip(stamps, stamps[1:], poses, poses[1:], strict=False)
-    )
-    camera = tuple(_image_pair(a, b, wTl, rng, noise) for a, b in pairwise(stamps))
-    blank = np.zeros((1, 1), np.uint8)
-    images = tuple(ImageFeatures(k, stamp, blank, {}) for k, stamp in enumerate(stamps))
-    return Drive("made", PinholeCamera(700, 700, 600, 180, 1242, 375), (), images, lidar, camera)
-
-
-def _image_pair(a: int, b: int, wTl: PoseAt, rng: np.random.Generator, noise: float) -> ImagePair:
-    ends = [wTl(stamp * 1e-9 + OFFSET_S) * TRUE.inverse() for stamp in (a, b)]
-    aTb = ends[0].between(ends[1])
-    turn = aTb.rotation() * gtsam.Rot3.Expmap(noise * SIGMA_RAD * rng.standard_normal(3))
-    length = float(np.linalg.norm(aTb.translation()))
-    direction = aTb.translation() / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    seen = np.asarray(
-        gtsam.Unit3(direction).retract(noise * SIGMA_DIRECTION * rng.standard_normal(2)).point3()
-    )
-    covariance = np.diag([SIGMA_RAD**2] * 3 + [SIGMA_DIRECTION**2] * 2)
-    motion = DirectionMotion(turn, turn, seen, covariance, np.ones(0, bool), 0.1, length > 0.1)
-    return ImagePair(ImageTracks(a, b, np.zeros((0, 2)), np.zeros((0, 2))), motion)
 
 
 def off(degrees: float) -> gtsam.Pose3:

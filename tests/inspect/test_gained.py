@@ -43,7 +43,7 @@ def _terms(count: int) -> tuple[list[HandEyeTerm], list[np.ndarray]]:
         linear = gtsam.JacobianFactor(EXTRINSIC, J[:, :6], time_offset_key(), J[:, 6:], np.zeros(6), unit)
         factor: Any = gtsam.LinearContainerFactor(linear, values)
         pair: Any = None
-        terms.append(HandEyeTerm(pair, factor, np.eye(6), 0.0, np.zeros((6, 6))))
+        terms.append(HandEyeTerm(pair, factor, np.eye(6)))
         rows.append(J)
     return terms, rows
 
