@@ -1,4 +1,4 @@
-"""The guard of the hot paths: what grows by a quarter is named, and what was not checked is not passed over."""
+"""The guard of the hot paths: what grows by a quarter is named, what was not checked is not passed over."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -46,7 +47,7 @@ def run_on_dask(
     """The records of all jobs, as they are done; None now and then while there is none.
 
     Raises:
-        ConfigError: no scheduler answers.
+        ConfigError: no scheduler answers, or it is lost.
         MissingDependencyError: dask.distributed is not installed.
     """
     distributed = _distributed()
@@ -73,6 +74,11 @@ def run_on_dask(
             except (TimeoutError, distributed.TimeoutError):
                 yield None
                 continue
+            except CancelledError:
+                raise ConfigError(
+                    f"--dask {cluster.address}: lost the scheduler with {len(running)} drives at it; "
+                    "the same command goes on from here, on this one or another"
+                ) from None
             for future in done:
                 job, error = running.pop(future), future.exception()
                 is_lost = isinstance(error, distributed.KilledWorker)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -79,6 +82,39 @@ def test_a_worker_that_cannot_run_a_drive_is_no_lost_worker() -> None:
     found = [one for one in run_on_dask(jobs(2), Cluster("local", 1), broken) if one]
     assert [one.status for one in found] == ["crash", "crash"]
     assert "could not be run on its Dask worker: No module named 'sst_graph'" in found[0].reason
+
+
+def fatal(job: Job) -> Record:
+    """Kills the scheduler, whose process id stands in a file."""
+    os.kill(int((Path(job.folder) / "pid").read_text()), signal.SIGKILL)
+    return instant(job)
+
+
+@pytest.mark.slow
+def test_a_lost_scheduler_is_a_sentence(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    address = f"tcp://127.0.0.1:{free_port()}"
+    scheduler = started("scheduler", "--host", address)
+    worker = started("worker", address, "--no-nanny")
+    (tmp_path / "pid").write_text(str(scheduler.pid))
+    try:
+        with pytest.raises(ConfigError, match="lost the scheduler"):
+            list(run_on_dask(jobs(3, tmp_path), Cluster(address, 1), fatal))
+    finally:
+        for one in (worker, scheduler):
+            one.kill()
+            one.wait()
+
+
+def started(kind: str, *arguments: str) -> subprocess.Popen[bytes]:
+    command = [sys.executable, "-m", f"distributed.cli.dask_{kind}", "--no-dashboard", *arguments]
+    return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
 
 
 def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import gtsam
 import numpy as np
@@ -17,10 +19,20 @@ from sst_graph.errors import DataError
 from sst_graph.export import fuse_marginals, marginal_of_result
 from sst_graph.factors import PinholeCamera
 from sst_graph.fleet import BatchConfig, Drive, Place, Record, write_summary
-from sst_graph.fleet.record import Cost, Numbers
+from sst_graph.fleet.record import Cost, Numbers, Status
+from sst_graph.fleet.summary import page
 from sst_graph.fleet.vehicles.fused import vehicle_of
 from sst_graph.fleet.vehicles.walk import WalkConfig
 from sst_graph.result import CalibrationResult
+
+
+def test_every_status_has_a_colour_and_a_rank() -> None:
+    style = (Path(page.__file__).parent / "page.css").read_text()
+    ranks = [Record("d", "/d", status).attention for status in get_args(Status)]
+    assert sorted(ranks) == list(range(len(ranks)))
+    for status in get_args(Status):
+        assert re.search(rf"\.s-{status}\b", style), status
+
 
 CAMERA = PinholeCamera(700.0, 700.0, 600.0, 180.0, 1242, 375)
 SHIFT = np.array([0.0, 0.002, 0.0, 0.01, 0.0, 0.0, 0.0])
