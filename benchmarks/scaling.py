@@ -6,11 +6,11 @@
 Simulated streets are written to a temporary folder, and each calibration is a process of its own, whose
 processor seconds and largest resident memory count. ``prepare`` reads the frames and keeps their features;
 ``12 iterations`` is the same work at every size: as many outer iterations (match, build, solve) from the true
-extrinsic; ``whole estimate`` is what ``calibrate`` does after prepare, from the nominal extrinsic,
-without the search for causes: how many searches and tests it makes depends on what it finds, and its status
-stands beside it. OUT gets scaling.md, a table for each question with log-log slopes (of all sizes, by least
-squares, and between the last two), and scaling.svg (extra ``plot``). Work that does not grow flattens the
-slope of small sizes; the last two say more about larger ones.
+extrinsic. ``--whole`` adds ``whole estimate``, what ``calibrate`` does after prepare from the nominal
+extrinsic, without the search for causes: how many searches and tests it makes depends on what it finds, and
+its status stands beside it; memory is that before it. OUT gets scaling.md, a table for each question with
+log-log slopes (of all sizes, by least squares, and between the last two), and scaling.svg (extra ``plot``).
+Work that does not grow flattens the slope of small sizes; the last two say more about larger ones.
 
 Frames are those of a street of 41, played forth and back under rising stamps (a drive reversed in time is a
 drive), so that one is like another. Points are varied by the angle between two firings, on a street full of
@@ -46,7 +46,7 @@ from sst_graph.rig.calibrate import Guess, KnownRig, calibrate_rig_prepared, pre
 from sst_graph.simulator import SimulationConfig, simulate, write_drive
 from sst_graph.types import CameraImage, Frame, GroundTruth, Scan, SemanticClass
 
-COSTS = "prepare [s]", "12 iterations [s]", "whole estimate [s]", "peak memory [MB]"
+COSTS, WHOLE = ("prepare [s]", "12 iterations [s]", "peak memory [MB]"), "whole estimate [s]"
 ITERATIONS, FRAMES, STREET_FRAMES, PERIOD_NS = 12, 6, 41, 100_000_000
 STREET = SimulationConfig(
     seed=5, frames=FRAMES, width=621, height=188, azimuth_limit_deg=60.0, time_offset_s=0.0
@@ -61,8 +61,8 @@ class Series:
     Attributes:
         unknown: what is varied.
         sizes: (k,) of it.
-        costs: (k, 4) as :data:`COSTS`.
-        statuses: k of the whole estimates.
+        costs: (k, 3) as :data:`COSTS`, or (k, 4) with that of :data:`WHOLE`.
+        statuses: k of the whole estimates, empty without.
     """
 
     unknown: str
@@ -72,21 +72,25 @@ class Series:
 
     @classmethod
     def of(cls, unknown: str, sizes: Sequence[float], found: Sequence[dict[str, Any]]) -> Series:
-        costs = [[one["prepare"], one["solve"], one["estimate"], one["peak_mb"]] for one in found]
-        return cls(unknown, np.array(sizes, float), np.array(costs), [one["status"] for one in found])
+        names = ["prepare", "solve", "peak_mb", *(["estimate"] if found[0]["status"] else [])]
+        costs = np.array([[one[name] for name in names] for one in found])
+        return cls(unknown, np.array(sizes, float), costs, [one["status"] for one in found])
 
     def slopes(self) -> tuple[FloatArray, FloatArray]:
-        """(4,) of all sizes, and (4,) between the last two."""
+        """(3 or 4,) of all sizes, and between the last two."""
         x, y = np.log(self.sizes), np.log(self.costs)
-        return np.polyfit(x, y, 1)[0], (y[-1] - y[-2]) / (x[-1] - x[-2])
+        return np.array([np.polyfit(x, cost, 1)[0] for cost in y.T]), (y[-1] - y[-2]) / (x[-1] - x[-2])
 
     def table(self) -> str:
-        lines = [f"| {self.unknown} | {' | '.join(COSTS)} | status |", "|---|---|---|---|---|---|"]
+        whole = any(self.statuses)
+        heads = [*COSTS, *([WHOLE, "status"] if whole else [])]
+        lines = [f"| {self.unknown} | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
         for size, cost, status in zip(self.sizes, self.costs, self.statuses, strict=True):
-            seconds = " | ".join(f"{one:.2f}" for one in cost[:-1])
-            lines.append(f"| {size:,.0f} | {seconds} | {cost[-1]:.0f} | {status} |")
+            cells = [f"{one:.0f}" if one > 100.0 else f"{one:.2f}" for one in cost]
+            lines.append(f"| {size:,.0f} | {' | '.join([*cells, *([status] if whole else [])])} |")
         for name, slopes in zip(("slope", "slope of the last two"), self.slopes(), strict=True):
-            lines.append(f"| {name} | {' | '.join(f'{slope:.2f}' for slope in slopes)} | |")
+            cells = [f"{slope:.2f}" for slope in slopes]
+            lines.append(f"| {name} | {' | '.join([*cells, *([''] if whole else [])])} |")
         return "\n".join(lines)
 
 
@@ -151,7 +155,7 @@ class ForthAndBack:
         return phase if phase <= last else 2 * last - phase
 
 
-def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, Any]:
+def calibrated(drive: Path, frames: int, cameras: int, whole: bool) -> dict[str, Any]:
     """In the process that is measured: seconds of all parts, memory, labelled points of a scan."""
     cv2.setNumThreads(1)
     source = ForthAndBack(open_source(drive), frames)
@@ -167,14 +171,13 @@ def calibrated(drive: Path, frames: int, cameras: int) -> dict[str, Any]:
     prepared = time.process_time()
     for own in drives.values():
         solve_twelve(own, source.truth, config)
-    solved, guess = time.process_time(), Guess(source.nominal, 0.0)
-    status = (
-        calibrate_prepared(drives["cam0"], source.nominal, config).status
-        if cameras == 1
-        else calibrate_rig_prepared(drives, dict.fromkeys(names, guess), config, KnownRig()).status
-    )
-    ended = time.process_time()
-    peak, scan = peak_mb(), source[0].scan
+    solved, peak, status = time.process_time(), peak_mb(), ""
+    if whole and cameras == 1:
+        status = calibrate_prepared(drives["cam0"], source.nominal, config).status
+    elif whole:
+        guesses = dict.fromkeys(names, Guess(source.nominal, 0.0))
+        status = calibrate_rig_prepared(drives, guesses, config, KnownRig()).status
+    ended, scan = time.process_time(), source[0].scan
     assert scan is not None
     labelled = int((scan.classes == SemanticClass.VEHICLE).sum())
     seconds = {"prepare": prepared - began, "solve": solved - prepared, "estimate": ended - solved}
@@ -189,9 +192,10 @@ def solve_twelve(drives: Sequence[Drive], truth: GroundTruth, config: Calibratio
     assert found.outer_iterations == ITERATIONS
 
 
-def measured(drive: Path, frames: int, cameras: int = 1) -> dict[str, Any]:
+def measured(drive: Path, frames: int, whole: bool, cameras: int = 1) -> dict[str, Any]:
     """What a process of its own took."""
     command = [sys.executable, "-m", "benchmarks.scaling", "--one", str(drive), str(frames), str(cameras)]
+    command += ["--whole"] if whole else []
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True)
     if done.returncode:
         raise SystemExit(f"a calibration ended with {done.returncode}")
@@ -205,33 +209,33 @@ def written(folder: Path, name: str, config: SimulationConfig) -> Path:
     return folder / name
 
 
-def by_frames(folder: Path, sizes: Sequence[float]) -> Series:
+def by_frames(folder: Path, sizes: Sequence[float], whole: bool) -> Series:
     drive = written(folder, "frames", replace(STREET, frames=STREET_FRAMES))
-    return Series.of("frames", sizes, [measured(drive, int(size)) for size in sizes])
+    return Series.of("frames", sizes, [measured(drive, int(size), whole) for size in sizes])
 
 
-def by_points(folder: Path, steps_deg: Sequence[float]) -> Series:
+def by_points(folder: Path, steps_deg: Sequence[float], whole: bool) -> Series:
     found = []
     for step in sorted(steps_deg, reverse=True):
         dense = replace(STREET, azimuth_step_deg=step, vehicle_density=0.4, truck_fraction=0.6)
-        found.append(measured(written(folder, f"step{step:g}", dense), FRAMES))
+        found.append(measured(written(folder, f"step{step:g}", dense), FRAMES, whole))
     labelled = [one["labelled"] for one in found]
     return Series.of(f"labelled points a scan, {FRAMES} frames", labelled, found)
 
 
-def by_image(folder: Path, scales: Sequence[float]) -> Series:
+def by_image(folder: Path, scales: Sequence[float], whole: bool) -> Series:
     found, pixels = [], []
     for scale in scales:
         width, height = round(1242 * scale), round(375 * scale)
         config = replace(STREET, width=width, height=height)
-        found.append(measured(written(folder, f"{width}x{height}", config), FRAMES))
+        found.append(measured(written(folder, f"{width}x{height}", config), FRAMES, whole))
         pixels.append(width * height)
     return Series.of(f"pixels of an image, {FRAMES} frames", pixels, found)
 
 
-def by_cameras(folder: Path, sizes: Sequence[float]) -> Series:
+def by_cameras(folder: Path, sizes: Sequence[float], whole: bool) -> Series:
     drive = written(folder, "cameras", STREET)
-    found = [measured(drive, FRAMES, int(size)) for size in sizes]
+    found = [measured(drive, FRAMES, whole, int(size)) for size in sizes]
     return Series.of(f"cameras, {FRAMES} frames", sizes, found)
 
 
@@ -244,7 +248,7 @@ def draw(series: Sequence[Series], path: Path) -> None:
 
     figure = Figure(figsize=(3.2 * len(series), 3.2), layout="constrained")
     for axes, each in zip(figure.subplots(1, len(series), squeeze=False)[0], series, strict=True):
-        for name, cost in zip(COSTS[:-1], each.costs.T, strict=False):
+        for name, cost in zip(COSTS[:2], each.costs.T, strict=False):
             axes.loglog(each.sizes, cost, "o-", label=name)
         axes.set_xlabel(each.unknown)
         axes.grid(True, which="both", alpha=0.3)
@@ -264,10 +268,11 @@ def main() -> None:
     )
     parser.add_argument("--image", nargs="+", type=float, default=[0.25, 0.5, 1.0, 2.0], metavar="SCALE")
     parser.add_argument("--cameras", nargs="+", type=int, default=[1, 2, 4, 6])
+    parser.add_argument("--whole", action="store_true", help="the whole estimate, too")
     parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.one:
-        print(json.dumps(calibrated(Path(args.one[0]), int(args.one[1]), int(args.one[2]))))
+        print(json.dumps(calibrated(Path(args.one[0]), int(args.one[1]), int(args.one[2]), args.whole)))
         return
     sizes = {name: sorted(getattr(args, name), reverse=name == "points") for name in args.only}
     for name, each in sizes.items():
@@ -277,7 +282,7 @@ def main() -> None:
     series: list[Series] = []
     for name in args.only:
         with tempfile.TemporaryDirectory() as folder:
-            series.append(SERIES[name](Path(folder), sizes[name]))
+            series.append(SERIES[name](Path(folder), sizes[name], args.whole))
         print(series[-1].table() + "\n", flush=True)
         (args.out / "scaling.md").write_text("\n\n".join(each.table() for each in series) + "\n")
     draw(series, args.out / "scaling.svg")
