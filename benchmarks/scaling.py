@@ -8,9 +8,9 @@ processor seconds and largest resident memory count. ``prepare`` reads the frame
 ``12 iterations`` is the same work at every size: as many outer iterations (match, build, solve) from the true
 extrinsic. ``--whole`` adds ``whole estimate``, what ``calibrate`` does after prepare from the nominal
 extrinsic, without the search for causes: how many searches and tests it makes depends on what it finds, and
-its status stands beside it; memory is that before it. OUT gets scaling.md, a table for each question with
-log-log slopes (of all sizes, by least squares, and between the last two), and scaling.svg (extra ``plot``).
-Work that does not grow flattens the slope of small sizes; the last two say more about larger ones.
+its status stands beside it. OUT gets scaling.md, a table for each question with log-log slopes (of all sizes,
+by least squares, and between the last two), and scaling.svg (extra ``plot``). Work that does not grow flattens
+the slope of small sizes; the last two say more about larger ones.
 
 Frames are those of a street of 41, played forth and back under rising stamps (a drive reversed in time is a
 drive), so that one is like another. Points are varied by the angle between two firings, on a street full of
@@ -171,13 +171,13 @@ def calibrated(drive: Path, frames: int, cameras: int, whole: bool) -> dict[str,
     prepared = time.process_time()
     for own in drives.values():
         solve_twelve(own, source.truth, config)
-    solved, peak, status = time.process_time(), peak_mb(), ""
+    solved, status = time.process_time(), ""
     if whole and cameras == 1:
         status = calibrate_prepared(drives["cam0"], source.nominal, config).status
     elif whole:
         guesses = dict.fromkeys(names, Guess(source.nominal, 0.0))
         status = calibrate_rig_prepared(drives, guesses, config, KnownRig()).status
-    ended, scan = time.process_time(), source[0].scan
+    ended, peak, scan = time.process_time(), peak_mb(), source[0].scan
     assert scan is not None
     labelled = int((scan.classes == SemanticClass.VEHICLE).sum())
     seconds = {"prepare": prepared - began, "solve": solved - prepared, "estimate": ended - solved}
