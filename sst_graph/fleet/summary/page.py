@@ -152,8 +152,8 @@ def _drives(rows: Sequence[Row]) -> str:
         "drives",
         "Drives",
         paragraph(
-            "What needs attention comes first; a click on a head sorts. A name leads to the drive's report, or "
-            "to the record of what went wrong.",
+            "What needs attention comes first; a click on a head sorts. A name leads to a drive's report, "
+            "or to the record of what went wrong.",
             "note",
         ),
         paragraph(note, "note") if note else "",
